@@ -78,13 +78,13 @@ def _call(
 ) -> Callable:
     directions = _directions(moving)
     shapes = [(num_nodes, 3, 3) if argument == _VEL else (num_nodes, 3) for argument in moving]
-    shapes = 2 * (shapes or [(num_nodes, 3)])  # results for positions, then for velocities
+    shapes = 2 * (shapes or [(num_nodes, 3)])  # shapes of results: positions, then velocities
 
     def body(pos, vel, resolution, drag, gravity, *out):
         numbers = resolution[...], drag[...], gravity[...]
         zero = jnp.zeros_like(numbers[0])
 
-        def full(values: Iterable[ArrayLike]) -> Any:  # a tuple of components, not an array
+        def full(values: Iterable[ArrayLike]) -> Any:  # a vector as a tuple of components
             return tuple(zero + value for value in values)
 
         def advance(ball: BallState, moved: list[BallState], sign: float = 1.0) -> tuple:

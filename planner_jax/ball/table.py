@@ -101,7 +101,7 @@ def _check_values(name: str, value: ArrayLike, num: int) -> Numbers:
 
 
 def _evaluate(times: np.ndarray, values: list[PyTree], at: np.ndarray, order: int) -> PyTree:
-    """Evaluate a derivative (..., T, 3) of the spline through `values` at T times `at`."""
+    """Evaluate derivative `order`, (..., T, 3), of the spline through `values` at T times `at`."""
     units, none = np.eye(times.size), np.zeros((times.size, times.size))
     if len(values) == 1:
         splines = [CubicSpline(times, units)]

@@ -101,7 +101,7 @@ def draw_path(
     def draw(ends: Array, steps: Array) -> CellPath:
         score = (
             ends + jnp.where(jnp.arange(9) == 0, 1.0, 0.0)[None, None]
-        )  # prefer the goal's own cell
+        )  # the bonus 1 prefers the cell of the goal, which is cell 0, to its neighbours
         best = jnp.argmax(jnp.where(is_reached, score, -jnp.inf))
         level, heading, around = jnp.unravel_index(best, is_reached.shape)
 

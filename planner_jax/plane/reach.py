@@ -178,7 +178,7 @@ def _stencils(grid: Grid, movers: Obstacles, radius: Array) -> Array:
 
 
 def _draw_movers(grid: Grid, movers: Obstacles, stencils: Array, time: Array) -> Array:
-    """Return the cells (words, cells) uint32 that moving obstacles occupy at one time."""
+    """Return the cells (words, cells) uint32 that obstacles occupy, with bitmaps `stencils`."""
     cells = grid.lattice.cells
     middle = (movers.centre + movers.velocity * time - grid.corner[None]) / grid.cell
     at = jnp.round(jnp.clip(middle, -cells, 2.0 * cells)).astype(jnp.int32) - _STENCIL // 2
@@ -287,10 +287,10 @@ def reach_set(
     ]
 
     def apart(bits: Array, n: Array) -> Array:
-        """Compute one layer on a CPU, with each of its parts in a separate loop iteration.
+        """Compute layer n + 1 from n on a CPU, with each of `parts` in its own loop iteration.
 
-        Otherwise XLA would fuse the parts on a CPU, and repeat the work of one part for every bit
-        that the next part reads.
+        The parts are a change of speed, a turn and moves. XLA would otherwise fuse them on a CPU,
+        and repeat the work of one part for every bit that the next part reads.
         """
         return lax.fori_loop(0, len(parts), lambda k, bits: lax.switch(k, parts, bits, n), bits)
 

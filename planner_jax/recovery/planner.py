@@ -16,7 +16,8 @@ from planner_jax.optimise.settings import LbfgsConfig, Round
 from planner_jax.recovery.case import RecoveryCase, RecoveryPlan
 from planner_jax.trajectory.polynomial import PiecewisePolynomial
 
-_ABOVE_GROUND = 0.2  # [m] lowest guess of the position of standstill, above the least height
+# [m], in a starting point standstill is at least this far above the least allowed height.
+_ABOVE_GROUND = 0.2
 # Starting points of the search, best first. Column 1: a base duration T_0 [s], to which the time
 # for the displacement at half the greatest speed is added. Column 2: a factor c; the displacement
 # to standstill is c T_0 v / 2 for the initial velocity v.
@@ -73,7 +74,7 @@ class RecoveryPlanner(ChainPlanner[RecoveryCase, RecoveryPlan]):
         return RecoveryContext(case)
 
     def guess_ends(self, context: RecoveryContext, num: int) -> Array:
-        """Return `num` guesses (num, 1, 4): log duration, and displacement to standstill [m]."""
+        """Return `num` starts (num, 1, 4): log duration, and displacement to standstill [m]."""
         case = context.case
         pos, vel = case.head_state[None, 0], case.head_state[None, 1]
         base, share = jnp.asarray(_GUESSES[:num], pos.dtype).T[..., None]

@@ -91,8 +91,8 @@ class _Quantity(NamedTuple):
 
 
 _LENGTH = _Quantity("length")
-# Part of a description -> field -> format of its value, or None for a text. The part "" holds the
-# fields outside rotors, tool and limits.
+# Section of a robot's file -> field -> format of its value, or None for a text. The sections are
+# "rotors", "tool" and "limits"; "" holds the fields outside of them.
 _FIELDS: dict[str, dict[str, _Quantity | None]] = {
     "": {
         "name": None,
@@ -287,7 +287,7 @@ def _require_units(description: Mapping[str, Value], place: str) -> None:
 
 
 def _require_known(given: Mapping[str, Value], known: list[str], prefix: str, place: str) -> None:
-    """Raise `RobotError` if `given` has a field that is not in `known`, and suggest a name."""
+    """Raise `RobotError`, beginning with `place`, if `given` has a field that is not in `known`."""
     for name in given:
         if name not in known:
             hint = suggestion(str(name), known)
@@ -296,7 +296,7 @@ def _require_known(given: Mapping[str, Value], known: list[str], prefix: str, pl
 
 
 def _require_all(kind: type, given: Mapping[str, Value], prefix: str, place: str) -> None:
-    """Raise `RobotError` if `given` lacks a field that has no default in the dataclass `kind`."""
+    """Raise `RobotError`, beginning with `place`, if `given` lacks a field that `kind` requires."""
     for field in dataclasses.fields(kind):
         if field.default is dataclasses.MISSING and field.name not in given:
             name = "places or diagonal" if field.name == "places" else field.name
@@ -304,7 +304,7 @@ def _require_all(kind: type, given: Mapping[str, Value], prefix: str, place: str
 
 
 def _to_si(given: Mapping[str, Value], part: str, place: str) -> dict[str, Value]:
-    """Check the fields of a part of a description, and convert their values to SI units."""
+    """Check the fields of a robot's section `part`, such as "rotors"; convert them to SI units."""
     fields, prefix = _FIELDS[part], f"{part}." if part else ""
     _require_known(given, list(fields), f"{part} " if part else "", place)
     converted = dict(given)

@@ -49,8 +49,9 @@ from planner_jax.trajectory.polynomial import (
 class ProportionalMinco:
     """Constant float64 matrices of splines of M pieces with least integral |p^(s)|^2.
 
-    The matrices multiply C = 2s + O columns [b; y]: 2s boundary rows b and O whitened waypoint
-    offsets y. h is the mean duration of a piece.
+    The matrices multiply C = 2s + O columns [b; y]: 2s boundary rows b (scaled states at both ends)
+    and O whitened waypoint offsets y (scaled deviations from the smoothest spline). h is the mean
+    duration of a piece.
     """
 
     order: int  # s
@@ -95,17 +96,18 @@ def _hermite_map(order: int) -> np.ndarray:
 
 @functools.cache
 def _hermite_energy(order: int) -> np.ndarray:
-    """Return the energy of a piece of duration 1 as a quadratic form in its end derivatives."""
+    """Return the integral of |p^(order)|^2 on a piece of 1 s as quadratic form in end states."""
     hermite = _hermite_map(order)
     return hermite.T @ energy_form(2 * order - 1, order)[0] @ hermite
 
 
 def _energy(coefficients: np.ndarray, shares: np.ndarray) -> np.ndarray:
-    """Return the energy of M pieces as a quadratic form (C, C) in the C columns [b; y].
+    """Return the integral of |p^(s)|^2 as a quadratic form (C, C) in C columns [b; y].
 
-    It is computed as a sum of squares, which keeps the small energy of smooth motions far from the
-    origin; other forms would lose it to rounding errors. `coefficients` (M, 2s, C) map the columns
-    to powers of the time since a piece's start over its duration, and `shares` (M,) are durations.
+    The columns are scaled end states b and waypoint offsets y. The form is computed as a sum of
+    squares; otherwise rounding errors could exceed the small integral of a smooth motion far from
+    the origin. `coefficients` (M, 2s, C) map the columns to powers of the time since a piece's
+    start over its duration, and `shares` (M,) are durations of the M pieces.
     """
     s = coefficients.shape[1] // 2
     root = np.linalg.cholesky(energy_form(2 * s - 1, s)[0][s:, s:]).T
@@ -114,7 +116,7 @@ def _energy(coefficients: np.ndarray, shares: np.ndarray) -> np.ndarray:
 
 
 def _least_energy(energy: np.ndarray, num: int) -> np.ndarray:
-    """Return the quadratic form of the first `num` unknowns if all others minimise `energy`."""
+    """Minimise the form `energy` over all but `num` unknowns: a quadratic form of these `num`."""
     first, free = np.s_[:num], np.s_[num:]
     best = np.linalg.solve(energy[free, free], energy[free, first])
     return energy[first, first] - energy[first, free] @ best
@@ -171,7 +173,7 @@ def proportional_minco(
     to_offsets = np.linalg.inv(from_offsets)
     nodes = nodal @ from_offsets
     pieces = np.stack([nodes[i * s : (i + 2) * s] for i in range(m)])
-    coefficients = _hermite_map(s) @ (units[:, :, None] * pieces)  # of each piece's unit time
+    coefficients = _hermite_map(s) @ (units[:, :, None] * pieces)  # for pieces of duration 1
     powers = shares[:, None] ** np.arange(2 * s)
     return ProportionalMinco(
         order=s,
@@ -198,7 +200,7 @@ def sample_motion(
     Args:
         maps: constant maps of M pieces.
         nodes: intervals of each piece. Neighbouring pieces share one of N = M nodes + 1 samples.
-        columns: (C, 3) boundary rows and whitened offsets y.
+        columns: (C, 3) boundary rows (scaled end states), then whitened waypoint offsets y.
         piece_duration: () h = T / M [s].
         orders: 4, or 5 to sample the snap as well.
     """
@@ -246,25 +248,29 @@ def _motion(matrices: Array, columns: Array, piece_duration: Array) -> Motion:
 
 
 def trajectory_energy(maps: ProportionalMinco, rows: Array, offsets: Array, piece_duration: Array):
-    """Return the energy (), the integral of |p^(s)|^2, for boundary rows (2s, 3) and offsets."""
+    """Return the integral () of |p^(s)|^2 of a spline p(t) of M pieces.
+
+    `rows` (2s, 3) are the boundary rows, the scaled states at both ends, and `offsets` (O, 3) the
+    whitened deviations of the waypoints from the smoothest spline.
+    """
     boundary = boundary_energy(maps, rows, piece_duration)
     return boundary + offset_energy(maps, offsets, piece_duration)
 
 
 def boundary_energy(maps: ProportionalMinco, rows: Array, piece_duration: Array) -> Array:
-    """Return the least energy () for given boundary rows: the energy with zero offsets."""
+    """Return the least integral () of |p^(s)|^2 for boundary rows (2s, 3): scaled end states."""
     return _boundary_form(maps, rows) * reciprocal(piece_duration) ** (2 * maps.order - 1)
 
 
 def offset_energy(maps: ProportionalMinco, offsets: Array, piece_duration: Array) -> Array:
-    """Return the energy () that the offsets add to the energy of the boundary rows."""
+    """Return by how much () waypoint offsets (O, 3) raise the integral of |p^(s)|^2."""
     rate = reciprocal(piece_duration)
     return maps.offset_energy * jnp.sum(offsets**2) * rate ** (2 * maps.order - 1)
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _boundary_form(maps: ProportionalMinco, rows: Array) -> Array:
-    """Return the least energy () for boundary rows (2s, 3) and pieces of 1 s mean duration."""
+    """Return `boundary_energy` () for pieces of 1 s mean duration; `rows` (2s, 3)."""
     return jnp.sum(rows * _by_rows(maps, rows))
 
 
@@ -272,13 +278,14 @@ def _boundary_form(maps: ProportionalMinco, rows: Array) -> Array:
 def _boundary_form_jvp(
     maps: ProportionalMinco, primals: tuple[Array], tangents: tuple[Array]
 ) -> tuple[Array, Array]:
-    # The matrix is symmetric, so that value and derivative share one product.
+    # The value is sum(rows * (E rows)) with a symmetric matrix E, so its gradient is 2 E rows:
+    # value and derivative share the product E rows.
     product = _by_rows(maps, primals[0])
     return jnp.sum(primals[0] * product), 2.0 * jnp.sum(product * tangents[0])
 
 
 def _by_rows(maps: ProportionalMinco, rows: Array) -> Array:
-    """Multiply the energy's matrix by rows (2s, 3), as a sum, faster than a matrix product."""
+    """Multiply `maps.boundary_energy` (2s, 2s) by rows (2s, 3), as a sum: faster than `matmul`."""
     gram = jnp.asarray(maps.boundary_energy, rows.dtype)
     return jnp.sum(gram[..., None] * rows[None], axis=1)
 
@@ -286,7 +293,7 @@ def _by_rows(maps: ProportionalMinco, rows: Array) -> Array:
 def proportional_trajectory(
     maps: ProportionalMinco, rows: Array, offsets: Array, piece_duration: Array
 ) -> PiecewisePolynomial:
-    """Return a trajectory in real time from the same arguments as `trajectory_energy`."""
+    """Return the trajectory of boundary rows (scaled end states) and whitened waypoint offsets."""
     unit = jnp.einsum(
         "mkc,ci->mki",
         jnp.asarray(maps.coefficients, rows.dtype),
@@ -302,15 +309,15 @@ def proportional_trajectory(
 
 @struct.dataclass
 class Chain:
-    """N segments of a trajectory: boundary rows, whitened offsets and mean piece durations."""
+    """N segments of a trajectory: scaled end states, waypoint offsets and mean piece durations."""
 
     rows: Float[Array, "N rows 3"]
-    offsets: Float[Array, "N offsets 3"]  # whitened
+    offsets: Float[Array, "N offsets 3"]  # scaled deviations from the smoothest waypoints
     piece_durations: Float[Array, " N"]  # [s], mean duration of each segment's pieces
 
     @property
     def columns(self) -> Float[Array, "N columns 3"]:
-        """Columns that define each segment: its boundary rows, then its whitened offsets."""
+        """Columns that define each segment: its scaled end states, then its waypoint offsets."""
         return jnp.concatenate([self.rows, self.offsets], axis=1)
 
 

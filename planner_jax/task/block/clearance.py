@@ -63,17 +63,17 @@ class _Pairs(NamedTuple):
 
 
 def clearances(arm: Arm, scene: Scene, angles: Array) -> Array:
-    """Return the distances (R, N) [m] of R pairs of bodies in N poses at joint angles (N, 6) [rad].
+    """Return the distances (R, N) [m] of R pairs of bodies, in N poses at angles (N, 6) [rad].
 
-    A distance is negative if the bodies overlap. The first `num_of_pole(arm)` rows are the
-    distances from the pole.
+    A pair is a link or the shield, and a body that it must not touch. A distance is negative
+    if the bodies overlap. The first `num_of_pole(arm)` of the R rows are distances from the pole.
     """
     every = _pairs(arm, scene, _poses(arm, angles))
     return jnp.concatenate([pairs.measure(*pairs.bodies) - pairs.thick for pairs in every])
 
 
 def least_clearances(arm: Arm, scene: Scene, angles: Array) -> Array:
-    """Return the least distance (N,) [m] of all pairs of bodies in N poses at angles (N, 6)."""
+    """Return the least distance (N,) [m] of bodies that must not touch, at angles (N, 6) [rad]."""
     return jnp.min(clearances(arm, scene, angles), axis=0)
 
 
@@ -93,7 +93,7 @@ def clearances_and_slopes(
     joint = np.arange(6)[:, None]
 
     def slopes_at(index: Array) -> Array:
-        def at(array: Array) -> Array:  # arrays without poses have one axis
+        def at(array: Array) -> Array:  # selects poses; keeps arrays without poses
             return array[..., index] if array.ndim > 1 and array.shape[-1] > 1 else array
 
         # A joint turns about the axis a through the point o. The derivative of a distance along the
@@ -191,7 +191,7 @@ def _pairs(arm: Arm, scene: Scene, poses: _Poses) -> list[_Pairs]:
     thick, plate, shield = radius[:, None], (middle, edges), _SHIELD_LINK
     to_pole = thick[turning] + pole
 
-    # The capsules of the links 3 to 6 and the edges of the shield, against the base.
+    # Pairs of the base's box with the capsules of links 3 to 6 and with the shield's edges.
     boxed = jnp.concatenate([poses.ends[:, :, swung], outline], axis=2)
     boxed_radius = jnp.concatenate([thick[swung], jnp.full((4, 1), _HALF_THICKNESS, thick.dtype)])
     boxed_link = np.append(link[swung], np.full(4, shield))

@@ -1,11 +1,12 @@
 """The default planner of blocks: a straight joint motion if one is free, else least squares.
 
-The shield may meet a ball anywhere between the two boxes, with the wrist and the elbow on either
-side. A straight motion turns all joints in proportion to one of these end poses. The planner
-returns the first straight motion that is in time and free of collisions. If there is none,
-Levenberg-Marquardt optimises end pose, time of contact and motion together. It starts from straight
-motions with an added bump (a detour of the joints), until one start leads to a plan that keeps
-every limit. [Natarajan2024] takes its motions from a library; this planner stores only the bumps.
+The shield may meet a ball anywhere between the outer box and the protected inner box around the
+arm, with the wrist and the elbow on either side. A straight motion turns all joints in proportion
+to one of these end poses. The planner returns the first straight motion that is in time and free of
+collisions. If there is none, Levenberg-Marquardt optimises end pose, time of contact and motion
+together. It starts from straight motions with an added bump (a detour of the joints), until one
+start leads to a plan that keeps every limit. [Natarajan2024] takes its motions from a library; this
+planner stores only the bumps.
 """
 
 import dataclasses
@@ -67,7 +68,8 @@ from planner_jax.task.block.motion import (
 from planner_jax.task.block.plan import BlockPlan, explain_status, make_empty_plan
 
 _HIGHEST = lax.Precision.HIGHEST
-_GROUP, _WIDTH = 4, 2  # starts in a group, and starts that a GPU refines at the same time
+# Number of starting points in a group, and number of them that a GPU refines at the same time.
+_GROUP, _WIDTH = 4, 2
 
 
 @with_run_time_numbers("straight", "tries", "first", "kept", "in_turn")
@@ -76,10 +78,10 @@ class Search(Attempt):
     """An attempt: check some straight motions, then run least squares from starting points."""
 
     starts: int = 8
-    straight: int = 48  # number of straight motions
-    tries: int = 15  # number of starts from which least squares are tried
-    first: int = 0  # index of the first start of least squares
-    kept: int = 5  # number of starts that continue after the solver's trial steps
+    straight: int = 48  # number of straight joint motions to check
+    tries: int = 15  # number of starting points from which least squares are tried
+    first: int = 0  # index of the first stored starting point to try
+    kept: int = 5  # number of starting points that continue after the solver's trial steps
     # Whether each start is refined to its end before the next one, if a single case is planned.
     # Otherwise all starts first take a few trial steps, and only the `kept` best ones continue.
     in_turn: bool = True
@@ -100,14 +102,14 @@ _BRISK = (Search(tries=0), *_LEAST_SQUARES)
 
 @functools.cache
 def read_learned_starts() -> tuple[np.ndarray, np.ndarray]:
-    """Read N stored starts: ranks (N,) of end poses by effort, and detours (N, 6) [rad]."""
+    """Read N stored starts: ranks (N,) of end poses by effort, and detours (N, 6) [rad] to them."""
     starts = json.loads((Path(__file__).parent / "learned_starts.json").read_text())
     ranks = np.array([start["rank"] for start in starts], np.int32)
     return ranks, np.array([start["bump"] for start in starts], np.float32)
 
 
 def _combine_excess(joints: Array, contact: Array, too_near: Array) -> Array:
-    """Return the largest relative excess over a limit; a distance 1 cm too small counts as 1."""
+    """Return the largest excess: relative of joints and contact; 1 for 1 cm of `too_near` [m]."""
     return jnp.maximum(jnp.maximum(joints, contact), 100.0 * too_near)
 
 
@@ -119,9 +121,9 @@ def _trial_cost(tried: LevenbergState, solver: LevenbergConfig) -> Array:
 def rank_poses(poses: EndPoses, num: int, most: float) -> Array:
     """Return the indices (num,) of the end poses that need the least effort, in rising order.
 
-    The effort is the greatest ratio of a joint's rate or acceleration to its limit. Noise is added
-    to it, so that the poses vary. A pose whose effort exceeds `most` cannot be reached in time and
-    is ranked far behind.
+    In an end pose the shield meets the ball. The effort is the greatest ratio of a joint's rate or
+    acceleration to its limit. Noise is added to it, so that the poses vary. A pose whose effort
+    exceeds `most` cannot be reached in time and is ranked far behind.
     """
     rng = np.random.default_rng(0)
     noise = jnp.asarray(rng.random(poses.effort.shape[0]), poses.effort.dtype)
@@ -134,7 +136,8 @@ def _lift_to_unknowns(
 ) -> tuple[Array, Array]:
     """Return J^T r and J^T J, where J is the Jacobian of all residuals r by all unknowns.
 
-    The unknowns are K steps of each of the six joints, and the time of contact.
+    The unknowns are the rates of each of the six joints after K pieces of the motion, multiplied by
+    its duration, and the time of contact.
 
     Args:
         lift: (W, K), derivatives of a joint's angle at W samples by its K unknowns.
@@ -169,7 +172,7 @@ def _lift_to_unknowns(
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class OnlineBlock(Planner):
-    """Planner of arm motions that block a ball between two boxes; the cost is the duration [s]."""
+    """Planner of arm motions that block a ball outside a protected box; cost: the duration [s]."""
 
     case_type: ClassVar[type] = BlockCase
     is_sequential: ClassVar[bool] = True
@@ -439,7 +442,7 @@ class OnlineBlock(Planner):
         excess = _combine_excess(joints, contact, self.margin - jnp.min(gaps[1:]))
         violation = jnp.where(point[-1] > case.delay, excess, jnp.inf)
         status = status_of(duration, violation, violation > FEASIBILITY_TOLERANCE)
-        is_blocked = (gaps[0] < 0.0) & ~is_solved(status)  # by something that touches the start
+        is_blocked = (gaps[0] < 0.0) & ~is_solved(status)  # the arm touches something at the start
         plan = BlockPlan(
             motion=polynomial(case.angles, first, moves, duration),
             contact_time=point[-1],

@@ -14,7 +14,8 @@ from planner_jax.task.block.motion import Weights, profiles, step_weights
 from planner_jax.task.block.scene import entry_time
 
 _PLANE = 1e-3  # [m], greatest distance of the ball from the shield's plane at the contact
-# Offsets of the ball from the shield's middle along the two edges, divided by the case's `offset`.
+# Tried offsets of the ball from the shield's middle along the two edges, divided by the greatest
+# offset that the case allows.
 _OFFSETS = np.array([(0.0, 0.0), (0.8, 0.0), (0.0, 0.8), (-0.8, 0.0), (0.0, -0.8)])
 
 
@@ -35,7 +36,7 @@ class EndPoses:
 
 @struct.dataclass
 class Flight:
-    """Interval of time in which a ball must be met: between the outer and the inner box."""
+    """Interval of time in which a ball must be met: in the outer box, before the inner box."""
 
     earliest: Array  # () [s], time at which the ball enters the outer box
     latest: Array  # () [s], time at which the ball enters the inner, protected box
@@ -43,7 +44,7 @@ class Flight:
 
 
 def flight_of(case: BlockCase) -> Flight:
-    """Compute when the ball of a case enters the outer box and the inner box."""
+    """Compute when a ball enters the outer box, where it may be met, and the protected one."""
     scene = case.scene
     earliest, enters = entry_time(scene.outer, case.ball, case.gravity)
     latest, hits = entry_time(scene.inner, case.ball, case.gravity)
@@ -69,12 +70,13 @@ def profile_peaks(pieces: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def end_poses(
     case: BlockCase, flight: Flight, points: int, pieces: int, *, quickest: bool = False
 ) -> EndPoses:
-    """Return the eight arm poses that meet the ball at each of `points` points between the boxes.
+    """Return the eight arm poses that meet the ball at each of `points` points of its path.
 
-    The eight poses are the branches of the inverse kinematics. Joint 6 keeps its angle, because it
-    only turns the shield in its own plane. A straight motion of `pieces` pieces leads to each pose.
-    Its speed profile is the one that stays farthest below the joints' limits; with `quickest`,
-    motions that end at rest have the profile that can be executed in the least time.
+    The points lie where the ball has entered the outer box but not the inner box. The eight poses
+    are the branches of the inverse kinematics. Joint 6 keeps its angle, because it only turns the
+    shield in its own plane. A straight motion of `pieces` pieces leads to each pose. Its speed
+    profile is the one that stays farthest below the joints' limits; with `quickest`, motions that
+    end at rest have the profile that can be executed in the least time.
     """
     share = (np.arange(points) + 0.5) / points
     time = flight.earliest + share * (flight.latest - flight.earliest)
@@ -112,7 +114,10 @@ def end_poses(
 
 
 def coast(case: BlockCase, duration: Array, pieces: int) -> Array:
-    """Return the angles (..., 6) [rad] at which joints stop if they brake in the first piece."""
+    """Return the angles (..., 6) [rad] at which joints stop that brake in the first piece.
+
+    The piece is one of `pieces` equal pieces of a motion of `duration` (...) [s].
+    """
     of_first = step_weights(pieces, (1.0,))[0][0]
     angles, rates = (jnp.broadcast_to(x, (*duration.shape, 6)) for x in (case.angles, case.rates))
     return angles + of_first * duration[..., None] * rates
@@ -138,9 +143,9 @@ def contact_terms(
 
     Returns:
         rows: (6,), weighted residuals: the ball's distance from the shield's plane; its offset from
-            the shield's middle in the plane (2); the shield's tilt (2); the time before the ball is
-            in the outer box or after it is in the inner box. Offset and tilt count only beyond the
-            tolerances of the case.
+            the shield's middle in the plane (2); the shield's tilt (2); the time by which the
+            contact is before the interval `flight` or after it. Offset and tilt count only beyond
+            the tolerances of the case.
         slopes: (6, 7), derivatives of the rows by the angles and the time.
         excess: (), largest relative excess over a tolerance, without weights.
     """

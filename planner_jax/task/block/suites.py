@@ -86,7 +86,7 @@ def _draw_throw(suite: Suite, random: np.random.Generator) -> np.ndarray:
 
 
 def _is_valid(suite: Suite, pos: np.ndarray, vel: np.ndarray, duration: float) -> bool:
-    """Return whether a throw enters both boxes as the suite requires, and misses the pole."""
+    """Return whether a throw misses the pole, and is in the outer box before the inner box."""
     times = np.linspace(0.0, duration, int(np.ceil(duration / _STEP)) + 1)[:-1]
     path = pos + vel * times[:, None]
     path[:, 2] -= 0.5 * GRAVITY * times**2

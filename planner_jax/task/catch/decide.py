@@ -23,7 +23,7 @@ from planner_jax.task.catch.case import CatchCase, CatchChoice
 from planner_jax.task.catch.estimate import Timetable, timetable
 from planner_jax.task.catch.plan import CatchPlan
 
-LENGTHS = 3  # number of proposals for each order of optional targets, by number of catches
+LENGTHS = 3  # number of variants of each order of optional targets, with ever fewer catches
 MOST_PERMUTED = 6  # greatest number of targets for which all orders are estimated
 MOST_SEARCHED = 100  # greatest number of targets for the beam search
 _WORD = 24  # number of targets in each integer of the bit set of caught targets
@@ -58,9 +58,9 @@ _closest_approaches = jax.jit(jax.vmap(_closest_approach))
 def in_several_lengths(case: CatchCase, choices: CatchChoice) -> CatchChoice:
     """Return K choices unchanged, or `LENGTHS` variants of each choice if targets are optional.
 
-    The variants of a choice catch all its targets, all but the last, all but the last two and so
-    on, because the estimate is least certain for the last catches. Leaves have the shape (K, N) or
-    (K * LENGTHS, N), for N targets.
+    A choice is an order of targets with times. Its variants catch all its targets, all but the
+    last, all but the last two and so on, because the estimate is least certain for the last
+    catches. Leaves have the shape (K, N) or (K * LENGTHS, N), for N targets.
     """
     if not case.optional:
         return choices
@@ -81,7 +81,7 @@ class _Partial:
     """State of a beam search: W sequences of catches, each of the same length so far."""
 
     rank: Array  # (W,) [s], the least is best; infinite in rows that hold no sequence
-    short: Array  # (W,) [m], sum of the shortfalls
+    short: Array  # (W,) [m], sum of the distances by which targets are missed
     time: Array  # (W,) [s], of the last catch
     place: Array  # (W, 3) [m], position of the quadrotor at the last catch
     position: Array  # (W, N) int32, index of each target in the sequence; N if it is not in it

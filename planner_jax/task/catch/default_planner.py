@@ -38,7 +38,9 @@ if TYPE_CHECKING:
 _PROPORTIONS = (0.3,) + (1.0,) * 5
 _FEATURE_TIMES = (-0.1, 0.1)  # [s] times of the ball that the network sees, after the decided time
 _RIM = 0.9  # greatest distance of a catch from the net's centre, relative to the net's radius
-_LEARNED_SIZE = 2.0  # greatest norm of a learned catch point's variables: 0.89 of `_RIM`
+# Greatest norm of the two variables of a catch point that a network predicts. The point is then at
+# most 0.89 * `_RIM` * (radius of the net) from the net's centre.
+_LEARNED_SIZE = 2.0
 _ENCODED_RIM = 0.99  # greatest distance of a catch point made by `encode`, relative to `_RIM`
 # Starting points, the most successful first. Column 1 is a factor on the decided times of the
 # catches. Columns 2 and 3 are the velocity at catches before the last one and at the last one,
@@ -61,16 +63,18 @@ _ROUNDS = (
     Round(starts=1, solver=LbfgsConfig(max_steps=80)),
     Round(starts=6, solver=LbfgsConfig(max_steps=200)),
 )
-_FROM_LEARNED = Round(starts=1, solver=LbfgsConfig(max_steps=2))  # from a network's guess
+_FROM_LEARNED = Round(starts=1, solver=LbfgsConfig(max_steps=2))  # from a network's starting point
 # With several targets this search runs before Newton's method, because the short search of `_FIRST`
 # would end too far from the optimum.
 _LONG_CHAIN = Stage(LbfgsConfig(max_steps=200, tolerance=1e-6, patience=5))
 _CHAIN_TOLERANCE = 1e-4
-# If more than `_FEW` targets must all be caught, the first two rounds have more iterations.
+# If more than `_FEW` targets must all be caught, the first two attempts have more iterations.
 _FEW = 3
 _STEPS_A_TARGET = 20
 _OF_MANY = LbfgsConfig(max_steps=300, memory=8, trial_steps=(1.0, 0.3))
-_LEAN = 0.95  # angle between net and ball in a guess, as a fraction of the greatest allowed angle
+# Angle between the net's axis and the ball's reversed velocity at a catch in a starting point, as a
+# fraction of the greatest allowed angle.
+_LEAN = 0.95
 
 
 @jax.tree_util.register_static
@@ -96,11 +100,11 @@ class ExactCatch(ChainPlanner[CatchCase, CatchPlan]):
     proportions: tuple[float, ...] = _PROPORTIONS  # relative durations of the pieces
     catch_weight: float = 0.3  # [s] weight of the penalties at a catch
     rounds: tuple[Round, ...] = _ROUNDS
-    # Thrust at catches before the last one in the first guess: -1 is the least, 0 hover, 1 the
-    # greatest thrust. Near -1 catches are earliest; larger values leave a margin for feedback
+    # Thrust at catches before the last one in the first starting point: -1 is the least, 0 hover, 1
+    # the greatest thrust. Near -1 catches are earliest; larger values leave a margin for feedback
     # control in flight.
     lift: float = _GUESSES[0, 3].item()
-    learned: bool = True  # whether a network improves the first guess of a single catch
+    learned: bool = True  # whether a network predicts a starting point for a single catch
 
     @property
     def end_weight(self) -> float:
@@ -112,7 +116,7 @@ class ExactCatch(ChainPlanner[CatchCase, CatchPlan]):
         return context.active
 
     def start_network(self, case: CatchCase) -> StartNetwork | None:
-        """Return the network that predicts the first guess; None if there is no such network.
+        """Return the network that predicts a starting point; None if there is no such network.
 
         It exists for one target, the default pieces, scale and `lift`, and no obstacles: around
         obstacles the side on which a search starts decides on which side it ends.
@@ -153,22 +157,22 @@ class ExactCatch(ChainPlanner[CatchCase, CatchPlan]):
         return order_targets(case)
 
     def guess_ends(self, context: CatchContext, num: int) -> Array:
-        """Return the 12 variables of each of N catches for `num` guesses, (num, N, 12)."""
+        """Return the 12 variables of each of N catches for `num` starting points, (num, N, 12)."""
         rows = _GUESSES[:num].copy()
         rows[0, 3] = self.lift
         rows = jnp.asarray(rows, context.times.dtype)
         return jax.vmap(lambda guess: self._guess(context, guess))(rows)
 
     def load_attempt(self, attempt: Round, cases: CatchCase) -> PyTree:
-        """Return a round, with the number of iterations that the cases need, as a pytree."""
+        """Return a round (attempt), with the iterations that the cases need, as a pytree."""
         return super().load_attempt(self._for_start(attempt, cases), cases)
 
     def starts_long(self, cases: CatchCase) -> bool:
-        """Return whether the first round is long: for many targets that must all be caught."""
+        """Return whether the first round (attempt) is long: many targets, all to be caught."""
         return self.rounds == _ROUNDS and cases.num_targets > _FEW and not cases.optional
 
     def _for_start(self, attempt: Round, case: CatchCase) -> Round:
-        """Return a round with the number of iterations that its starting point needs."""
+        """Return a round (attempt) with the number of iterations that its starting point needs."""
         if self.starts_long(case) and attempt in _ROUNDS[:2]:
             is_first = attempt == _FIRST
             steps = _STEPS_A_TARGET * case.num_targets if is_first else _OF_MANY.max_steps

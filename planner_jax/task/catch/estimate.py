@@ -55,7 +55,7 @@ def timetable(case: CatchCase) -> Timetable:
 
 
 def _to_catch(case: CatchCase, states: BallState, speed: Array) -> tuple[Array, Array]:
-    """Return quadrotor's positions (N, 3, K) at catches of N targets at K times, and penalties."""
+    """Return the quadrotor's `places` and `penalty` of `Timetable`, with a leading axis N."""
     net, limits = case.net, case.limits
     from_below = jnp.maximum(states.vel[:, 2] / speed - _STEEPEST, 0.0)
     places = states.pos - net.height * jnp.asarray([[[0.0], [0.0], [1.0]]], states.pos.dtype)
@@ -86,11 +86,14 @@ def arrival(
     return times[first], places[:, first], short[first]
 
 
-arrivals = jax.vmap(arrival, (0, None, None, None))  # the same for N targets
+arrivals = jax.vmap(arrival, (0, None, None, None))  # `arrival` for N targets from one position
 
 
 def _out_of_reach(offset: Array, span: Array, speed: Array) -> Array:
-    """Return the distance [m] by which a flight of `span` (..., K) [s] falls short of `offset`."""
+    """Return by how much [m] a flight of `span` (..., K) [s] falls short of its goal.
+
+    The goal is displaced by `offset` (..., 3, K) [m] from the start of the flight.
+    """
     span = jnp.maximum(span - _TURNING, 0.0)
     rise = speed / _ACCELERATION
     reach = jnp.where(span < rise, 0.5 * _ACCELERATION * span**2, speed * span - 0.5 * speed * rise)

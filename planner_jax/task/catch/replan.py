@@ -38,7 +38,8 @@ _LATEST = 0.05  # [s], greatest shift of a catch's time in the starting point
 _SHORTEST = 0.01  # [s], least duration of a segment in the starting point
 _CLOSING = 0.1  # [m/s], least speed towards the net's plane at which a catch's time is shifted
 _BINOMIALS, _SHIFTS = shift_basis(2 * _ORDERS)
-_TRIALS = (1.0, 0.2, 0.04)  # step lengths; the first direction is too long, as it ignores curvature
+# Step lengths that a search tries; its first direction is too long, because it ignores curvature.
+_TRIALS = (1.0, 0.2, 0.04)
 
 
 @struct.dataclass
@@ -173,7 +174,7 @@ class ReplanCatch(OptimisedPlanner):
         return planner.encode(context, durations, tails, offsets)
 
     def guesses(self, context: ReplanContext, num: int) -> Array:
-        """Return `num` starting points: the previous plan, then the planner's own guesses."""
+        """Return `num` starting points: the previous plan, then those of planning from scratch."""
         first = context.start[None]
         if num == 1:
             return first

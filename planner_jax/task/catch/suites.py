@@ -136,7 +136,7 @@ def _unit(angle: PyTree) -> PyTree:
 
 
 def _throws(uniform: PyTree, throws: tuple[_Throw, ...]) -> tuple[BallPath, PyTree]:
-    """Make thrown balls from three random numbers each, with latest times of their catches [s]."""
+    """Make the balls of `throws` from three random numbers each, with latest times of catches."""
     xp = _module(uniform)
     drawn = [_throw(u, t) for u, t in zip(xp.split(uniform, len(throws), 1), throws, strict=True)]
     pos, vel, horizon = (xp.stack(column, axis=1) for column in zip(*drawn, strict=True))
@@ -147,7 +147,7 @@ def _throws(uniform: PyTree, throws: tuple[_Throw, ...]) -> tuple[BallPath, PyTr
 
 
 def _throw(uniform: PyTree, throw: _Throw) -> tuple[PyTree, PyTree, PyTree]:
-    """Return positions and velocities of balls at time 0, and latest times of catches [s]."""
+    """Return positions and velocities at time 0 of random balls, and latest times of catches."""
     xp = _module(uniform)
     level = (2.0 * uniform[:, :2] - 1.0) * xp.asarray(throw.land)
     land = xp.concatenate([level, xp.zeros_like(level[:, :1])], axis=1)
@@ -220,7 +220,7 @@ def _harmonic(uniform: PyTree) -> tuple[HarmonicPath, PyTree]:
 
 
 def _triangle(uniform: PyTree) -> tuple[BallPath, PyTree]:
-    """Make three targets along the sides of a triangle, with latest times of their catches [s]."""
+    """Make three random targets along a triangle's sides, and latest times of their catches [s]."""
     xp, u = _module(uniform), uniform[:, :, None]
     centre = xp.concatenate([uniform[:, :2] - 0.5, _between(uniform[:, 2:3], 1.5, 2.5)], axis=1)
     corner = 2.0 * np.pi * (u[:, 3] + np.arange(3) / 3.0)
@@ -231,7 +231,7 @@ def _triangle(uniform: PyTree) -> tuple[BallPath, PyTree]:
 
 
 def _polygon(uniform: PyTree, *, num: int) -> tuple[BallPath, PyTree]:
-    """Make parallel targets at a polygon's corners, with latest times of their catches [s]."""
+    """Make `num` targets of equal velocity from random numbers, and latest times of catches [s]."""
     xp, u = _module(uniform), uniform[:, :, None]
     near = xp.concatenate([uniform[:, :2] - 0.5, _between(uniform[:, 2:3], 1.5, 2.5)], axis=1)
     corner = 2.0 * np.pi * (u[:, 3] + np.arange(num) / num)
@@ -257,7 +257,7 @@ def _rush(
 
 
 def _swarm(uniform: PyTree, *, num: int) -> tuple[BallPath, PyTree]:
-    """Make `num` sinking balls from random numbers, with latest times of their catches [s]."""
+    """Make `num` sinking balls from random numbers, and latest times of their catches [s]."""
     xp, u = _module(uniform), uniform.reshape(len(uniform), num, 6)
     height, sinking = _between(u[..., 2:3], 2.0, 6.0), _between(u[..., 3:4], 0.4, 2.0)
     level = 6.0 * xp.sqrt(u[..., 1:2]) * _unit(2.0 * np.pi * u[..., 0])

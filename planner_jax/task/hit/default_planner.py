@@ -57,7 +57,7 @@ _SMALL_MARGIN = (
     ("velocities", True),
 )
 _VELOCITY_SCALE = 2.0  # unit of the offsets of velocities; measured units range from 0.6 to 7
-_PASSING = 0.9  # greatest speed at the ball in a guess, as a fraction of the speed limit
+_PASSING = 0.9  # greatest speed at the ball in a starting point / speed limit
 # Starting points, the most successful first. Columns: time of the impact / time at which the ball
 # would land without a hit; flight time after the impact [s]; thrust per unit mass / gravity.
 _GUESSES = np.array(
@@ -143,7 +143,7 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
     impact_weight: float = 0.3  # [s] weight of the penalties for apex and hitting speed
     rounds: tuple[Round, ...] = _ROUNDS
     velocities: bool = False  # whether the velocities at the waypoints are variables
-    learned: bool = True  # whether a network improves the first guess of usual cases
+    learned: bool = True  # whether a network predicts starting points of usual cases
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -177,7 +177,7 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
         return scale[:places] + (_VELOCITY_SCALE,) * places + scale[places:]
 
     def start_network(self, case: HitCase) -> StartNetwork | None:
-        """Return the network that predicts the first guess; None if there is no such network.
+        """Return the network that predicts a starting point; None if there is no such network.
 
         Networks exist for the default pieces and scales, one without and one with waypoint
         velocities as variables. There is none for cases with the user's extra terms, such as
@@ -226,7 +226,7 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
         return prepare_hit(case, self.num_table_nodes)
 
     def guess_ends(self, context: HitContext, num: int) -> Array:
-        """Return the 8 variables of the impact for the first `num` rows of `guess_table`."""
+        """Return the 8 variables of the impact in the first `num` starting points, (num, 1, 8)."""
         fraction, flight_time, thrust = jnp.asarray(_GUESSES[:num], context.landing_time.dtype).T
         times = jnp.stack(
             [
@@ -243,7 +243,7 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
         return natural[:, None]
 
     def _set_passing_speed(self, natural: Array, context: HitContext) -> Array:
-        """Return a guess (8,) in which the racket's velocity across its normal is set.
+        """Set the racket's velocity across its normal in the 8 variables `natural` of an impact.
 
         The velocity is the final velocity of a motion from the start to the impact at constant
         acceleration. Its magnitude is limited to `_PASSING` times the speed limit.

@@ -27,7 +27,8 @@ from planner_jax.task.hit.plan import HitPlan
 from planner_jax.trajectory.polynomial import evaluate, states_at, total_duration
 
 _SHORTEST = 0.01  # [s] least time to the impact in a starting point
-_TRIALS = (1.0, 0.2, 0.04)  # step lengths; the first direction is too long, as it ignores curvature
+# Step lengths that a search tries; its first direction is too long, because it ignores curvature.
+_TRIALS = (1.0, 0.2, 0.04)
 
 
 @struct.dataclass
@@ -104,7 +105,7 @@ class ReplanHit(OptimisedPlanner):
         return planner.join(jnp.zeros((1, planner.num_offsets // 3, 3), sizes.dtype), natural[None])
 
     def guesses(self, context: ReplanHitContext, num: int) -> Array:
-        """Return `num` starting points: the previous plan's impact, then the planner's guesses."""
+        """Return `num` starting points: the previous impact, then those for planning anew."""
         first = context.start[None]
         if num == 1:
             return first

@@ -120,7 +120,10 @@ def _random(seed: int, stream: int, block: int) -> np.random.Generator:
 
 
 def _draw_block(chosen: np.ndarray, seed: int, block: int):
-    """Draw N serves, `_ROUNDS` of each scenario: scenarios (N,), positions, velocities (N, 3)."""
+    """Draw N serves, `_ROUNDS` of each scenario in `chosen`.
+
+    Return their scenarios (N,), positions (N, 3) [m] and velocities (N, 3) [m/s].
+    """
     random = _random(seed, _SERVE_STREAM, block)
     scenario = random.permuted(np.tile(chosen, (_ROUNDS, 1)), axis=1).ravel()
     states = np.zeros((2, len(scenario), 3))
@@ -184,9 +187,10 @@ def _aim_table() -> _AimTable:
 
 
 def _aim(distance: np.ndarray, rise: np.ndarray):
-    """Return the horizontal speeds [m/s] of serves with vertical speeds `rise` for `distance` [m].
+    """Return the horizontal speeds [m/s] of serves that land after a horizontal `distance` [m].
 
-    The other results are the derivatives of the speeds by distance [1/s], and flight times [s].
+    Their vertical speeds are `rise` [m/s]. The other results are the derivatives of the speeds by
+    distance [1/s], and flight times [s].
     """
     drag_free_time = (rise + np.sqrt(rise**2 + 2.0 * GRAVITY * SERVE_HEIGHT)) / GRAVITY
     speed = distance / drag_free_time * (1.0 + 0.5 * DRAG * distance)

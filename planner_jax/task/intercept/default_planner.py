@@ -190,7 +190,7 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
     def _guess(
         self, case: InterceptCase, found: Reachability, noise: PathNoise, attempt: Search
     ) -> Guess:
-        """Draw a random path of cells that meets the target, and return the guess along it.
+        """Draw a random path of cells that meets the target; return the starting point along it.
 
         The path ends at the case's time if `meet` is "given", at one of the two earliest times at
         which the car can meet the target if "early", and at any such time if "least".

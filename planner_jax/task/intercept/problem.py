@@ -113,11 +113,11 @@ class MotionProblem:
         return dataclasses.replace(plan, cost=time) if self.meet == "early" else plan
 
     def guess_at(self, point: Array) -> Guess:
-        """Return a guess with given unknowns, for stages that follow no path of cells."""
+        """Return a starting point with given unknowns, for stages that follow no path of cells."""
         return Guess(point=point, positions=jnp.zeros((self.pieces, 2), point.dtype))
 
     def guess_along(self, case: InterceptCase, grid: Grid, path: CellPath, layer: Array) -> Guess:
-        """Return a guess whose motion follows a path of cells, headings and speeds over time.
+        """Return a starting point whose motion follows a path of cells, headings and speeds.
 
         The path has one cell for each time of the grid, the layers. It meets the target at the
         layer with the index `layer` () int32.
@@ -207,7 +207,7 @@ class MotionProblem:
         )
 
     def list_stages(self, attempt: Search) -> list[Stage]:
-        """Return the stages of least squares from a guess that follows a path of cells."""
+        """Return the stages of least squares from a starting point that follows a path of cells."""
         return [Stage(_FOLLOWING, attempt.following), *self.list_last_stages(attempt)]
 
     def list_last_stages(self, attempt: Search | Warm) -> list[Stage]:
@@ -266,7 +266,7 @@ class MotionProblem:
         attempt: Search | Warm,
         stages: list[Stage],
     ) -> InterceptPlan:
-        """Run the stages from a guess; of the last two stages' plans return the better one."""
+        """Run the stages from `guess`; of the last two stages' plans return the better one."""
         points, steps = self.run_stages(case, field, guess, attempt, stages)
         plans = lax.map(lambda point: self.decode(case, point, steps), points[-2:])
         before, after = (jax.tree.map(lambda leaf, k=k: leaf[k], plans) for k in range(2))

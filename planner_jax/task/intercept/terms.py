@@ -32,7 +32,7 @@ class Weights:
     effort: float = 0.064  # [s^3/m^2], of the integral of the squared acceleration
     early: float = 300.0  # of the meeting time divided by the case's time, if the time is free
     turning: float = 3e-3  # [m^2 s], of the integral of the squared rate of curvature
-    follow: float = 0.0  # [1/m^2], of the distance at knots from the positions of a guess
+    follow: float = 0.0  # [1/m^2], of the distance at knots from a path of cells
     margin: float = 0.03  # [m], distance from obstacles below which they are penalised
     slack: float = 0.015  # a value is penalised above (1 - slack) times its limit
 
