@@ -111,7 +111,7 @@ def describe(bench: Bench, library: Library) -> None:
 
 
 def referee(bench: Bench, library: Library, num: int, name: str) -> None:
-    """Draw `num` balls through tunnels with stored motions; report how many the motions block.
+    """Draw `num` balls through pairs of cells with stored motions; report how many are blocked.
 
     The referee, an independent check in float64, judges each motion. The function also counts
     motions that the planner reports as blocking and the referee rejects. `name` labels the printed
@@ -259,7 +259,7 @@ def batch_queries(bench: Bench, library: Library, batch: int) -> None:
 def measure_repair(bench: Bench, library: Library, shift: float, num: int) -> None:
     """Move the pole along y by `shift` [m], and time planning again all motions that now collide.
 
-    Then the referee, an independent check, judges `num` balls through tunnels of the new library.
+    Then the referee, an independent check, judges how the new library blocks `num` balls.
     """
     scene = library.setting.scene
     pole: Any = np.asarray(scene.pole) + np.array([0.0, shift], np.float32)

@@ -174,7 +174,7 @@ class Lattice:
         ]
 
     def _draw_walls(self) -> list[int]:
-        """Return for each heading the cells at which the car is on the map and touches no wall."""
+        """Return for each heading the cells in which the car is on the map and touches no wall."""
         scene, pad = self.scene, int(np.ceil(max(self.ahead) / _FINE)) + 1
         fine = [
             self.origin[k] + _FINE * np.arange(-pad, FINER * self.count[k] + pad) for k in (0, 1)

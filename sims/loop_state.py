@@ -35,7 +35,7 @@ class Pilot(Protocol):
     """A task's part of the closed loop, which poses planning problems and selects plans."""
 
     def pose_problem(self, case: Any, plan: Any, outlook: Outlook) -> Any:
-        """Return the planning problem of the situation `outlook`; `plan` is the current plan."""
+        """Return the planning problem of the predicted situation `outlook` and the current plan."""
         ...
 
     @property
@@ -44,7 +44,7 @@ class Pilot(Protocol):
         ...
 
     def choose(self, asked: Any, outlook: Outlook, found: tuple[Any, ...]) -> tuple[Any, Array]:
-        """Select one of the found plans; return it, and whether to replace the current plan."""
+        """Select one of the plans `found`; return it, and whether it replaces the current plan."""
         ...
 
     def times(self, plan: Any) -> Array:

@@ -79,7 +79,7 @@ class Frame(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Launches:
-    """The states of N balls of F flights before and after their simulation, in NumPy."""
+    """States of N balls of F flights, to compute the parts of flights that are not simulated."""
 
     balls: BallState  # leaves (F, N, 3), each at the start of the plan for it
     drag: Any  # (F, N), true drag coefficient K_D [1/m]

@@ -57,8 +57,8 @@ class Throws(FlightCases):
 class Budget:
     """Parts of the times (B,) [s] until B balls enter the inner box [Natarajan2024, eq. 1].
 
-    The inner box stands around the arm. The parts add up to a ball's time of flight. An arm whose
-    plan takes longer than the planning budget starts late.
+    The arm protects the inner box. The parts add up to a ball's time of flight. An arm whose plan
+    takes longer than the planning budget starts late.
     """
 
     sense: np.ndarray  # [s], until the ball's flight is known
@@ -71,7 +71,7 @@ class Budget:
 
     @property
     def flight(self) -> np.ndarray:
-        """The times (B,) [s] until B balls enter the inner box around the arm."""
+        """The times (B,) [s] until B balls enter the inner (protected) box."""
         return np.sum([getattr(self, field.name) for field in dataclasses.fields(self)], axis=0)
 
 

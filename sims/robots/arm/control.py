@@ -51,7 +51,7 @@ class JointReference:
 
 
 def reference_at(course: Course, time: Array) -> JointReference:
-    """Return the planned state of the joints at a time () [s] of a course.
+    """Return the planned state of the joints at a time () [s] of a course (a timed motion).
 
     Before the motion starts, each joint moves at its initial rate, which is mostly zero. After the
     motion's end each joint brakes at a constant deceleration, and then stands still.

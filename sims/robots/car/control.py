@@ -29,7 +29,7 @@ class Gains:
 
     @property
     def across(self) -> tuple[float, float]:
-        """Extra curvature per lateral error [1/m^2] and per heading error [1/m]."""
+        """Gains of the regulator: extra curvature per lateral [1/m^2] and heading error [1/m]."""
         place = self.bend / self.reach
         return place, float(np.sqrt((self.bend / self.turn) ** 2 + 2.0 * place))
 
