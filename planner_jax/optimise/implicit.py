@@ -89,12 +89,7 @@ def newton_refine(
     return state.point, state.slope
 
 
-def optimal_plan(
-    planner: Planner,
-    case: PyTree,
-    *,
-    solver: LbfgsConfig | None = None,
-) -> PyTree:
+def optimal_plan(planner: Planner, case: PyTree, *, solver: LbfgsConfig | None = None) -> PyTree:
     """Return the plan at the local optimum near the planner's guess, differentiable by the case.
 
     `jax.grad` and `jax.jacobian` of any number in the plan, by any leaf of the case, use the

@@ -32,11 +32,7 @@ class Obstacles:
 
 
 def obstacles(
-    polygons: object,
-    velocities: object = 0.0,
-    *,
-    room: object = None,
-    dtype: object = jnp.float32,
+    polygons: object, velocities: object = 0.0, *, room: object = None, dtype: object = jnp.float32
 ) -> Obstacles:
     """Make the obstacles of one case from lists of corners.
 

@@ -42,12 +42,7 @@ _ORDER = 4  # derivative whose square is minimised: snap
 # and of each catch: logarithm of the duration, position, velocity, acceleration, jerk.
 _OFFSET_SCALE = 0.05
 _CATCH_SCALE = (0.035, *(0.06,) * 3, *(0.6,) * 3, *(1.2,) * 3, *(2.4,) * 3)
-_PATIENT = {
-    "memory": 16,
-    "trial_steps": (1.0, 2.5, 0.3, 0.05),
-    "tolerance": 1e-8,
-    "patience": 10,
-}
+_PATIENT = {"memory": 16, "trial_steps": (1.0, 2.5, 0.3, 0.05), "tolerance": 1e-8, "patience": 10}
 COST_UNIT = 1e3  # divisor of the cost, so that the Hessian has moderate entries
 
 

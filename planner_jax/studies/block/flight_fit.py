@@ -133,8 +133,7 @@ def fit_flight(times: Array, places: Array, information: ArrayLike, gravity: Arr
     unseen = jnp.where(num == 0, Sight.NEVER_SEEN, Sight.SEEN_ONCE)
     return FlightFit(
         belief=EkfState(
-            mean=jnp.where(enough, mean, jnp.nan),
-            covariance=jnp.where(enough, covariance, jnp.nan),
+            mean=jnp.where(enough, mean, jnp.nan), covariance=jnp.where(enough, covariance, jnp.nan)
         ),
         time=middle,
         misfit=jnp.where(enough, _root(squares / free), jnp.nan),

@@ -60,12 +60,7 @@ class Aim:
 
 # Requirements on a contact in the order in which they are tried, the strictest first. Each is tried
 # for the balls for which no plan meets the previous requirements.
-AIMS = (
-    Aim(0.005, at_rest=True, edge=0.05),
-    Aim(0.005, edge=0.05),
-    Aim(0.03, edge=0.03),
-    Aim(0.09),
-)
+AIMS = (Aim(0.005, at_rest=True, edge=0.05), Aim(0.005, edge=0.05), Aim(0.03, edge=0.03), Aim(0.09))
 
 
 @struct.dataclass

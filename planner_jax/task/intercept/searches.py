@@ -141,11 +141,7 @@ _LATER = (
     Search(8, seed=1, body_scale=0.9),
     dataclasses.replace(_GIVEN[2], solver=LevenbergConfig(30)),
 )
-SEARCHES = {
-    "given": _GIVEN,
-    "early": (_EARLY, *_LATER),
-    "least": (_LEAST, *_LATER),
-}
+SEARCHES = {"given": _GIVEN, "early": (_EARLY, *_LATER), "least": (_LEAST, *_LATER)}
 
 
 @struct.dataclass

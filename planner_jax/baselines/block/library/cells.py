@@ -187,10 +187,7 @@ def tunnels(layout: Layout, inner: Box, outer: Box) -> Tunnels:
     begin[rows, near, axis] = side * np.maximum(side * begin[rows, near, axis], side * plane)
     feasible = side * (begin[rows, far, axis] - plane) > 1e-6
     return Tunnels(
-        outer=begin,
-        inner=end,
-        is_feasible=feasible,
-        is_centred=side * (middle - plane) > 1e-6,
+        outer=begin, inner=end, is_feasible=feasible, is_centred=side * (middle - plane) > 1e-6
     )
 
 
