@@ -28,7 +28,6 @@ def run() -> None:
 
 
 def _is_on_cpu() -> bool:
-    """Return whether JAX will certainly compute on a CPU."""
     plugins = importlib.util.find_spec("jax_plugins")  # exists if JAX can use a GPU or a TPU
     return plugins is None or os.environ.get("JAX_PLATFORMS") == "cpu"
 

@@ -41,7 +41,7 @@ def test_programs_are_recorded_with_their_equations():
 
 @pytest.mark.slow
 def test_the_doctor_lists_programs_of_planners(monkeypatch, capsys):
-    monkeypatch.setattr(compilation, "_EXAMINED", (("hit", None), ("catch", "throws")))
+    monkeypatch.setattr(compilation, "_EXAMINED", ("hit", "catch throws"))
     monkeypatch.setattr(compilation, "BATCH", 2)
     usual = jax.config.jax_enable_compilation_cache
     try:

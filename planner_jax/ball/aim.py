@@ -117,8 +117,7 @@ def _compute_climb(vel: Array, flight_time: Array, drag: Array, gravity: Array) 
     rising = jnp.maximum(vels[:, 2], 0.0)
     speed = jnp.sqrt(jnp.maximum(jnp.sum(vels**2, axis=1), 1e-12))
     reach = height + 0.5 * rising**2 / (gravity + drag * speed * rising * 2.0 / 3.0)
-    last = jnp.maximum(jnp.sum(vels[:, 2] > 0.0) - 1, 0)
-    return reach[last]
+    return reach[jnp.maximum(jnp.sum(vels[:, 2] > 0.0) - 1, 0)]
 
 
 _climb = jax.custom_jvp(_compute_climb)

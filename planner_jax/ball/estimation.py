@@ -88,8 +88,7 @@ def ekf_predict(
     """
 
     def transition(mean: Array) -> Array:
-        before = BallState(pos=mean[:3], vel=mean[3:])
-        after = flight(before, duration, model.drag, model.gravity)
+        after = flight(BallState(pos=mean[:3], vel=mean[3:]), duration, model.drag, model.gravity)
         return jnp.concatenate([after.pos, after.vel])
 
     F = jax.jacfwd(transition)(state.mean)

@@ -197,8 +197,6 @@ def solve_impact(ball_vel: Array, ball_vel_after: Array, restitution: Array) -> 
     """
     change = ball_vel_after - ball_vel
     size_squared = jnp.sum(change**2)
-    distinct = size_squared > 0.0
-    normal = change * inverse_sqrt(jnp.where(distinct, size_squared, 1.0))
+    normal = change * inverse_sqrt(jnp.where(size_squared > 0.0, size_squared, 1.0))
     mean = (restitution * ball_vel + ball_vel_after) * reciprocal(1.0 + restitution)
-    normal_speed = jnp.sum(mean * normal)
-    return normal, normal_speed
+    return normal, jnp.sum(mean * normal)

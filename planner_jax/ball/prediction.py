@@ -97,8 +97,7 @@ def _node_function(num_nodes: int) -> Callable:
     @functools.cache
     def slopes(moving: tuple[int, ...]) -> Callable:
         """Build the function that differentiates the nodes by the arguments at indices `moving`."""
-        derivatives = jax.jacfwd(integrate, argnums=moving)
-        return with_kernel(derivatives, path, num_nodes, moving)
+        return with_kernel(jax.jacfwd(integrate, argnums=moving), path, num_nodes, moving)
 
     def jvp(primals: tuple, tangents: tuple) -> tuple:
         nodes = integrate_lanes(*primals)
@@ -153,8 +152,7 @@ def target_at(table: PathTable, time: Array) -> BallState:
     first = index.astype(jnp.int32)
 
     def read(nodes: Array) -> Array:
-        window = jax.lax.dynamic_slice_in_dim(nodes, first, 4)
-        return jnp.sum(weights[:, None] * window, axis=0)
+        return jnp.sum(weights[:, None] * jax.lax.dynamic_slice_in_dim(nodes, first, 4), axis=0)
 
     vel = read(table.vel)
     return BallState(pos=read(table.pos) + vel * (time - inside), vel=vel)

@@ -14,16 +14,14 @@ from collections.abc import Iterator
 from pathlib import Path
 
 BATCH = 64  # number of cases of the batch whose programs are listed
-# Tasks and suites (None for the task's default suite) for which the default planner is examined.
-_EXAMINED = (
-    *(("hit", None), ("catch", "throws"), ("catch", "triangle3")),
-    *(("intercept", "hard"), ("block", None)),
-)
+# Tasks whose default planners are examined, with a suite if it is not the task's default suite.
+_EXAMINED = ("hit", "catch throws", "catch triangle3", "intercept hard", "block")
 _SMALL = 0.05  # [s] programs that compile faster have no row, and only count in the sums
-_EVENTS = {  # fields of `Program` that hold the durations of JAX's events
-    "/jax/core/compile/jaxpr_trace_duration": "tracing",
-    "/jax/core/compile/jaxpr_to_mlir_module_duration": "lowering",
-    "/jax/core/compile/backend_compile_duration": "compiling",
+# Fields of `Program` that hold the durations of JAX's events /jax/core/compile/NAME_duration.
+_EVENTS = {
+    "jaxpr_trace": "tracing",
+    "jaxpr_to_mlir_module": "lowering",
+    "backend_compile": "compiling",
 }
 _HEAD = (
     "| planner | cases | program | versions | equations | tracing [s] | lowering [s] "
@@ -44,16 +42,13 @@ class Program:
 
 @contextlib.contextmanager
 def record_programs() -> Iterator[dict[str, Program]]:
-    """Record the programs that JAX compiles in a `with` block, by the names of their functions.
-
-    The dictionary is filled at the end of the block.
-    """
+    """Record the programs that JAX compiles in a `with` block; the record is whole at its end."""
     import jax
 
     programs: dict[str, Program] = collections.defaultdict(Program)
-    found: dict[str, Program] = {}
 
     def listen(event: str, seconds: float, fun_name: str = "", **_: object) -> None:
+        event = event.removeprefix("/jax/core/compile/").removesuffix("_duration")
         if field := _EVENTS.get(event):
             program = programs[fun_name.removeprefix("jit(").removesuffix(")")]
             setattr(program, field, getattr(program, field) + seconds)
@@ -64,7 +59,7 @@ def record_programs() -> Iterator[dict[str, Program]]:
         jax.config.update("jax_dump_ir_to", folder)  # JAX writes a text file for each program
         jax.monitoring.register_event_duration_secs_listener(listen)
         try:
-            yield found
+            yield programs
         finally:
             jax.monitoring.unregister_event_duration_listener(listen)
             jax.config.update("jax_dump_ir_to", "")
@@ -72,14 +67,12 @@ def record_programs() -> Iterator[dict[str, Program]]:
             name = re.sub(r"^jax_\d+_|\.jaxpr\.txt$", "", path.name)
             programs[name].equations += len(re.findall(r"^\s*\S.* = ", path.read_text(), re.M))
     # Functions within a program are traced as well, but are not compiled by themselves.
-    found |= {name: program for name, program in programs.items() if program.versions}
+    for name in [name for name, program in programs.items() if not program.versions]:
+        del programs[name]
 
 
 def format_rows(planner: str, num: int, seconds: float, programs: dict[str, Program]) -> list[str]:
-    """Format rows of the table: a planner's programs for `num` cases, the longest to compile first.
-
-    The last row has the sums over all programs, and the duration `seconds` of the first plan.
-    """
+    """Format a planner's rows of the table, the slowest program first, and a last row of sums."""
     columns = zip(*map(dataclasses.astuple, programs.values()), strict=True)
     shown = [row for row in programs.items() if row[1].compiling >= _SMALL]
     shown.sort(key=lambda row: -row[1].compiling)
@@ -102,12 +95,13 @@ def report() -> None:
 
     jax.config.update("jax_enable_compilation_cache", False)
     print(f"Compiling the default planners, which takes minutes.\n{_HEAD}", flush=True)
-    for name, suite in _EXAMINED:
+    for planner in _EXAMINED:
+        name, *suite = planner.split()
         task = task_named(name)
-        batch = jax.tree.map(np.asarray, task.draw(BATCH, *filter(None, [suite])))
+        batch = jax.tree.map(np.asarray, task.draw(BATCH, *suite))
         for num, cases in ((1, take(batch, 0)), (BATCH, batch)):
             start = time.perf_counter()
             with record_programs() as programs:
                 jax.block_until_ready(plan(task.planner(), cases))
-            shown, seconds = f"{name} {suite or ''}".strip(), time.perf_counter() - start
-            print("\n".join(format_rows(shown, num, seconds, programs)), flush=True)
+            seconds = time.perf_counter() - start
+            print("\n".join(format_rows(planner, num, seconds, programs)), flush=True)

@@ -58,7 +58,6 @@ def _devices() -> Finding:
 
 
 def _kernels() -> Finding:
-    """Report whether GPU kernels replace JAX's operations, which makes planning faster."""
     from planner_jax.lanes import kernels
 
     state = kernels.kernels()
@@ -85,7 +84,6 @@ def _precision() -> Finding:
 
 
 def _cache(folder: Path | None) -> Finding:
-    """Report the folder of compiled programs, its size, and the limit of the default folder."""
     if folder is None or not folder.is_dir():
         is_off = os.environ.get(SWITCH) == "off"
         text = f"off, by {SWITCH}" if is_off else "no folder for compiled programs can be made"

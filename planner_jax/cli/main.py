@@ -1,7 +1,4 @@
-"""Entry point of the program `planner-jax`: it parses the command line and runs a command.
-
-The tasks come from the registry, and their options are the fields of their settings.
-"""
+"""Entry point of the program `planner-jax`: it parses the command line and runs a command."""
 
 import functools
 import sys
@@ -23,8 +20,7 @@ _INTERRUPTED = 130  # exit code after Ctrl-C
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command of `planner-jax`, by default with the arguments of the process.
 
-    Returns the exit code: 0 for success, 1 if the command fails, 2 for a bad argument, 130 after
-    Ctrl-C.
+    Returns the exit code: 0 for success, 1 for a failure, 2 for a bad argument, 130 after Ctrl-C.
     """
     flags: dict[str, str] = {}  # options of the command by argument name, such as "num": "--num"
     try:

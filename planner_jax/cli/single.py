@@ -172,8 +172,7 @@ def _serve(settings: ServeSettings) -> None:
     keep_compiled_programs()
     names = ("rate", "horizon", "deadline", "noise")
     options = {name: vars(settings)[name] for name in names}
-    planner = LivePlanner(settings.stroke(), **options)
-    server = Server(planner, settings.port)
+    server = Server(LivePlanner(settings.stroke(), **options), settings.port)
     print("Compiling the planner.", file=sys.stderr, flush=True)
     server.warm_up()
     report = server.planner.report

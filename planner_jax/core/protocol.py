@@ -208,8 +208,7 @@ class Decision(Protocol):
     def rank(self, plans: PyTree, /) -> Array:
         """Return one number for each plan, by default its cost; pure.
 
-        The plan with the least number is selected. The plans have any batch shape, in NumPy or jax
-        arrays.
+        The plan with the least number is selected. The plans have any batch shape.
         """
         return plans.cost
 
@@ -256,10 +255,7 @@ def are_solved(plans: Plan) -> np.ndarray:
 
 
 def mark_bad_input(plans: PlanT, cases: PyTree) -> PlanT:
-    """Return plans with the status `BAD_INPUT` where a number of the case breaks a rule; pure.
-
-    The plans are returned unchanged if the cases have no `rules`.
-    """
+    """Return plans with the status `BAD_INPUT` where a number of the case breaks a rule; pure."""
     if not has_rules(cases):
         return plans
     status = numpy_of(plans.status).where(is_sound(cases), plans.status, Status.BAD_INPUT)
@@ -279,8 +275,7 @@ def is_better(
     Args:
         later: plans of any batch shape.
         before: plans of the same cases.
-        tolerance: greatest violation of a plan that keeps every limit. By default the plan's
-            status decides.
+        tolerance: greatest violation of a solved plan. By default the plan's status decides.
         share: factor on the earlier cost; the later plan must cost less than this product.
     """
     if tolerance is None:
@@ -321,10 +316,7 @@ def select_into(plans: PyTree, later: PyTree, lanes: np.ndarray) -> PyTree:
 
 
 def index_of_best(plans: PyTree, cost: PyTree = None) -> PyTree:
-    """Return the index of the best of K plans for each case; all leaves have the shape (K, ...).
-
-    `cost` (K, ...) replaces the planner's own cost.
-    """
+    """Return the index of the best of K plans (K, ...) per case; `cost` replaces the plans' own."""
     xp = numpy_of(plans.status)
     good = is_solved(plans.status)
     finite = xp.isfinite(plans.cost) & xp.isfinite(plans.violation)

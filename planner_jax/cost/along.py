@@ -191,8 +191,7 @@ def _slopes_by_all(along: Along, columns: Array, durations: Array, parameters: P
         penalty, pull_back, worst = jax.vjp(value, columns, duration, parameters, has_aux=True)
         return penalty, jax.lax.stop_gradient(worst), *pull_back(jnp.ones_like(penalty))
 
-    segments = jax.vmap(of_segment, in_axes=(0, 0, None))
-    return segments(columns, durations, parameters)
+    return jax.vmap(of_segment, in_axes=(0, 0, None))(columns, durations, parameters)
 
 
 def _curvature(along: Along, primals: tuple, tangents: tuple) -> tuple:

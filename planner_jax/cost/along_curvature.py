@@ -151,8 +151,7 @@ def _at_samples(
         parts = {"snap": snap[0]} if snap else {}
         samples = Motion(height=pos[:, 2], vel=vel, acc=acc, jerk=jerk, pos=pos, **parts)
         excess = jnp.stack(along.excess(samples, parameters))
-        hinges = smooth_hinge(excess + margins, along.hinge_width)
-        penalty = jnp.sum(factors * hinges, axis=0)
+        penalty = jnp.sum(factors * smooth_hinge(excess + margins, along.hinge_width), axis=0)
         if along.rate is not None:
             penalty = penalty + along.rate(samples, parameters)
         return jnp.sum(penalty), (penalty, jnp.max(excess))

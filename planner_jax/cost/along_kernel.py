@@ -190,8 +190,7 @@ def _call(
         least = zero if mode == "curvature" else jnp.full_like(duration, -jnp.inf)
         first = grid_index(2) * share
         last = jnp.minimum(first + share, num_samples)
-        start = least, [zero] * num_sums
-        most, sums = jax.lax.fori_loop(first, last, add_sample, start)
+        most, sums = jax.lax.fori_loop(first, last, add_sample, (least, [zero] * num_sums))
         _store(out, [*sums[:_WORST], most, *sums[_WORST:]])
 
     constants = matrices.reshape(num_samples, -1), weights

@@ -49,8 +49,7 @@ def body_rate_excess(
 
     omega follows from acceleration and jerk, since the quadrotor is differentially flat.
     """
-    rate_squared = body_rate_squared(acc, jerk, gravity)
-    return rate_squared * reciprocal(limits.body_rate) ** 2 - 1.0
+    return body_rate_squared(acc, jerk, gravity) * reciprocal(limits.body_rate) ** 2 - 1.0
 
 
 def ground_excess(height: Array, limits: QuadrotorLimits) -> Array:
@@ -240,9 +239,7 @@ def greatest_excess(
     Peaks between samples are included, by parabolas for limits of flight and by tangents for
     extras. The other arguments are as for `greatest_along`.
     """
-    bare = dataclasses.replace(case, extras=())
-    along = flight_along(maps, nodes, bare, 0.0, 1.0)
+    along = flight_along(maps, nodes, dataclasses.replace(case, extras=()), 0.0, 1.0)
     greatest = greatest_along(along, columns, durations, (case.gravity, case.limits, ()))
     extras = jax.vmap(functools.partial(greatest_extras, maps), in_axes=(0, 0, None))
-    flown = relative_excess(case.limits, greatest)
-    return [*flown, *extras(columns, durations, case.extras)]
+    return [*relative_excess(case.limits, greatest), *extras(columns, durations, case.extras)]

@@ -33,8 +33,7 @@ class Format:
 
     summary: str  # short description for the command's help
     robots: tuple[str, ...]  # kinds of robots that are supported: quadrotor, car, arm
-    # For each file extension, the function "module:name" that writes the file. The first extension
-    # is the default.
+    # For each file extension, the function "module:name" that writes it; the first is the default.
     writers: Mapping[str, str]
     is_sampled: bool = True  # True for setpoints at equal time steps, False for polynomials
 
@@ -86,8 +85,7 @@ def export(
     Args:
         plan: one solved plan. `pj.take(plans, k)` selects one from a batch.
         to: name of the format.
-        out: path of the file, whose extension selects the variant of the format. The file must not
-            exist.
+        out: path of the new file, whose extension selects the variant of the format.
         rate: setpoints per second [Hz], 100 by default; not allowed for `crazyflie`.
         recovery: which trajectory to standstill is appended to a plan that does not end at
             standstill. "brake" stops where this costs least, "home" at the robot's first position.
@@ -163,8 +161,7 @@ def bring_to_rest(plan: Plan, recovery: str | None, case: Case | None = None) ->
     """Return one plan with a recovery trajectory, so that the robot ends at standstill.
 
     Args:
-        plan: solved plan of a quadrotor, a car or an arm. If it ends at standstill, it is returned
-            unchanged.
+        plan: solved plan of a robot. If it ends at standstill, it is returned unchanged.
         recovery: "brake" stops where this costs least, "home" at the robot's first position. None
             removes the recovery trajectory.
         case: case of the plan; needed unless the plan ends at standstill.

@@ -21,8 +21,7 @@ _BYTES = 4 * (4 * POWERS + 1)  # [bytes], memory of one piece
 def poly4d(plan: QuadrotorPlan) -> np.ndarray:
     """Return the polynomial pieces of a plan as rows of 33 float32 numbers.
 
-    A row has the duration [s], and then eight coefficients of rising powers for each of x, y, z [m]
-    and yaw [rad].
+    A row has the duration [s], then 8 coefficients of rising powers each of x, y, z [m], yaw [rad].
 
     Raises:
         ArgumentError: the plan cannot be exported, its degree is above 7, it has more pieces than

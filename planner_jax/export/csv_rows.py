@@ -52,5 +52,4 @@ def write_table(file: BinaryIO, header: list[str], columns: list[np.ndarray]) ->
     file.write((",".join(header) + "\n").encode())
     blocks = [np.asarray(column).reshape(len(column), -1) for column in columns]
     for parts in zip(*blocks, strict=True):
-        line = ",".join(str(value) for part in parts for value in part)
-        file.write((line + "\n").encode())
+        file.write((",".join(str(value) for part in parts for value in part) + "\n").encode())

@@ -5,8 +5,7 @@
 | library, ROS | ENU: x east, y north, z up | FLU: forward, left, up | counter-clockwise from east |
 | PX4 | NED: x north, y east, z down | FRD: forward, right, down | clockwise from north |
 
-Both world frames have the same origin. The library's x axis counts as east, whatever its true
-direction.
+Both world frames have the same origin. The library's x axis counts as east.
 """
 
 import numpy as np

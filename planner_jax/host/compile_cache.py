@@ -18,8 +18,7 @@ _CHECKED_EVERY = 3600.0  # [s] Least time between two checks of the folder's siz
 def cache_folder() -> Path:
     """Return the default folder of compiled programs, within the platform's cache folder."""
     usual = "~/Library/Caches" if sys.platform == "darwin" else "~/.cache"
-    home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser(usual)
-    return Path(home, "planner-jax", "jax")
+    return Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser(usual), "planner-jax", "jax")
 
 
 @functools.cache

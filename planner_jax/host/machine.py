@@ -17,8 +17,7 @@ _CGROUP = Path("/sys/fs/cgroup")  # control group of a container, version 2
 
 def available_memory() -> int | None:
     """Return the number of bytes that a process can still allocate; None if unknown."""
-    found = [each for each in (_of_system(), _of_container()) if each is not None]
-    return min(found, default=None)
+    return min([each for each in (_of_system(), _of_container()) if each is not None], default=None)
 
 
 def _of_system() -> int | None:

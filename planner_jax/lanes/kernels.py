@@ -102,8 +102,7 @@ def with_kernel(
             adds an axis elsewhere, such as after a matrix product, the kernel is not called.
         constants: arguments of the factory. Functions of one path with different constants must
             have a different `repr` of them, which identifies programs in the compile cache.
-        jvp: derivative as for `jax.custom_jvp`, with zeros as `SymbolicZero`; by default the
-            function's own.
+        jvp: derivative as for `jax.custom_jvp`, with zeros as `SymbolicZero`; by default JAX's own.
     """
 
     @functools.cache
@@ -155,5 +154,4 @@ def kernel_of(eqn: JaxprEqn) -> Kernel | None:
     )
     if not is_whole:
         return None
-    make_kernel = pkgutil.resolve_name(entry.path)
-    return functools.partial(make_kernel(*entry.constants), entry.treedef)
+    return functools.partial(pkgutil.resolve_name(entry.path)(*entry.constants), entry.treedef)

@@ -58,9 +58,8 @@ def over_lanes(function: Callable[..., Results]) -> Callable[..., Results]:
 
     Returns:
         A function of the same pytrees with the lanes as one more, last, axis on every leaf. Up to
-        rounding it equals `jax.vmap` with all axes -1. Call it inside a compiled function. It
-        cannot be differentiated if `function` has custom derivatives; differentiate within
-        `function`.
+        rounding it equals `jax.vmap` with all axes -1. Call it inside a compiled function. If
+        `function` has custom derivatives, differentiate only within `function`.
     """
 
     @functools.wraps(function)
@@ -71,8 +70,7 @@ def over_lanes(function: Callable[..., Results]) -> Callable[..., Results]:
         closed, shape = jax.make_jaxpr(function, return_shape=True)(
             *jax.tree.unflatten(treedef, single)
         )
-        results = _full_results(closed, leaves, lanes)
-        return jax.tree.unflatten(jax.tree.structure(shape), results)
+        return jax.tree.unflatten(jax.tree.structure(shape), _full_results(closed, leaves, lanes))
 
     return map_lanes
 
@@ -101,8 +99,7 @@ def _evaluate(closed: ClosedJaxpr, args: Sequence[_Value], lanes: int) -> list[_
 
     for eqn in jaxpr.eqns:
         inputs = [read(atom) for atom in eqn.invars]
-        is_same = eqn.primitive.name in _UNCHANGED
-        outputs = inputs if is_same else _outputs(eqn, inputs, lanes)
+        outputs = inputs if eqn.primitive.name in _UNCHANGED else _outputs(eqn, inputs, lanes)
         values.update(zip(eqn.outvars, outputs, strict=True))
     return [read(atom) for atom in jaxpr.outvars]
 
@@ -213,8 +210,7 @@ def _pad(eqn: JaxprEqn, inputs: list[_Value], lanes: int) -> list[Array] | None:
 def _dot_general(eqn: JaxprEqn, inputs: list[_Value], lanes: int) -> list[Array] | None:
     """Multiply by a matrix that all lanes (problems) share: one product, with lanes as columns."""
     (left, right), ((left_dims, right_dims), batch) = inputs, eqn.params["dimension_numbers"]
-    both = isinstance(left, _Lanes) and isinstance(right, _Lanes)
-    if both or batch != ((), ()):
+    if isinstance(left, _Lanes) and isinstance(right, _Lanes) or batch != ((), ()):
         return None
     if isinstance(right, _Lanes):
         return _bind(eqn, [left, right.array])

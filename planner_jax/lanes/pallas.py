@@ -40,8 +40,7 @@ def kernel_call(
     """Make a kernel: a function of arrays that runs a body once for every index of a grid.
 
     Args:
-        body: function that takes references to a block of each input and of each output, and writes
-            the outputs.
+        body: takes references to a block of each input and of each output, and writes the outputs.
         grid: number of indices along each axis.
         inputs: the block of every input.
         outputs: the shape, type and block of every output.

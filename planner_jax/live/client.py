@@ -31,8 +31,7 @@ class Client:
 
         Args:
             pos: (3,) [m].
-            measured: [s], time of the observation by `time.monotonic()`; the default is the time of
-                this call.
+            measured: [s], time of the observation by `time.monotonic()`, by default of this call.
             number: number from 0 to 65535 that identifies the ball.
         """
         return self._send(BALL, measured, pos, number)
@@ -45,10 +44,7 @@ class Client:
         *,
         measured: float | None = None,
     ) -> Answer | None:
-        """Send the robot's position, velocity, acceleration in SI units, and return the answer.
-
-        The other arguments and the result are as for `ball`.
-        """
+        """Send the robot's position, velocity and acceleration in SI units; otherwise as `ball`."""
         return self._send(ROBOT, measured, (*pos, *vel, *acc), 0)
 
     def _send(

@@ -276,8 +276,7 @@ class LivePlanner(Generic[CaseT, PlanT]):
         if flight is None or flight.plan is None or before is None:
             return
         with self.report.stages["rest"].measure():
-            path = flight.plan.trajectory
-            course, is_within = with_recovery(path, self._gravity, self._limits)
+            course, is_within = with_recovery(flight.plan.trajectory, self._gravity, self._limits)
         self.report.counts["endless"] += not is_within
         self._flight = dataclasses.replace(flight, course=course) if is_within else before
         self._before = None
@@ -299,5 +298,4 @@ class LivePlanner(Generic[CaseT, PlanT]):
 
     def _setpoints(self, flight: _Flight[PlanT], due: float) -> np.ndarray:
         times: Any = np.float32(due - flight.start), np.float32(self._period)
-        query = Query(flight.course, *times)
-        return call_packed(setpoints_of, self._num, None, query)
+        return call_packed(setpoints_of, self._num, None, Query(flight.course, *times))

@@ -165,8 +165,7 @@ def _time_left(case: CatchCase) -> Array:
 def _catch_first(attempt: Round, planner: ExactCatch, case: CatchCase) -> CatchPlan:
     """Plan a catch from scratch; the first guess is the earliest catch within the robot's reach."""
     case = dataclasses.replace(case, horizon=_time_left(case))
-    choice = jax.tree.map(lambda leaf: leaf[0], Greedy().propose(case))
-    case = case.with_choice(choice)
+    case = case.with_choice(jax.tree.map(lambda leaf: leaf[0], Greedy().propose(case)))
     return solve_cases(planner, case, planner.load_attempt(attempt, case))
 
 
@@ -209,5 +208,4 @@ class CatchStroke(Stroke[CatchCase, CatchPlan]):
     def _with_ball(self, ball: BallState) -> CatchCase:
         one = BallState(pos=ball.pos[None], vel=ball.vel[None])
         path: Any = self.case.targets
-        targets = dataclasses.replace(path, ball=one)
-        return dataclasses.replace(self._case, targets=targets)
+        return dataclasses.replace(self._case, targets=dataclasses.replace(path, ball=one))

@@ -70,8 +70,7 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
     num_end_variables: ClassVar[int]  # K, for each segment
     guess_table: ClassVar[np.ndarray]  # one row for each starting point, best first
     # Numbers of intervals of each piece at which finished plans are checked: with one segment, with
-    # several. Several need more, as body rates peak sharply where the thrust is small, between
-    # two catches.
+    # several. Between two catches the thrust may be small, where body rates peak sharply.
     decode_nodes: ClassVar[tuple[int, int]] = (32, 48)
     proportions: tuple[float, ...] = (1.0,) * 6  # relative durations of a segment's pieces
     nodes: int = 8  # number of intervals of each piece, at whose ends penalties are evaluated
@@ -205,8 +204,7 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
         if self.time_weight:
             spent = spent + self.time_weight * ends.total_time
         hinges = smooth_hinge(ends.excess + self.margin, self.hinge_width)
-        core = self.end_weight * jnp.sum(hinges) + spent
-        return rows, durations, core, jnp.max(ends.excess)
+        return rows, durations, self.end_weight * jnp.sum(hinges) + spent, jnp.max(ends.excess)
 
     def _count(self, values: Float[Array, " N"], context: PyTree) -> Array:
         return jnp.sum(jnp.where(self.active(context), values, 0.0))

@@ -106,8 +106,7 @@ def chain_curvature(
         return jnp.concatenate(parts, axis=1).ravel()
 
     def products() -> Callable[[Array], Array]:
-        whole = functools.partial(columns_columns, along, given=given)
-        hessian = jax.vmap(whole)(of.at_samples)
+        hessian = jax.vmap(functools.partial(columns_columns, along, given=given))(of.at_samples)
 
         def product(direction: Array) -> Array:
             parts = direction.reshape(num, -1) * scale[None]

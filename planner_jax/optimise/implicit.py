@@ -93,13 +93,11 @@ def optimal_plan(planner: Planner, case: PyTree, *, solver: LbfgsConfig | None =
     """Return the plan at the local optimum near the planner's guess, differentiable by the case.
 
     `jax.grad` and `jax.jacobian` of any number in the plan, by any leaf of the case, use the
-    implicit function theorem. Use float64 (`jax.enable_x64`) where gradients must have more than
-    two correct digits.
+    implicit function theorem. Use float64 (`jax.enable_x64`) for more than two correct digits.
 
     Args:
-        planner: a planner that minimises. If it first decides something or searches for a path, its
-            first decision or path is used, and derivatives treat this decision or path as a
-            constant.
+        planner: a planner that minimises. If it first decides something or searches for a path,
+            derivatives treat its first decision or path as a constant.
         case: one case; derivatives are by its leaves.
         solver: settings of the search before the refinement; 200 iterations by default.
 

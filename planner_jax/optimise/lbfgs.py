@@ -108,8 +108,7 @@ def remember(memory: Memory, step: Array, change: Array) -> Memory:
     keep, moved, inverse = weigh_pair(jnp.sum(step * change), jnp.sum(change**2), jnp.sum(step**2))
 
     def push(old: Array, new: Array) -> Array:
-        pushed = jnp.concatenate([old[1:], new[None]])
-        return jnp.where(keep, pushed, jnp.where(moved, old, 0.0))
+        return jnp.where(keep, jnp.concatenate([old[1:], new[None]]), jnp.where(moved, old, 0.0))
 
     return Memory(
         steps=push(memory.steps, step),
@@ -146,8 +145,7 @@ def _turn(num_pairs: int, step_cap: float) -> Callable:
         memory = remember(memory, step, change)
         return memory, search_direction(memory, grad, step_cap)
 
-    path = "planner_jax.optimise.lbfgs_kernel:turn_kernel"
-    return with_kernel(turn, path, num_pairs, step_cap)
+    return with_kernel(turn, "planner_jax.optimise.lbfgs_kernel:turn_kernel", num_pairs, step_cap)
 
 
 def step(objective: Objective, state: LbfgsState, config: LbfgsConfig) -> LbfgsState:
@@ -168,8 +166,7 @@ def step(objective: Objective, state: LbfgsState, config: LbfgsConfig) -> LbfgsS
     )
     lengths = state.numbers.reach * jnp.asarray(config.trial_steps, grad.dtype)
     trials = jax.vmap(lambda length: objective(state.point + length * direction))(lengths)
-    here = Evaluation(cost, violation)
-    choice = _choose(config, state.numbers, here, lengths, trials)
+    choice = _choose(config, state.numbers, Evaluation(cost, violation), lengths, trials)
     step = jnp.where(choice.going, choice.length * direction, state.step)
     point = jnp.where(choice.going, state.point + step, state.point)
     return LbfgsState(

@@ -161,8 +161,7 @@ def _optimum_at(point: Array, evaluation: Evaluation, config: Solver) -> Optimum
 def solve_round(planner: "OptimisedPlanner", attempt: Round, case: PyTree) -> PyTree:
     """Plan one case with the starts and iterations of one round (attempt); pure.
 
-    The result is the plan of the best start, with its `status` and `iterations`. For many cases
-    `solve_batch` is faster.
+    The result is the plan of the best start. For many cases `solve_batch` is faster.
     """
     last = planner.with_settings(attempt.settings)
     context = last.prepare(case)
@@ -197,8 +196,7 @@ def solve_round(planner: "OptimisedPlanner", attempt: Round, case: PyTree) -> Py
 def solve_batch(planner: "OptimisedPlanner", attempt: Round, cases: PyTree) -> PyTree:
     """Plan a batch of cases with the starts and iterations of one round (attempt); pure."""
     last, num = planner.with_settings(attempt.settings), attempt.starts
-    lanes = jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), cases)
-    contexts = over_lanes(last.prepare)(lanes)
+    contexts = over_lanes(last.prepare)(jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), cases))
     before = planner.with_settings(_stages(attempt)[0].settings)
     starts = over_lanes(lambda context: before.guesses(context, num))(contexts)
     # Each start of each case is one problem of the solver; the starts of a case are adjacent.

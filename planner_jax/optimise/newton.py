@@ -134,8 +134,7 @@ def step(
     numbers, chosen, is_best, going = _choose(
         config, state.numbers, here.evaluation, trials, decrease
     )
-    move = jnp.matmul(chosen, steps, precision=_HIGHEST)
-    point = state.point + jnp.where(going, move, 0.0)
+    point = state.point + jnp.where(going, jnp.matmul(chosen, steps, precision=_HIGHEST), 0.0)
     return NewtonState(
         point=point, best_point=jnp.where(is_best, point, state.best_point), numbers=numbers
     )
@@ -310,5 +309,4 @@ def _choose(
     )
     going = is_unfinished(numbers, config)
     after = jax.tree.map(lambda new, old: jnp.where(going, new, old), after, numbers)
-    shares = jnp.where(is_chosen & moved, 1.0, 0.0)
-    return after, shares, is_best & going, going
+    return after, jnp.where(is_chosen & moved, 1.0, 0.0), is_best & going, going

@@ -197,8 +197,7 @@ def gradient_at(
         return planner.objective(x, context_of(smooth)).cost
 
     def value_of(x: Array, smooth: list) -> Array:
-        plan = planner.decode(x, context_of(smooth))
-        value = number(plan.replace(cost=cost(x, smooth)))
+        value = number(planner.decode(x, context_of(smooth)).replace(cost=cost(x, smooth)))
         if numeric(value) is None:
             raise ArgumentTypeError("of", "one number", value)
         if value.shape:
@@ -236,8 +235,7 @@ def gradient_at(
 
 
 def _by_whole_hessian(product: Product, point: Array) -> tuple[Product, Product]:
-    hessian = jax.vmap(product)(jnp.eye(point.shape[0], dtype=point.dtype))
-    inverse = positive_inverse(hessian)
+    inverse = positive_inverse(jax.vmap(product)(jnp.eye(point.shape[0], dtype=point.dtype)))
     return lambda right: jnp.sum(inverse * right[None], axis=1), product
 
 

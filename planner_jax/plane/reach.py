@@ -118,8 +118,7 @@ def _pack(cells: Array) -> Array:
     """Pack bools (..., W * 32) into the bits of W 32-bit words, an array (W, ...) uint32."""
     bits = cells.reshape(*cells.shape[:-1], -1, 32).astype(jnp.uint32)
     shifts = jnp.expand_dims(jnp.arange(32, dtype=jnp.uint32), tuple(range(cells.ndim)))
-    words = jnp.sum(bits << shifts, axis=-1, dtype=jnp.uint32)
-    return jnp.moveaxis(words, -1, 0)
+    return jnp.moveaxis(jnp.sum(bits << shifts, axis=-1, dtype=jnp.uint32), -1, 0)
 
 
 def _move_y(rows: Array, move: Array) -> Array:
@@ -188,8 +187,7 @@ def _draw_movers(grid: Grid, movers: Obstacles, stencils: Array, time: Array) ->
         row = jnp.where(
             (y >= 0) & (y < _STENCIL), stencil[jnp.clip(y, 0, _STENCIL - 1)], jnp.uint32(0)
         )
-        words = [_word_of(row, at[0] - 32 * word) for word in range(cells // 32)]
-        return jnp.stack(words)
+        return jnp.stack([_word_of(row, at[0] - 32 * word) for word in range(cells // 32)])
 
     return lax.reduce(
         jax.vmap(draw_one)(stencils, at), jnp.uint32(0), lax.bitwise_or, dimensions=(0,)
@@ -214,8 +212,7 @@ def reach_set(
 
     Args:
         grid: positions of the cells and times of the layers, from `grid_of`.
-        field: (cells, cells) [m], distance of every cell's middle from the walls; the first index
-            counts along y.
+        field: (cells, cells) [m], distances of the cells' middles from walls; first index along y.
         movers: moving obstacles.
         vehicle: sizes and limits of the vehicle.
         initial_speed: () [m/s].
@@ -243,8 +240,7 @@ def reach_set(
     # two rounded angles, so that these turns add up to the angle that the turn rate allows.
     before = jnp.arange(lattice.layers + 1, dtype=dtype)[:, None]
     whole = jnp.diff(jnp.floor(before * most[None] + 0.1), axis=0)  # (layers, levels)
-    span = jnp.abs(jnp.arange(-SPAN, SPAN + 1, dtype=dtype))
-    turns = span[None, None] <= whole[..., None]
+    turns = jnp.abs(jnp.arange(-SPAN, SPAN + 1, dtype=dtype))[None, None] <= whole[..., None]
     walls = _pack(field < vehicle.radius)
     stencils = _stencils(grid, movers, vehicle.radius)
     discs = jnp.round(-vehicle.ahead[:, None, None] * direction[None] / grid.cell).astype(jnp.int32)
@@ -253,8 +249,7 @@ def reach_set(
     on_map = (position[None] + middle[:, :, None] > grid.lower[None, :, None]) & (
         position[None] + middle[:, :, None] < grid.upper[None, :, None]
     )
-    columns = _pack(on_map[:, 0])[..., None]
-    allowed = jnp.where(on_map[:, 1], columns, jnp.uint32(0))
+    allowed = jnp.where(on_map[:, 1], _pack(on_map[:, 0])[..., None], jnp.uint32(0))
 
     times = 0.5 * grid.step * jnp.arange(2 * lattice.layers + 2, dtype=dtype)
     halves_needed = 2 * needed + 2

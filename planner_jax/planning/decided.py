@@ -117,8 +117,5 @@ def _explain(decision: Decision, cases: PyTree, status: Array) -> Array:
 
 
 def first_choice(decision: Decision, cases: PyTree) -> PyTree:
-    """Return one case or a batch with the first choice of a decision; nothing is planned.
-
-    The function is pure. Derivatives treat the choice as a constant.
-    """
+    """Return cases with a decision's first choice, which derivatives treat as constant; pure."""
     return cases.with_choice(_propose_all(decision, lax.stop_gradient(cases))[0])

@@ -125,8 +125,7 @@ def _plan_purely(planner: Planner, attempts: Sequence[Attempt], cases: PyTree) -
 def _solve_by(planner: Planner, cases: PyTree, loaded: Sequence[PyTree], k: Array | int) -> PyTree:
     if len(loaded) == 1:
         return solve_cases(planner, cases, loaded[0])
-    chosen = jax.tree.map(lambda *leaves: jnp.stack(leaves)[k], *loaded)
-    return solve_cases(planner, cases, chosen)
+    return solve_cases(planner, cases, jax.tree.map(lambda *leaves: jnp.stack(leaves)[k], *loaded))
 
 
 def require_pure(planner: Planner) -> None:

@@ -107,10 +107,7 @@ def _require_layout(chunk: object, devices: object) -> None:
 
 
 def _require_own_precision(leaves: list[PyTree]) -> None:
-    """Raise `TypeError` if all floating-point arrays are float64 while JAX computes in float32.
-
-    Cases that mix float32 with float64, the default type of NumPy, are accepted.
-    """
+    """Raise `TypeError` if all floating-point arrays are float64 while JAX computes in float32."""
     if jax.config.jax_enable_x64:  # type: ignore[attr-defined]
         return
     kinds = (leaf.dtype if isinstance(leaf, _ARRAYS) else None for leaf in leaves)

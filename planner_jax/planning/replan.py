@@ -52,8 +52,7 @@ def check_elapsed(cases: Case, elapsed: PyTree) -> np.ndarray:
 def resolve_argument(name: str, given: PyTree, own: PyTree, elapsed: np.ndarray) -> np.ndarray:
     """Return an argument's value: `given` by the caller or, if that is None, `own` of the plan.
 
-    Both values are for one case, or for each case of a batch. The result has the batch shape and
-    the type of `elapsed`.
+    Both values are for one case, or for each case. The result has the shape and type of `elapsed`.
 
     Raises:
         TypeError: the argument does not hold numbers.

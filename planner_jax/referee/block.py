@@ -113,8 +113,7 @@ def referee_blocks(
 ) -> BlockVerdict:
     """Decide for every plan of a batch of blocks whether it succeeds.
 
-    Angles, rates and accelerations are compared with their limits at the ends of each piece and at
-    their extrema inside.
+    Angles, rates and accelerations are tested at the ends of each piece and at their extrema.
 
     Clearances are computed at the ends of the pieces and at samples between them. Samples are at
     most `LONGEST_STEP` and `LARGEST_TURN` apart, but not closer than 0.17 ms. At samples the
@@ -286,8 +285,7 @@ def _judge_limits(case: dict, motion: _Motion, extremes: list, relative: float) 
     for name, (values, times) in zip(("velocity", "acceleration"), extremes[1:], strict=True):
         size, limit = np.abs(values), case[f"limits.{name}"].T[..., None]
         test(name, above(size, limit, relative, times)[1], motion.starts + times, relative)
-        share = size / np.maximum(limit, SMALLEST_LIMIT)
-        measured[f"{name}_share"] = share.max(axis=(0, 1, 3))
+        measured[f"{name}_share"] = (size / np.maximum(limit, SMALLEST_LIMIT)).max(axis=(0, 1, 3))
     return measured, tests, parts
 
 
@@ -347,8 +345,7 @@ def _sample(
     behind = np.cumsum(count, axis=1)
     piece = (sample >= behind[..., None]).sum(axis=1).clip(max=count.shape[1] - 1)  # (B, S)
     rows, lanes = np.arange(len(lanes))[:, None], lanes[:, None]
-    steps = count[rows, piece]
-    share = np.minimum((sample - behind[rows, piece]) / steps + 1.0, 1.0)
+    share = np.minimum((sample - behind[rows, piece]) / count[rows, piece] + 1.0, 1.0)
     local = share * motion.durations[lanes, piece]
     angles = derivative(motion.coeffs[:, :, lanes, piece], local, 0)
     return motion.starts[lanes, piece] + local, angles

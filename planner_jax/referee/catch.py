@@ -210,8 +210,7 @@ def _follow_targets(targets, order: np.ndarray, times: np.ndarray) -> tuple[np.n
         vel, amplitude = leaf("vel", targets.vel, 3), leaf("amplitude", targets.amplitude, 3)
         rate = leaf("rate", targets.rate)[..., None]
         angle = rate * times[..., None] + leaf("phase", targets.phase)[..., None]
-        start = leaf("pos", targets.pos, 3)
-        pos = start + vel * times[..., None] + amplitude * np.sin(angle)
+        pos = leaf("pos", targets.pos, 3) + vel * times[..., None] + amplitude * np.sin(angle)
         states = pos, vel + amplitude * rate * np.cos(angle)
     elif "resolution" in fields:
         nodes = np.shape(targets.pos)[2] if np.ndim(targets.pos) == 4 else 0
@@ -348,8 +347,7 @@ def _judge_catches(case, pieces, held, ends, net_test: str, tolerances: dict) ->
 
     `held` (B, N) is true for catches, and `ends` (B, N) [s] are their times.
     """
-    num = held.shape[1]
-    each = pieces.durations.shape[1] // num
+    each = pieces.durations.shape[1] // held.shape[1]
     tail = np.moveaxis(pieces.coeffs[:, :, each - 1 :: each], -1, 0)
     spans = pieces.durations[:, each - 1 :: each]
     pos, acc = (np.moveaxis(derivative(tail, spans, order), 0, -1) for order in (0, 2))
@@ -399,7 +397,6 @@ def _worst(test: tuple, held: np.ndarray) -> tuple:
     """Reduce a test (failed, excess, time) of catches (B, N) to the worst catch of each plan."""
     failed, excess, time = test
     failed = failed & held
-    counts = failed | (held & np.isnan(excess))
-    value = np.where(counts, excess, -np.inf)
+    value = np.where(failed | (held & np.isnan(excess)), excess, -np.inf)
     pick, lanes = value.argmax(axis=1), np.arange(len(value))
     return failed.any(axis=1), value[lanes, pick], time[lanes, pick]

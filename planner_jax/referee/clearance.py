@@ -104,8 +104,7 @@ def _separation(corners, normals, pose, half) -> np.ndarray:
         return np.stack([cos * x + sin * y, cos * y - sin * x], axis=2)
 
     points, out = rotate(corners - pose[:, None, :2]), rotate(normals)
-    height = (out * points).sum(axis=2)
-    beyond = -height - (np.abs(out) * half[:, None]).sum(axis=2)
+    beyond = -(out * points).sum(axis=2) - (np.abs(out) * half[:, None]).sum(axis=2)
     beyond = np.where(out.any(axis=2), beyond, -np.inf).max(axis=1)
     beside = np.maximum(points.min(axis=1), -points.max(axis=1)) - half
     gap = np.maximum(beyond, beside.max(axis=1))
@@ -116,8 +115,7 @@ def _separation(corners, normals, pose, half) -> np.ndarray:
     square = np.maximum((edge**2).sum(axis=2), _SLACK**2)
     for signs in ((1.0, 1.0), (1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0)):
         away = (half * signs)[:, None] - points
-        share = np.clip((away * edge).sum(axis=2) / square, 0.0, 1.0)
-        away = away - share[..., None] * edge
+        away = away - np.clip((away * edge).sum(axis=2) / square, 0.0, 1.0)[..., None] * edge
         nearest = np.minimum(nearest, (away**2).sum(axis=2).min(axis=1))
     gap[free] = np.sqrt(nearest)
     return gap

@@ -77,8 +77,7 @@ def _worst_excess(pieces: Pieces, extra: ExtraLimit, u: np.ndarray) -> tuple[flo
     bend = before - after
     share = np.clip((rise - after) / np.where(bend > 0.0, bend, np.inf), 0.0, 1.0)
     bound = np.maximum(values[:, :-1] + share * before, values[:, 1:])
-    likeliest = np.argsort(bound, axis=None)[-_REFINED:]
-    piece, sample = np.unravel_index(likeliest, bound.shape)
+    piece, sample = np.unravel_index(np.argsort(bound, axis=None)[-_REFINED:], bound.shape)
     low, high = durations[piece] * u[sample], durations[piece] * u[sample + 1]
     for _ in range(_REFINEMENTS):
         times = low + (high - low) * np.linspace(0.0, 1.0, 9)[:, None]

@@ -106,14 +106,12 @@ def referee_intercepts(
 
     Target positions are computed in float64 for paths with the fields of `TurningPath` (recognised
     by `turn_rate`), `PolynomialPath` (`coeffs`), or a `LaterPath` (`path` and `begin`) of either.
-    For other classes `pj.intercept.judge` calls the target's own method `at`, which the planner
-    calls too.
+    For other classes `pj.intercept.judge` calls the target's own method `at`, as planners do.
 
     Args:
         cases: object with the fields of `InterceptCase`, for B cases. Polygons are convex, in
             either orientation, and may repeat corners. Values of absent obstacles are ignored.
-        plans: object with the fields of `InterceptPlan`, for B plans; speed and curvature are (B,
-            K + 1).
+        plans: object with the fields of `InterceptPlan`; speed and curvature are (B, K + 1).
         truth: true paths of the B targets; they replace `cases.target`, which may be a prediction.
         target_positions: function `(target, times (B,) [s]) -> positions (B, 2) [m]` for targets
             of other classes. If passed, it is called for the known classes too.
@@ -183,8 +181,7 @@ def target_positions_of(target: object, times: np.ndarray) -> np.ndarray:
     fields, batch = getattr(target, "__dict__", {}), times.shape
 
     def leaf(name: str, *trailing: int) -> np.ndarray:
-        value = check_leaf(f"target.{name}", fields[name], batch + trailing)
-        return value.astype(np.float64)
+        return check_leaf(f"target.{name}", fields[name], batch + trailing).astype(np.float64)
 
     if fields.keys() >= {"path", "begin"}:
         return target_positions_of(fields["path"], leaf("begin") + times)
@@ -232,8 +229,7 @@ def _judge(case: dict, relative: float, contact: float) -> dict:
     )
     measured |= {"miss": miss, "meeting_time": end}
     for name, value in measured.items():
-        broken = -1 if value.dtype.kind == "i" else np.nan
-        measured[name] = np.where(driven, value, broken)
+        measured[name] = np.where(driven, value, -1 if value.dtype.kind == "i" else np.nan)
     return first_failures(tests, LIMITS, finite) | measured
 
 

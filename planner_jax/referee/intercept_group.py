@@ -72,8 +72,7 @@ def referee_groups(
         leg = _index(plans.legs, (lanes, np.full(batch, k)))
         case = _leg(shared, _index(shared.target, (lanes, order[:, k])), begin, car)
         where = _delay(target_positions or target_positions_of, begin)
-        verdict = referee_intercepts(case, leg, target_positions=where, **settings)
-        found.append(dict(vars(verdict)))
+        found.append(dict(vars(referee_intercepts(case, leg, target_positions=where, **settings))))
         for name in ("failed_time", "meeting_time"):
             found[k][name] = found[k][name] + begin
         begin = begin + np.asarray(leg.time, np.float64)
@@ -105,7 +104,6 @@ def _leg(shared: Any, target: Any, begin: np.ndarray, car: tuple) -> SimpleNames
 
 
 def _delay(where: Callable, begin: np.ndarray) -> Callable:
-    """Return the function (target, times) -> where(target, times + begin)."""
     return lambda target, times: where(target, begin + times)
 
 

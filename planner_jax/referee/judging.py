@@ -130,8 +130,7 @@ def judge_in_chunks(
     """Judge B plans in chunks, and return the fields of their verdict as arrays (B, ...).
 
     At most `chunk` plans are judged together, to bound the memory. The chunks are divided among
-    threads, one for each core. Large batches are divided among processes instead, if `judge` can be
-    pickled.
+    threads, one for each core, or for large batches among processes if `judge` can be pickled.
     """
     num_lanes, num_cores = len(next(iter(leaves.values()))), cores()
     size = min(chunk, max(math.ceil(num_lanes / num_cores), _FEWEST_LANES))
@@ -178,8 +177,7 @@ def finite_lanes(case: dict, unbounded: tuple[str, ...] = ()) -> np.ndarray:
     """Test which plans have finite numbers only; limits and fields `unbounded` may be infinite."""
     finite = np.ones(len(next(iter(case.values()))), bool)
     for name, leaf in case.items():
-        limit = "limits." in name or name in unbounded
-        good = ~np.isnan(leaf) if limit else np.isfinite(leaf)
+        good = ~np.isnan(leaf) if "limits." in name or name in unbounded else np.isfinite(leaf)
         finite &= flat(good).all(axis=1)
     return finite
 

@@ -52,8 +52,7 @@ def pieces_of(coeffs: np.ndarray, durations: np.ndarray, flown: np.ndarray | Non
     if flown is None:
         flown = np.ones(durations.shape, bool)
     else:
-        number = np.arange(durations.shape[1])
-        last = np.maximum.accumulate(np.where(flown, number, 0), axis=1)
+        last = np.maximum.accumulate(np.where(flown, np.arange(durations.shape[1]), 0), axis=1)
         lanes = np.arange(len(durations))[:, None]
         coeffs = coeffs[:, lanes, last]
         durations, starts = durations[lanes, last], starts[lanes, last]
@@ -233,8 +232,7 @@ def peaks(pieces: Pieces, gravity: np.ndarray, intervals: int) -> dict[str, tupl
 
 def _peaks(pieces: Pieces, gravity: np.ndarray, u: np.ndarray) -> dict[str, tuple]:
     num_lanes, num_pieces = pieces.durations.shape
-    products = num_pieces * pieces.coeffs.shape[-1] * len(u)
-    tiles = cut(num_lanes, max(_PRODUCT // products, 1))
+    tiles = cut(num_lanes, max(_PRODUCT // (num_pieces * pieces.coeffs.shape[-1] * len(u)), 1))
     sampled = [_sample(pieces.of(tile), gravity[tile], u) for tile in tiles]
     top, greatest, likeliest, sharpest, turn = (
         np.concatenate(parts, axis=-1) for parts in zip(*sampled, strict=True)
@@ -304,8 +302,7 @@ def _fastest_turn(acc, gravity, pieces: Pieces, u: np.ndarray) -> tuple[np.ndarr
     step = np.maximum(pieces.durations * (u[1] - u[0]), np.finfo(float).tiny)
     rate = np.where(pieces.flown, np.arccos(np.clip(sharpest, -1.0, 1.0)) / step, 0.0)
     piece, lanes = rate.argmax(axis=1), np.arange(len(rate))
-    sample = cosine[lanes, piece].argmin(axis=1)
-    return piece * len(u) + sample, rate[lanes, piece] ** 2
+    return piece * len(u) + cosine[lanes, piece].argmin(axis=1), rate[lanes, piece] ** 2
 
 
 def joint_errors(pieces: Pieces, head_state: np.ndarray) -> tuple:
@@ -384,8 +381,7 @@ def judge_motion(
     for name, (peak, field, bound, sign) in bounds.items():
         limit = case.get(f"limits.{bound}")
         if limit is not None:
-            value = sign * measured[field]
-            tests[name] = above(value, sign * limit, relative, found[peak][1])
+            tests[name] = above(sign * measured[field], sign * limit, relative, found[peak][1])
     if "limits.rotors.mass" in case:
         from planner_jax.referee.rotors import judge_rotors  # few cases limit rotors
 
@@ -411,6 +407,5 @@ def _judge_rest(case: dict, pieces: Pieces, continuity: float) -> dict:
         ]
     ).max(axis=0)
     scale = np.maximum(np.abs(pieces.coeffs[..., 0]).max(axis=(0, 2)), 1.0)
-    late = (durations <= 0.0).any(axis=1)
-    failed = ~(moved <= continuity * scale) | late
+    failed = ~(moved <= continuity * scale) | (durations <= 0.0).any(axis=1)
     return {"recovery": (failed, moved, pieces.starts[:, -1] + pieces.durations[:, -1])}

@@ -80,8 +80,7 @@ def rotor_thrusts(
     inertia = inertia[:, None, None]
     torque = inertia * turning + np.cross(own, inertia * own)
     thrust = mass[:, None, None, None] * np.linalg.norm(pull, axis=-1)[..., None]
-    wrench = np.concatenate([thrust, torque], axis=-1)
-    return np.einsum("bik,bmsk->bmsi", mixer, wrench)
+    return np.einsum("bik,bmsk->bmsi", mixer, np.concatenate([thrust, torque], axis=-1))
 
 
 def _pull_and_rate(
@@ -100,8 +99,7 @@ def _pull_and_rate(
 
 def _body_axes(pull: np.ndarray) -> np.ndarray:
     """Return the shortest rotations (..., 3, 3) from the world's z axis to thrusts (..., 3)."""
-    up = pull / np.linalg.norm(pull, axis=-1, keepdims=True)
-    x, y, z = np.moveaxis(up, -1, 0)
+    x, y, z = np.moveaxis(pull / np.linalg.norm(pull, axis=-1, keepdims=True), -1, 0)
     k = 1.0 / (1.0 + z)
     rows = [[1.0 - k * x * x, -k * x * y, x], [-k * x * y, 1.0 - k * y * y, y], [-x, -y, z]]
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)

@@ -32,13 +32,9 @@ def rotate_back(rotation: np.ndarray, vector: np.ndarray) -> np.ndarray:
 
 
 def from_segment(point: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return the distances [m] of points from line segments from `first` to `second`, all (3, ...).
-
-    `first` may equal `second`.
-    """
+    """Return the distances [m] of points from the segments `first` to `second`, all (3, ...)."""
     span, away = second - first, point - first
-    square = dot(span, span)
-    share = np.clip(_ratio(dot(away, span), square), 0.0, 1.0)
+    share = np.clip(_ratio(dot(away, span), dot(span, span)), 0.0, 1.0)
     return length(away - share * span)
 
 

@@ -58,8 +58,7 @@ class Regime:
 def _regime(factor: float, acceleration: float, ends_at_rest: bool) -> Regime:
     """Return joint limits of the IRB 1600-6/1.2: `factor` times the speeds of its data sheet."""
     speeds = np.deg2rad(np.array([150, 160, 170, 320, 400, 450], np.float32))
-    accelerations = np.full(6, acceleration, np.float32)
-    limits = ArmLimits(host_leaf(factor * speeds), host_leaf(accelerations))
+    limits = ArmLimits(host_leaf(factor * speeds), host_leaf(np.full(6, acceleration, np.float32)))
     return Regime(limits=limits, ends_at_rest=ends_at_rest)
 
 

@@ -242,7 +242,6 @@ def _home(root: ET.Element, limits: np.ndarray) -> np.ndarray:
 
 
 def _tag(element: ET.Element) -> str:
-    """Format an element's tag and attributes, without its children, for an error message."""
     attributes = [f'{name}="{value}"' for name, value in element.items()]
     return f"<{' '.join([element.tag, *attributes])}>"
 
@@ -253,7 +252,6 @@ def _require(holds: object, element: ET.Element, rule: str, attribute: str = "")
 
 
 def _require_known(element: ET.Element, attributes: set[str], children: Iterable[str]) -> None:
-    """Raise `ValueError` if an element has an attribute or a child that is not in the lists."""
     for name in element.keys():
         if name not in attributes:
             raise ValueError(f"{_tag(element)}: {name} is not supported")

@@ -64,8 +64,7 @@ class QuadrotorLimits:
         if self.acceleration is not None:
             limits["acceleration"] = factor * self.acceleration
         if self.min_thrust is not None and self.max_thrust is not None:
-            least = jnp.maximum(gravity + factor * (self.min_thrust - gravity), 0.0)
-            limits["min_thrust"] = least
+            limits["min_thrust"] = jnp.maximum(gravity + factor * (self.min_thrust - gravity), 0.0)
             limits["max_thrust"] = gravity + factor * (self.max_thrust - gravity)
         return dataclasses.replace(self, **limits)
 

@@ -134,8 +134,7 @@ class QuadrotorModel:
     """Description of a quadrotor; hashable, so that it can be a static argument of `jax.jit`.
 
     Raises:
-        ValueError: a number breaks its rule, or the rotors cannot hold the body in hover. The
-            message is one line.
+        ValueError: a number breaks its rule, or the rotors cannot hold the body in hover.
     """
 
     name: str
@@ -192,7 +191,6 @@ class QuadrotorModel:
 
 
 def _require(name: str, value: object, rule: str, holds: Callable[[float], bool]) -> None:
-    """Raise `ArgumentError` unless a value is a finite number that keeps a rule."""
     if isinstance(value, bool) or not isinstance(value, int | float | np.number):
         raise ArgumentError(name, "a number", value)
     if not (math.isfinite(value) and holds(float(value))):

@@ -78,5 +78,4 @@ def _in_tiles(
 @functools.partial(jax.jit, static_argnames="setpoint_at")
 def _sample(leaves: object, times: Array, setpoint_at: Callable) -> dict[str, Array]:
     """Evaluate `setpoint_at` for B plans with leaves (B, ...) at K times: arrays (B, K, ...)."""
-    of_plan = jax.vmap(setpoint_at, in_axes=(None, 0))
-    return jax.vmap(of_plan, in_axes=(0, None))(leaves, times)
+    return jax.vmap(jax.vmap(setpoint_at, in_axes=(None, 0)), in_axes=(0, None))(leaves, times)

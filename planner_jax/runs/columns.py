@@ -36,8 +36,7 @@ class Column(NamedTuple):
     unit: str  # SI unit; "" for names and counts, "1" for ratios
     meaning: str  # text for the metadata of the Parquet file
     type: pa.DataType
-    # Function that returns one value or list for each of B rows, (B,) or (B, ...), or None if all
-    # values are missing.
+    # Function that returns a value or list for each of B rows, or None if all values are missing.
     values: Callable[[RefereedBatch], Values]
 
 

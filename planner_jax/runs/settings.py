@@ -52,8 +52,7 @@ def require_count(name: str, value: int | None, least: int, *, none: bool = Fals
 class SweepSettings:
     """Settings that the sweeps of all tasks have; a task's subclass adds further settings.
 
-    They determine every number in a run's rows. A value that breaks its rule raises
-    `ArgumentError`.
+    They determine all numbers in a run's rows. A value that breaks its rule raises `ArgumentError`.
     """
 
     planner: str | None = option(None, "NAME", "")  # None selects the task's first planner

@@ -58,11 +58,7 @@ _STYLE: "dict[RcKeyType, object]" = {
 
 
 def draw(path: Path, figure: Callable[..., None], size: tuple[float, float], *data: object) -> None:
-    """Draw one figure in the common style and write it atomically as a PNG file.
-
-    `size` is (width, height) [inch]. The figure is drawn by `figure(canvas, *data)` on an empty
-    canvas.
-    """
+    """Draw `figure(canvas, *data)` on a canvas of `size` [inch], and write it as a PNG file."""
     with matplotlib.rc_context(_STYLE):
         canvas = Figure(figsize=size)
         FigureCanvasAgg(canvas)

@@ -121,7 +121,6 @@ def draw_upper_limit(axes: Axes, limit: float) -> None:
 
 
 def _draw_thrust_limits(axes: Axes, setting: Entries) -> None:
-    """Draw the thrust of hovering, and limits of the thrust or the bound from acceleration."""
     gravity = setting["gravity"]
     axes.axhline(gravity, color=style.GREY, linewidth=1.0, linestyle=":")
     if "max_thrust" in setting:

@@ -85,8 +85,7 @@ def sample_motion(
     pieces = np.asarray(coeffs, float).reshape(len(lengths), -1, 3)
     time = np.linspace(0.0, lengths.sum(), num)
     leaves = (host_leaf(np.broadcast_to(x, (num, *x.shape))) for x in (pieces, lengths))
-    states = states_at(PiecewisePolynomial(*leaves), time)
-    return SampledMotion(time, *np.moveaxis(states, 1, 0))
+    return SampledMotion(time, *np.moveaxis(states_at(PiecewisePolynomial(*leaves), time), 1, 0))
 
 
 def sample_rest(row: Row, num: int) -> SampledMotion | None:
@@ -114,5 +113,4 @@ def body_rate(motion: SampledMotion, gravity: float) -> np.ndarray:
     cross = np.cross(thrust, motion.jerk)
     with np.errstate(all="ignore"):
         across = np.linalg.norm(cross, axis=1) / size**2
-        about = cross[:, 2] / (size * (size + thrust[:, 2]))
-        return np.hypot(across, about)
+        return np.hypot(across, cross[:, 2] / (size * (size + thrust[:, 2])))

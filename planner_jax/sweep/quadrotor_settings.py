@@ -20,10 +20,7 @@ def robot_option(usual: str) -> Any:
 
 
 def resolve_robot(given: object, tool: str) -> "QuadrotorModel | None":
-    """Return the robot for a setting; raise unless it is known and carries `tool`.
-
-    A setting is a name, a file, a mapping of the fields of a model, or a model.
-    """
+    """Return the robot for a name, file, model, or a model's fields; raise unless it has `tool`."""
     if given is None:
         return None
     from planner_jax.robot.quadrotor_file import RobotError, model_of

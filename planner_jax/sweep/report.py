@@ -43,8 +43,7 @@ def read_finished(folder: RunFolder) -> tuple[Entries, Sweep]:
 def require_sound(folder: RunFolder) -> None:
     """Raise `ArgumentError` unless all rows exist and their counts equal the manifest's summary."""
     manifest, sweep = read_finished(folder)
-    parameters = manifest["parameters"]
-    settings = settings_of_manifest(settings_of(sweep.task), parameters, folder.name)
+    settings = settings_of_manifest(settings_of(sweep.task), manifest["parameters"], folder.name)
     with folder.reading_rows():
         tally = count_rows(sweep, settings, folder.plans)
         counted = {**tally.summary(), "example": tally.example}

@@ -145,8 +145,7 @@ def resume_sweep(
 
 def _session(workers: str | None) -> Entries:
     now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
-    made = {} if workers is None else {"workers": workers}
-    return {"started": now, **environment(), **made}
+    return {"started": now, **environment(), **({} if workers is None else {"workers": workers})}
 
 
 def _settings_of_run(
@@ -216,8 +215,7 @@ def _finish(
         if others := maker.sweep.other_planners(source.settings):
             if progress:
                 print("Now one case with the other planners.", file=sys.stderr)
-            rows = plan_baselines(maker.sweep, source, others, tally.example)
-            folder.baselines.write_rows(rows)
+            folder.baselines.write_rows(plan_baselines(maker.sweep, source, others, tally.example))
         write_report(folder)
         return folder.write_manifest({**manifest, "state": "complete"})
     except ArgumentError:
@@ -242,8 +240,7 @@ def plan_baselines(
     for name, planner in planners.items():
         stopping.check()
         plans = sweep.plan(planner, chunk.cases)
-        verdict = sweep.judge(chunk.cases, plans, source.settings)
-        batch = RefereedBatch(chunk, plans, verdict)
+        batch = RefereedBatch(chunk, plans, sweep.judge(chunk.cases, plans, source.settings))
         rows = rows_of(sweep.columns(batch), batch, sweep.frame)
         tables.append(rows.add_column(0, "planner", pa.array([name])))
     return pa.concat_tables(tables)

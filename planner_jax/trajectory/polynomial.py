@@ -44,8 +44,7 @@ def evaluate(trajectory: PiecewisePolynomial, time: Array, order: int = 0) -> Ar
 
     Args:
         trajectory: M pieces.
-        time: () [s] since the start. The first piece is continued before the start, the last piece
-            past the end.
+        time: () [s] since the start; before the start and past the end the outer pieces continue.
         order: 0 position, 1 velocity, 2 acceleration, 3 jerk, 4 snap.
 
     Returns:
@@ -56,8 +55,7 @@ def evaluate(trajectory: PiecewisePolynomial, time: Array, order: int = 0) -> Ar
     piece = jnp.clip(jnp.sum(time >= starts) - 1, 0, durations.shape[0] - 1)
     local = time - starts[piece]
     degree = coeffs.shape[1] - 1
-    factors = jnp.asarray(derivative_factors(degree, order), coeffs.dtype)[:, None]
-    scaled = coeffs[piece] * factors
+    scaled = coeffs[piece] * jnp.asarray(derivative_factors(degree, order), coeffs.dtype)[:, None]
     value = jnp.zeros_like(scaled[0])
     for k in range(degree, order - 1, -1):
         value = value * local + scaled[k]

@@ -79,8 +79,7 @@ class ProportionalMinco:
         times = self.proportions[:, None] * np.arange(nodes + 1) / nodes
         basis = factors * times[..., None] ** powers  # (M, nodes + 1, 2s)
         samples = basis @ self.coefficients  # (M, nodes + 1, columns)
-        inner = samples[:, :-1].reshape(-1, samples.shape[-1])
-        return np.concatenate([inner, samples[-1:, -1]])
+        return np.concatenate([samples[:, :-1].reshape(-1, samples.shape[-1]), samples[-1:, -1]])
 
 
 @functools.cache
@@ -286,8 +285,7 @@ def _boundary_form_jvp(
 
 def _by_rows(maps: ProportionalMinco, rows: Array) -> Array:
     """Multiply `maps.boundary_energy` (2s, 2s) by rows (2s, 3), as a sum: faster than `matmul`."""
-    gram = jnp.asarray(maps.boundary_energy, rows.dtype)
-    return jnp.sum(gram[..., None] * rows[None], axis=1)
+    return jnp.sum(jnp.asarray(maps.boundary_energy, rows.dtype)[..., None] * rows[None], axis=1)
 
 
 def proportional_trajectory(

@@ -167,8 +167,7 @@ def _of_flight(answer: Answer, motion: SampledMotion) -> list[Margin]:
         thrust = sizes["thrust"]
         found.append(closest("thrust, least [m/s^2]", thrust, limits.min_thrust, least=True))
         found.append(closest("thrust, greatest [m/s^2]", thrust, limits.max_thrust))
-    height = closest("height, least [m]", motion.pos[:, 2], limits.min_height, least=True)
-    return [*found, height]
+    return [*found, closest("height, least [m]", motion.pos[:, 2], limits.min_height, least=True)]
 
 
 def _of_rotors(answer: Answer) -> list[Margin]:

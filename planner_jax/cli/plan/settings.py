@@ -63,8 +63,7 @@ class SingleSettings:
 
     def planner_options(self) -> Entries:
         """Return the planner's options that these settings specify, by name."""
-        own = {name: vars(self)[name] for name in self.PLANNER}
-        return own | recovery_options(self.recovery)
+        return {name: vars(self)[name] for name in self.PLANNER} | recovery_options(self.recovery)
 
     def case_options(self) -> Entries:
         """Return the keyword arguments of `task.case`: the options that are not None."""

@@ -84,8 +84,7 @@ def draw_case(axes: Axes, row: Row, second: int, setting: Entries, drag_after: b
         axes.plot(*tip, "X", color=style.RED, markersize=8, mec="white", zorder=6)
         return
     contact, after = np.array(row["contact_pos"]), np.array(row["ball_vel_after"])
-    slowed = drag if drag_after else 0.0
-    _, back = ball_path(contact, after, row["flight_time"], slowed, gravity)
+    _, back = ball_path(contact, after, row["flight_time"], drag if drag_after else 0.0, gravity)
     line(serve, style.ORANGE, 0.8, 0.6)
     line(back, style.GREEN, 0.8, 0.6)
     line(path, style.BLUE, 1.3, 0.75)
@@ -93,7 +92,6 @@ def draw_case(axes: Axes, row: Row, second: int, setting: Entries, drag_after: b
 
 
 def _draw_floor(axes: Axes) -> None:
-    """Draw the court from above: its lines, its dead zone, and the letters of its regions."""
     length, width, dead = court.HALF_LENGTH, court.HALF_WIDTH, court.DEAD_ZONE
     line: Look = {"color": style.GREY, "linewidth": 1.0, "zorder": 1}
     whole: Look = {"facecolor": _FLOOR, "edgecolor": style.GREY}

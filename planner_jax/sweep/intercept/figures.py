@@ -67,8 +67,7 @@ def sample_drive(row: Row, setting: Entries, num: int) -> SampledDrive:
         jnp.asarray(row[name], jnp.float32) for name in ("start", "speed", "curvature")
     )
     end = jnp.asarray(row["meeting_time"], jnp.float32)
-    shares = jnp.linspace(0.0, 1.0, num)
-    found = _sample(start, end, speed, curvature, shares)
+    found = _sample(start, end, speed, curvature, jnp.linspace(0.0, 1.0, num))
     sampled = {name: np.array(leaf) for name, leaf in found.items()}
     direction = np.stack([np.cos(sampled["pose"][:, 2]), np.sin(sampled["pose"][:, 2])], axis=1)
     ahead = 0.5 * setting["body_length"] - setting["body_rear_overhang"]
@@ -88,8 +87,7 @@ def sample_drive(row: Row, setting: Entries, num: int) -> SampledDrive:
 
 def _polygons(row: Row, kind: str) -> list[np.ndarray]:
     present = np.array(row[f"{kind}_present"], bool)
-    corners = np.reshape(row[f"{kind}_corners"], (len(present), -1, 2))
-    return list(corners[present])
+    return list(np.reshape(row[f"{kind}_corners"], (len(present), -1, 2))[present])
 
 
 @jax.jit

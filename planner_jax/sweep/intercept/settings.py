@@ -25,8 +25,7 @@ class GroupSettings(SweepSettings):
 
     decide: str = option("best", "NAME", f"decision about the order: {', '.join(DECISIONS)}")
 
-    # Memory of one case [bytes]. It is large, because several orders of the group's targets are
-    # planned together.
+    # Memory of one case [bytes], for which several orders of the targets are planned together.
     CASE_BYTES: ClassVar[int] = 1_000_000
     CPU_BATCH: ClassVar[int] = 64
     GPU_BATCH: ClassVar[int] = 512

@@ -125,8 +125,7 @@ def _from_link(arm: Arm, first: int) -> np.ndarray:
 
 def _poses(arm: Arm, angles: Array) -> _Poses:
     """Return positions and axes of the arm's parts in N poses with joint angles (N, 6) [rad]."""
-    # Without `optimization_barrier` XLA would repeat the computation of the poses in the loop of
-    # every distance.
+    # Without `optimization_barrier` XLA would compute the poses again for every distance.
     rotations, origins = lax.optimization_barrier(
         jax.vmap(lambda angles: link_frames(arm, angles), out_axes=-1)(angles)
     )

@@ -125,8 +125,7 @@ def coast(case: BlockCase, duration: Array, pieces: int) -> Array:
 
 def face_ball(velocity: Array) -> Array:
     """Return the shield's normal (3,) that faces a ball: the reversed direction of its velocity."""
-    square = jnp.maximum(jnp.sum(velocity**2), 1e-12)
-    return -velocity / jnp.sqrt(square)
+    return -velocity / jnp.sqrt(jnp.maximum(jnp.sum(velocity**2), 1e-12))
 
 
 def frame_of(normal: Array) -> Array:

@@ -33,8 +33,7 @@ class Weights:
 def step_weights(pieces: int, shares: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
     """Return weights of a motion's parameters whose weighted sum is the angle turned so far.
 
-    The motion has K = `pieces` pieces. The angle is evaluated at N times, which are `shares` in
-    [0, 1] of the duration.
+    The motion has K = `pieces` pieces. The N times are `shares`, in [0, 1], of the duration.
 
     Returns:
         first: (N,), weights of the initial rate multiplied by the duration.

@@ -94,6 +94,5 @@ def entry_time(box: Box, ball: BallState, gravity: Array) -> tuple[Array, Array]
     def height(time: Array) -> Array:
         return ball.pos[2] + ball.vel[2] * time - 0.5 * gravity * time**2
 
-    at_side = height(jnp.maximum(from_side, 0.0))
-    time = jnp.where(at_side > box.upper[2], from_top, from_side)
+    time = jnp.where(height(jnp.maximum(from_side, 0.0)) > box.upper[2], from_top, from_side)
     return time, (time > 0.0) & (time <= until) & (height(time) > box.lower[2])

@@ -91,8 +91,7 @@ def _is_valid(suite: Suite, pos: np.ndarray, vel: np.ndarray, duration: float) -
     path = pos + vel * times[:, None]
     path[:, 2] -= 0.5 * GRAVITY * times**2
     if suite.has_pole:
-        away = np.linalg.norm(path[:, :2] - POLE, axis=1)
-        if away.min() < POLE_RADIUS + BALL_RADIUS:
+        if np.linalg.norm(path[:, :2] - POLE, axis=1).min() < POLE_RADIUS + BALL_RADIUS:
             return False
 
     def within(half: float, height: float) -> np.ndarray:

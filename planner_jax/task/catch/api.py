@@ -55,8 +55,7 @@ def planner(
         TypeError: the planner's dataclass has no field of the name of an option.
     """
     decision = find_decision(DECISIONS, decide, TRAINED)
-    own = TASK.make_planner(name, options).with_effort(effort)
-    decided = DecidedPlanner(own, decision)
+    decided = DecidedPlanner(TASK.make_planner(name, options).with_effort(effort), decision)
     if recovery is None:
         return decided
     from planner_jax.recovery.with_recovery import add_recovery  # imported only if needed

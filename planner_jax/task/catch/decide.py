@@ -48,8 +48,7 @@ def _closest_approach(case: CatchCase) -> Array:
     slack = net.height + net.radius + (speed + limits.speed) * step
     far = distance - limits.speed * times - slack
     low = limits.min_height - states.pos[:, 2] - slack
-    gap = jnp.min(jnp.maximum(jnp.maximum(far, low), 0.0), axis=1)
-    return jnp.where(case.present, gap, 0.0)
+    return jnp.where(case.present, jnp.min(jnp.maximum(jnp.maximum(far, low), 0.0), axis=1), 0.0)
 
 
 _closest_approaches = jax.jit(jax.vmap(_closest_approach))

@@ -174,8 +174,7 @@ class ExactCatch(ChainPlanner[CatchCase, CatchPlan]):
     def _for_start(self, attempt: Round, case: CatchCase) -> Round:
         """Return a round (attempt) with the number of iterations that its starting point needs."""
         if self.starts_long(case) and attempt in _ROUNDS[:2]:
-            is_first = attempt == _FIRST
-            steps = _STEPS_A_TARGET * case.num_targets if is_first else _OF_MANY.max_steps
+            steps = _STEPS_A_TARGET * case.num_targets if attempt == _FIRST else _OF_MANY.max_steps
             return Round(starts=1, solver=dataclasses.replace(_OF_MANY, max_steps=steps))
         if attempt.stages == (Stage(_FIRST.solver),) and case.num_targets > 1:
             # With several targets the search starts far from the optimum, where a small gain in one

@@ -210,8 +210,7 @@ def _states_along(trajectory: PiecewisePolynomial, times: Numbers) -> Array:
 def _segments(task: Replanning) -> tuple[Array, Array]:
     """Return indices of segments, and times [s], of N remaining catches of the previous plan."""
     times = task.previous.times
-    num_past = jnp.sum(times <= task.elapsed)
-    segments = jnp.minimum(num_past + np.arange(times.size), times.size - 1)
+    segments = jnp.minimum(jnp.sum(times <= task.elapsed) + np.arange(times.size), times.size - 1)
     return segments, times[segments] - task.elapsed
 
 

@@ -142,8 +142,7 @@ def _throws(uniform: PyTree, throws: tuple[_Throw, ...]) -> tuple[BallPath, PyTr
     pos, vel, horizon = (xp.stack(column, axis=1) for column in zip(*drawn, strict=True))
     drag = np.broadcast_to([[t.drag] * 3 for t in throws], pos.shape)
     gravity = np.full(horizon.shape, GRAVITY)
-    ball = BallState(pos=pos, vel=vel)
-    return BallPath(ball, host_leaf(drag), host_leaf(gravity)), horizon
+    return BallPath(BallState(pos=pos, vel=vel), host_leaf(drag), host_leaf(gravity)), horizon
 
 
 def _throw(uniform: PyTree, throw: _Throw) -> tuple[PyTree, PyTree, PyTree]:
@@ -237,10 +236,8 @@ def _polygon(uniform: PyTree, *, num: int) -> tuple[BallPath, PyTree]:
     corner = 2.0 * np.pi * (u[:, 3] + np.arange(num) / num)
     radius, speed = _between(u[:, 4:5], 1.0, 1.5), _between(u[:, 5:6], 1.0, 1.5)
     vel = speed * _unit(2.0 * np.pi * u[:, 6])[:, 0:1]
-    when = _between(u[:, 7:8], 4.0, 6.0)
-    pos = near[:, None] + radius * _unit(corner) - vel * when
-    targets = _lines(pos, xp.broadcast_to(vel, pos.shape))
-    return targets, np.full(corner.shape, _PARALLEL)
+    pos = near[:, None] + radius * _unit(corner) - vel * _between(u[:, 7:8], 4.0, 6.0)
+    return _lines(pos, xp.broadcast_to(vel, pos.shape)), np.full(corner.shape, _PARALLEL)
 
 
 def _rush(

@@ -36,7 +36,6 @@ class _Meeting:
 
 
 def _start(group: InterceptGroup) -> _Meeting:
-    """Return the car's initial state in the form of a meeting at time 0."""
     shared = group.shared
     heading = shared.start[2]
     ahead = shared.body.middle * jnp.stack([jnp.cos(heading), jnp.sin(heading)])
@@ -68,8 +67,7 @@ def _next(
     # With speed v and curvature kappa, the turn rate v kappa is greatest where the curvature and
     # the lateral acceleration v^2 kappa both reach their limits.
     rate = _TURNING * jnp.sqrt(limits.curvature * limits.lateral_acceleration)
-    duration = distance / (_PACE * limits.speed) + turn / rate
-    lack = last.time + duration - times
+    lack = last.time + (distance / (_PACE * limits.speed) + turn / rate) - times
     first = jnp.where(jnp.any(lack <= 0.0), jnp.argmax(lack <= 0.0), jnp.argmin(lack))
     return _Meeting(
         time=jnp.maximum(times[first], last.time),
@@ -120,8 +118,7 @@ class Best(Decision):
             rule = f"at most {MOST_PERMUTED}, because all orders are evaluated"
             raise ArgumentError("targets", rule, num)
         orders = jnp.asarray(list(itertools.permutations(range(num))), jnp.int32)
-        table = _timetable(case)
-        rank = jax.vmap(functools.partial(_rank, case, table))(orders)
+        rank = jax.vmap(functools.partial(_rank, case, _timetable(case)))(orders)
         # Orders that differ only in the positions of absent targets are equivalent. Only the order
         # that ends with the absent targets, in ascending order, is proposed.
         exists = case.present[orders]

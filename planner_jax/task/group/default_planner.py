@@ -3,8 +3,7 @@
 A leg is the drive to one target. It starts at the end of the previous leg, with targets and moving
 obstacles moved to that time. `SpacetimeIntercept` plans each leg such that the meeting is as early
 as possible. If this fails, it plans the leg with the least squared acceleration instead. The first
-legs of all groups of a batch, in all their proposed orders, are planned together, then all second
-legs, and so on.
+legs of all groups of a batch, in all proposed orders, are planned together, then all second legs.
 """
 
 import dataclasses

@@ -78,8 +78,7 @@ def planner(
         recovery: kind of the trajectory after the impact, which keeps all limits: "brake" ends at
             standstill wherever this costs least, "home" ends at the start position. By default the
             plan ends at the impact.
-        effort: "feasible" stops the search as soon as every limit holds. "good" and "best" continue
-            it to lower the cost.
+        effort: "feasible" stops as soon as every limit holds; "good" and "best" lower the cost.
         **options: fields of the planner's dataclass, for example `rounds`.
 
     Returns:

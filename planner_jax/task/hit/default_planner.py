@@ -166,7 +166,6 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
 
     @property
     def _num_places(self) -> int:
-        """Number of variables for the waypoints' positions."""
         return 3 * (self.num_pieces - 1)
 
     def _fit_scale(self, scale: tuple[float, ...]) -> tuple[float, ...]:

@@ -65,8 +65,7 @@ def read_serves(folder: str | os.PathLike) -> Serves:
 
     A file is named "S_L_T_M.csv". S, L and T are serve, landing and target region (1 near, 2 far,
     3 left, 4 right), and M is the planner (p Bat, l Bat-Lite, b Juggle). Files with equal S_L_T
-    contain the same serves in the same order; some of these files may be missing. Files with other
-    names are ignored.
+    contain the same serves in the same order; some may be missing. Other files are ignored.
 
     Returns:
         Row 1 of every scenario, then row 2 of every scenario and so on, so that the first rows
@@ -77,8 +76,7 @@ def read_serves(folder: str | os.PathLike) -> Serves:
             is not finite, does not land in the hitting half, or differs between the files of a
             scenario. `value` lists all such rows.
     """
-    read = pkgutil.resolve_name("planner_jax.baselines.hit.published:read_serves")
-    return read(folder)
+    return pkgutil.resolve_name("planner_jax.baselines.hit.published:read_serves")(folder)
 
 
 def generate_serves(

@@ -140,8 +140,7 @@ def position_setting(target: PlanePath) -> dict[str, object]:
     """Return the referee's setting for targets of a user's class; {} for the library's classes."""
     while isinstance(target, LaterPath):
         target = target.path
-    is_known = type(target) in (TurningPath, PolynomialPath)
-    return {} if is_known else {"target_positions": positions}
+    return {} if type(target) in (TurningPath, PolynomialPath) else {"target_positions": positions}
 
 
 def positions(target: PlanePath, times: Float[np.ndarray, " B"]) -> Float[np.ndarray, "B 2"]:

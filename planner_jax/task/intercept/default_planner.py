@@ -156,10 +156,7 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
     def _solve_all_paths(
         self, case: InterceptCase, attempt: Search, layers: Array
     ) -> InterceptPlan:
-        """Try all paths of one case together; the last stage then refines only the best plan.
-
-        With `tries_all` the last stage refines the plans of all paths.
-        """
+        """Try all paths of one case; refine only the best plan, or all plans with `tries_all`."""
         problem = self.problem
         found = search_reach(case, attempt, is_time_free=problem.is_time_free, layers=layers)
 
@@ -207,7 +204,6 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
     def _explain(
         self, case: InterceptCase, attempt: LoadedSearch, found: Reachability, plan: InterceptPlan
     ) -> InterceptPlan:
-        """Set the status of an unsolved plan to the reason why it is unsolved."""
         reason = plan.status
         reason = jnp.where(found.is_reached | ~attempt.is_last, reason, Status.NO_PATH)
         return explain(case, reason, plan, is_time_free=self.problem.is_time_free)

@@ -209,8 +209,7 @@ def by_unknowns(drive: Motion, cost: Quadratic, is_time_free: bool) -> tuple[Arr
         """Reorder values (K, 2, ...) of speed and curvature at K knots: first all speeds."""
         return values.swapaxes(0, 1).reshape(2 * num, *values.shape[2:])
 
-    size = 2 * num
-    knot = np.arange(size) % num
+    knot = np.arange(2 * num) % num
     gap = knot[:, None] - knot
     twists = flatten(twist)
 

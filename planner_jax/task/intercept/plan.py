@@ -98,5 +98,4 @@ def explain(
     is_finite = jnp.all(jnp.stack([jnp.all(~jnp.isnan(leaf)) for leaf in floats]))
     reason = jnp.where(is_finite, reason, Status.NON_FINITE)
     keeps = (is_solved(plan.status) | (plan.status == Status.NON_FINITE)) & is_finite
-    status = jnp.where(keeps, plan.status, reason).astype(jnp.int32)
-    return dataclasses.replace(plan, status=status)
+    return dataclasses.replace(plan, status=jnp.where(keeps, plan.status, reason).astype(jnp.int32))

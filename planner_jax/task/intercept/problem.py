@@ -331,7 +331,6 @@ class SmoothIntercept(OptimisedPlanner):
         return jnp.broadcast_to(end.point, (num, *end.point.shape))
 
     def _model(self, point: Array, context: _Context) -> Model:
-        """Return the cost at the unknowns `point` and its quadratic model; see `build_model`."""
         problem = self.problem
         weights = dataclasses.replace(problem.weights, early=_EARLY)
         positions = problem.guess_at(point).positions

@@ -33,8 +33,7 @@ from planner_jax.task.intercept.searches import Search, Warm, make_field, make_g
 class ReplanIntercept(Planner[Replanning, InterceptPlan]):
     """Planner of the remainders of interceptions; `SpacetimeIntercept.replanner` makes it.
 
-    If less than `shortest` remains until the meeting, the remainder of the previous plan is
-    returned.
+    If less than `shortest` remains until the meeting, the previous plan's remainder is returned.
     """
 
     case_type: ClassVar[type] = Replanning
@@ -77,8 +76,7 @@ class ReplanIntercept(Planner[Replanning, InterceptPlan]):
             target: the expected path; its times count from this moment.
             movers: the moving obstacles at this moment; by default the obstacles of the cases,
                 moved at their velocities.
-            start: (3,) or (B, 3) x, y [m] and heading [rad] of the rear axle; by default as
-                planned.
+            start: (3,) or (B, 3) x, y [m], heading [rad] of the rear axle; by default as planned.
             speed: () or (B,) [m/s]; by default as planned; clipped to the car's limits.
             curvature: () or (B,) [1/m]; by default as planned; clipped to the car's limits.
         """
@@ -131,8 +129,7 @@ class ReplanIntercept(Planner[Replanning, InterceptPlan]):
             dataclasses.replace(stage, steps=jnp.where(time < self.shortest, 0, stage.steps))
             for stage in problem.list_last_stages(attempt)
         ]
-        field = make_field(case, grid)
-        return problem.refine(case, field, guess, attempt, stages)
+        return problem.refine(case, make_field(case, grid), guess, attempt, stages)
 
     def solve_at_once(self, tasks: Replanning, attempt: Search | Warm) -> InterceptPlan:
         """Return the plans of a batch, computed all at once."""

@@ -148,8 +148,7 @@ def _candidates(suite: Suite, kinds: np.ndarray, uniform: np.ndarray) -> Draws:
     target = target_to(meeting, suite.time, turning, u[:, 3:7])
     movers = movers.reshape(len(u), suite.mover_room[0], 3 + _SHAPE)
     when = suite.time * _between(movers[..., 2], 0.2, 0.8)
-    line = (meeting - start)[:, None]
-    crossing = start[:, None] + (when / suite.time)[..., None] * line
+    crossing = start[:, None] + (when / suite.time)[..., None] * (meeting - start)[:, None]
     velocity = _between(movers[..., 0], *suite.mover_speed)[..., None]
     velocity = velocity * _unit(2.0 * np.pi * movers[..., 1])
     middle = crossing - velocity * when[..., None]
@@ -254,8 +253,7 @@ def _maze(
 def _boxes(left, low, right, high) -> np.ndarray:
     """Return six corners (..., 6, 2) of axis-aligned rectangles; the last corner is repeated."""
     x = np.stack([left, right, right, left, left, left], axis=-1)
-    y = np.stack([low, low, high, high, high, high], axis=-1)
-    return np.stack([x, y], axis=-1)
+    return np.stack([x, np.stack([low, low, high, high, high, high], axis=-1)], axis=-1)
 
 
 def path_of(draws: Draws, dtype: DTypeLike) -> TurningPath:
@@ -310,9 +308,7 @@ def _path(suite: Suite, draws: Draws) -> np.ndarray:
 
 
 def _is_off_map(suite: Suite, draws: Draws) -> np.ndarray:
-    """Return which of B targets leave the map before the meeting, (B,) bool."""
-    from_middle = np.abs(_path(suite, draws) - 0.5 * SIZE)
-    return from_middle.max(axis=(1, 2)) > 0.5 * SIZE
+    return np.abs(_path(suite, draws) - 0.5 * SIZE).max(axis=(1, 2)) > 0.5 * SIZE
 
 
 def _middle(draws: Draws) -> np.ndarray:
@@ -322,8 +318,7 @@ def _middle(draws: Draws) -> np.ndarray:
 
 def _is_too_far(_: Suite, draws: Draws) -> np.ndarray:
     """Return in which of B cases even a straight drive at full speed would be late, (B,) bool."""
-    distance = draws["meeting"] - _middle(draws)
-    return np.linalg.norm(distance, axis=1) > TOP_SPEED * draws["time"]
+    return np.linalg.norm(draws["meeting"] - _middle(draws), axis=1) > TOP_SPEED * draws["time"]
 
 
 def _gap(

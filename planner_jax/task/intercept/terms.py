@@ -183,8 +183,7 @@ def obstacle_terms(
 ) -> tuple[Array, Array]:
     """Compute the penalties on the distances of the body from obstacles and from the map's edge.
 
-    The body is represented by `discs` discs. Fewer discs are larger and extend further beyond the
-    sides of the body.
+    The body is represented by `discs` discs. Fewer discs extend further beyond its sides.
 
     Returns:
         squares: (K, S, 5, 5), the matrix `squares` of `meeting_terms` for S samples on K pieces.
@@ -273,8 +272,7 @@ def clearance(case: InterceptCase, drive: Motion) -> Array:
 def is_blocked(case: InterceptCase) -> tuple[Array, Array]:
     """Return whether the car overlaps an obstacle at the start, and whether the target is blocked.
 
-    The target is blocked if at the case's time it is off the map, or nearer to an obstacle than
-    half the car's width.
+    It is blocked if it is then off the map, or nearer to an obstacle than half the car's width.
     """
     goal = case.target.at(case.time).pos
     both = join_obstacles(case.walls, case.movers)
