@@ -18,11 +18,7 @@ BATCH = 64  # number of cases of the batch whose programs are listed
 _EXAMINED = ("hit", "catch throws", "catch triangle3", "intercept hard", "block")
 _SMALL = 0.05  # [s] programs that compile faster have no row, and only count in the sums
 # Fields of `Program` that hold the durations of JAX's events /jax/core/compile/NAME_duration.
-_EVENTS = {
-    "jaxpr_trace": "tracing",
-    "jaxpr_to_mlir_module": "lowering",
-    "backend_compile": "compiling",
-}
+_EVENTS = dict(jaxpr_trace="tracing", jaxpr_to_mlir_module="lowering", backend_compile="compiling")
 _HEAD = (
     "| planner | cases | program | versions | equations | tracing [s] | lowering [s] "
     "| compiling [s] | first plan [s] |\n|---|---|---|---|---|---|---|---|---|"

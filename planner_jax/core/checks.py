@@ -126,10 +126,7 @@ def floating(dtype: object) -> np.dtype:
 
 
 def require_beginning(name: str, tree: PyTree, shape: tuple[int, ...], words: str) -> list[Numbers]:
-    """Return a pytree's leaves; raise an error unless the shape of each begins with `shape`.
-
-    `words` describes `shape` in the error's text.
-    """
+    """Return a tree's leaves; raise an error in `words` unless all shapes begin with `shape`."""
     leaves = jax.tree.leaves(tree)
     arrays = [array for leaf in leaves if (array := numeric(leaf)) is not None]
     if not arrays or len(arrays) < len(leaves):

@@ -105,10 +105,7 @@ def trace_for(platform: str) -> Iterator[None]:
 
 
 def traced_platform() -> str | None:
-    """Return the only platform for which a program is being traced, or None if it is unknown.
-
-    If it is known, the methods of other platforms need not be traced.
-    """
+    """Return the only platform for which a program is being traced, or None if it is unknown."""
     return _TRACED.get()
 
 

@@ -206,10 +206,7 @@ class Decision(Protocol):
         ...
 
     def rank(self, plans: PyTree, /) -> Array:
-        """Return one number for each plan, by default its cost; pure.
-
-        The plan with the least number is selected. The plans have any batch shape.
-        """
+        """Return one number for each plan, by default its cost; the least is selected; pure."""
         return plans.cost
 
     def explain(self, case: PyTree, status: Array, /) -> Array:

@@ -159,10 +159,7 @@ def _optimum_at(point: Array, evaluation: Evaluation, config: Solver) -> Optimum
 
 
 def solve_round(planner: "OptimisedPlanner", attempt: Round, case: PyTree) -> PyTree:
-    """Plan one case with the starts and iterations of one round (attempt); pure.
-
-    The result is the plan of the best start. For many cases `solve_batch` is faster.
-    """
+    """Return the best plan of one case from the starts and iterations of one round; pure."""
     last = planner.with_settings(attempt.settings)
     context = last.prepare(case)
 

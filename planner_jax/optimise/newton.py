@@ -112,10 +112,7 @@ def is_stationary(numbers: NewtonNumbers, config: NewtonConfig) -> Array:
 
 
 def most_to_gain(numbers: NewtonNumbers, config: NewtonConfig, num: int) -> Array:
-    """Return the indices (num,) of the problems with the greatest predicted decreases of the cost.
-
-    Unfinished problems come before finished problems.
-    """
+    """Return indices (num,) of problems of greatest predicted decrease; unfinished ones first."""
     expected = jnp.where(jnp.isnan(numbers.expected), jnp.inf, numbers.expected)
     return jnp.argsort(jnp.where(is_unfinished(numbers, config), -expected, 1.0))[:num]
 

@@ -73,10 +73,7 @@ class _Context:
 
 @struct.dataclass
 class Differentiated(OptimisedPlanner):
-    """A planner whose plans contain the gradient of one of their numbers.
-
-    It solves the problem of the inner planner, and computes the gradient at the result.
-    """
+    """A planner that adds the gradient of one number to the plans of the inner planner."""
 
     planner: OptimisedPlanner
     # The differentiated number: a dotted name in the plan, such as "stroke.time", or a function.

@@ -80,7 +80,6 @@ class _Box:
 
     @property
     def reach(self) -> np.ndarray:
-        """Radius (B, 1) [m] of the sphere around `middle` that contains the box."""
         return length(self.half)
 
     def lowest(self) -> np.ndarray:
@@ -102,7 +101,6 @@ class _Box:
         return between_boxes(middle, turn, other.half, self.half)
 
     def at(self, lane: np.ndarray, sample: np.ndarray) -> "_Box":
-        """Return the box at P samples, each the sample `sample[k]` of the motion `lane[k]`."""
         middle, turn = (_pick_samples(each, lane, sample) for each in (self.middle, self.turn))
         return _Box(self.name, middle, turn, self.half[:, lane, 0])
 

@@ -104,10 +104,7 @@ def judge_by(
     kinds: tuple[type[Case], type[Plan]],
     settings: dict[str, object],
 ) -> VerdictT:
-    """Check the arguments of a task's function `judge`, and return the verdict of its referee.
-
-    `kinds` are the required classes of the cases and of the plans.
-    """
+    """Check the arguments of a task's `judge` against `kinds`; return its referee's verdict."""
     require_kind("cases", cases, kinds[0])
     require_kind("plans", plans, kinds[1])
     require_settings(referee, settings)

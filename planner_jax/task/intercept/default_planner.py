@@ -102,10 +102,7 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
     def smooth_near(
         self, cases: InterceptCase, plans: InterceptPlan
     ) -> tuple[SmoothIntercept, StartedCase]:
-        """Return a planner that minimises the cost from existing plans, and cases with these plans.
-
-        `pj.gradient` and `pj.optimal_plan` use both results.
-        """
+        """Return a planner that minimises cost from existing plans, and cases with these plans."""
         problem = self.problem
         start = problem.pack(plans.speed[..., 1:], plans.curvature[..., 1:], plans.time)
         return SmoothIntercept(problem), add_start(cases, start)
