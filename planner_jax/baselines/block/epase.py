@@ -55,7 +55,7 @@ class OpenStates:
         self._lengths, self._closed = {_cell_of(start.angles): 0.0}, set()
 
     def pop(self) -> State | None:
-        """Remove and return the first state whose grid cell was not returned before, or None."""
+        """Remove and return the next state whose grid cell was not returned before, or None."""
         while self._states:
             state = heapq.heappop(self._states)[2]
             if (cell := _cell_of(state.angles)) not in self._closed:
@@ -88,7 +88,7 @@ def _cell_of(angles: np.ndarray) -> tuple[int, ...]:
 
 @dataclasses.dataclass(frozen=True)
 class EpaseBlock(PathThenTime):
-    """The planner `epase`: weighted A* to one end pose after another (extra `arm-peers`)."""
+    """The planner `epase`: weighted A* to end poses in turn; needs the extra `arm-peers`."""
 
     # [s], longest search for one end pose. Few searches that take longer succeed.
     longest: float = 0.05

@@ -43,7 +43,7 @@ class FreeSpace:
     """Collision checks of the arm of one case: joint angles within limits, and free of contacts."""
 
     def __init__(self, case: BlockCase, margin: float) -> None:
-        """Compile the checks; `margin` [m] is the least distance from obstacles that is free."""
+        """Compile the checks; `margin` [m] is the least obstacle distance of a free pose."""
         self.lower, self.upper = np.asarray(case.arm.lower), np.asarray(case.arm.upper)
         self._dtype = np.asarray(case.angles).dtype
         self._arm, self._scene = jax.device_put((case.arm, case.scene))

@@ -86,7 +86,7 @@ class InsatBlock(PoseByPose):
     solver: lbfgs.LbfgsConfig = lbfgs.LbfgsConfig(max_steps=12)
 
     def plan_of(self, case: BlockCase) -> BlockPlan:
-        """Return the plan of one case, after compiling, so that only the search is timed."""
+        """Return the plan of one case; compile first, so that only the search is timed."""
         _compile(np.asarray(case.angles).dtype, self.solver)
         return super().plan_of(case)
 

@@ -45,7 +45,7 @@ class Goal:
 
 @dataclasses.dataclass(frozen=True)
 class HostMotion:
-    """A joint motion of M polynomial pieces; it starts when the case's delay has passed."""
+    """A joint motion of M polynomial pieces; it starts after the delay of its case."""
 
     coeffs: np.ndarray  # (M, D + 1, 6), of degree D for six joints [rad], lowest power first
     durations: np.ndarray  # (M,) [s], durations of the pieces

@@ -38,8 +38,8 @@ from planner_jax.trajectory.proportional_minco import (
 )
 
 _ORDER = 4  # derivative whose square is minimised: snap
-# Units of the optimiser's variables, tuned for low costs on random throws: of a waypoint offset,
-# and of each catch: logarithm of the duration, position, velocity, acceleration, jerk.
+# Units of the optimiser's variables, tuned for low costs: of a waypoint's shift from the smoothest
+# trajectory, and of a catch's logarithm of duration, position, velocity, acceleration and jerk.
 _OFFSET_SCALE = 0.05
 _CATCH_SCALE = (0.035, *(0.06,) * 3, *(0.6,) * 3, *(1.2,) * 3, *(2.4,) * 3)
 _PATIENT = {"memory": 16, "trial_steps": (1.0, 2.5, 0.3, 0.05), "tolerance": 1e-8, "patience": 10}
@@ -154,7 +154,7 @@ class PaperCatch(OptimisedPlanner):
 
     @property
     def maps(self) -> ProportionalMinco:
-        """Constant matrices: from end states and waypoints' deviations to one segment's motion."""
+        """The constant matrices that compute one segment from end states and waypoint variables."""
         return proportional_minco(_ORDER, (1.0,) * self.num_pieces)
 
     @property

@@ -179,7 +179,7 @@ class BatHit(OptimisedPlanner):
 
     @property
     def maps(self) -> ProportionalMinco:
-        """Constant matrices: from end states and waypoints' deviations to the trajectory."""
+        """Constant matrices that compute a trajectory from end states and waypoint variables."""
         return proportional_minco(_ORDER, (1.0,) * self.num_pieces)
 
     @property
@@ -252,7 +252,7 @@ class BatHit(OptimisedPlanner):
         )
 
     def _unpack(self, point: Array, context: HitContext):
-        """Return waypoint offsets, end states, piece duration, impact, and the impact's defect."""
+        """Return waypoints' deviations, end states, piece duration, impact and its defect."""
         natural = point * jnp.asarray(self.scale, point.dtype)
         waypoints = natural[: self.num_offsets].reshape(-1, 3)
         impact, defect = self.impact(natural[self.num_offsets :], context)

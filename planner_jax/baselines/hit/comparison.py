@@ -112,7 +112,7 @@ def make_table(manifest: Entries) -> RateTable:
 
 
 def explain_table(manifest: Entries) -> str:
-    """Return sentences that explain the columns with published rates."""
+    """Return sentences that explain the columns of `make_table` with published success rates."""
     other, same = choose_reference(manifest["parameters"]["planner"]), ""
     if _knows_same_serves(manifest["summary"], other):
         same = '"Same serves" are the published outcomes of this run\'s cases, if known. '

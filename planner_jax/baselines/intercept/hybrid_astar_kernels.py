@@ -234,7 +234,7 @@ def _sinc(x):
 
 @njit(cache=True)
 def _is_free_along(pose, parts, senses, curvature, scene, field):
-    """Return whether a path of three parts from a pose is collision-free.
+    """Return whether a Dubins path, three arcs or lines, from a pose is collision-free.
 
     `parts` (3,) [m] are the lengths of the parts, `senses` (3,) their turning directions: 1 left, 0
     straight, -1 right.

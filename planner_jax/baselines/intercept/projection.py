@@ -27,7 +27,7 @@ _BEFORE = 0.05  # fraction of the horizon by which the projected time is extende
 
 @dataclasses.dataclass(frozen=True)
 class Projection:
-    """Settings of the projection: how finely quadrangles cover what an obstacle blocks."""
+    """Settings: how finely quadrangles cover the stations and times that obstacles block."""
 
     runs: int = 2  # number of sequences of blocked points per obstacle; later ones join the last
     slabs: int = 4  # number of quadrangles of equal duration for one sequence

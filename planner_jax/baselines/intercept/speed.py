@@ -62,8 +62,8 @@ class SpeedPlanner:
     # With a number they apply to that many samples of each piece, including its end.
     samples: int | None = None
     margin: float = 1e-3  # [m], least distance from polygons
-    # Weight of the squared distance from the path's end at the end, 300 in the paper for a horizon
-    # of 10 s. With None the curve ends exactly there.
+    # Weight of the curve's squared final distance from the path's end, 300 in the paper for a
+    # horizon of 10 s. With None the curve ends exactly there.
     end_weight: float | None = None
     grid: StationTimeGrid = StationTimeGrid()
     solver: QpConfig = QpConfig()
@@ -160,7 +160,7 @@ def _shares(planner: SpeedPlanner) -> np.ndarray:
 def speed_bounds(
     problem: StationTimeProblem, reference: ReferenceLine, planner: SpeedPlanner
 ) -> tuple[Array, Array, Array]:
-    """Return the right sides (3,) of the equalities, and lower and upper bounds (M,) of M rows.
+    """Return right sides (3,) of equalities, and bounds (M,) of M rows, of a quadratic program.
 
     Lengths are in units of the path length, times in units of the horizon. The bounds keep the
     curve on the reference line's side of each polygon.

@@ -72,7 +72,7 @@ class StationTimeGrid:
 
 @struct.dataclass
 class ReferenceLine:
-    """The line that dynamic programming finds in the plane of time and station."""
+    """The line of station (distance along a path) over time that dynamic programming finds."""
 
     station: Array  # (N + 1,) [m], at equally spaced times from 0 to the horizon
     cost: Array  # () [m^2/s^3], sum of (change of speed)^2 / (time step)
@@ -124,7 +124,7 @@ def reference_line(
     )
 
     def step_back(node: tuple[Array, Array], cost: Array) -> tuple[tuple[Array, Array], Array]:
-        """Return the node before `node` on the best line, given the costs of all candidates."""
+        """Return the node before `node` on the best line, given the costs of all previous nodes."""
         jump, place = node
         place = place - jump
         jump = lax.argmin(cost[:, place] + change[jump], 0, jnp.int32)
@@ -248,7 +248,7 @@ def corridor(
     pieces: int,
     lines: Literal["tilted", "edges", "flat"] = "tilted",
 ) -> Corridor:
-    """Return bounds around a line that enters no polygon [Qu2022, Section IV-C].
+    """Return bounds on stations beside a line that enters no polygon [Qu2022, Section IV-C].
 
     Time is divided into equal pieces. If a polygon covers the whole duration of a piece, the
     polygon's edge is the bound. If a polygon starts or ends within the piece, the bound is a line

@@ -66,7 +66,7 @@ _TIMED_COLUMNS = leaves_of("plans", ("planning_time", "s", "of this plan"))
 
 
 def columns_of(plans: object) -> list[Column]:
-    """Return the additional columns for plans with camera observations or planning times."""
+    """Return a sweep's additional table columns for camera observations or planning times."""
     return {SeenPlan: _SEEN_COLUMNS, TimedPlan: _TIMED_COLUMNS}.get(type(plans), [])
 
 

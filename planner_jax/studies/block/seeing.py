@@ -84,7 +84,7 @@ class SeeingArms(Planner[BlockCase, SeenPlan]):
         )
 
     def moments(self, cases: BlockCase) -> list[float]:
-        """Return the times [s] at which flights are fitted, until the last ball arrives."""
+        """Return the times [s] when the balls' flights are fitted, until the last ball arrives."""
         moments = [self.observe]
         if self.observe_longer:
             num = int(self.observe_longer * self.frame_rate + 1e-6)

@@ -102,7 +102,7 @@ class AdaptBlock(Planner):
         return self.efforts
 
     def check(self, cases: BlockCase) -> None:
-        """Raise `ArgumentError` if the first case's arm, limits, scene or start does not fit."""
+        """Raise `ArgumentError` unless the first case's arm, limits, scene and start are stored."""
         self.stored.check(cases)
 
     def solve(self, case: BlockCase, attempt: Effort) -> BlockPlan:

@@ -35,7 +35,7 @@ class Face:
 
     @property
     def num(self) -> int:
-        """The number of cells of the face."""
+        """The number of cells, equal rectangles, into which the face is divided."""
         return self.cells[0] * self.cells[1]
 
     @property
@@ -98,13 +98,13 @@ def cell_of(faces: tuple[Face, ...], box: Box, point: Sequence[Array]) -> tuple[
     border of two cells belongs to the cell with the greater coordinate.
 
     Args:
-        faces: faces that have cells.
+        faces: the faces of the box that are divided into cells.
         box: the box.
         point: three coordinates () [m]; rounding errors may move the point off the surface.
 
     Returns:
-        cell: () int32, number of the cell; 0 if the face has no cells.
-        found: () bool, whether the face has cells.
+        cell: () int32, number of the cell; 0 if the point's face has no cells.
+        found: () bool, whether the point's face has cells.
     """
     share = [(point[k] - box.lower[k]) / (box.upper[k] - box.lower[k]) for k in range(3)]
     x, y, z = (jnp.abs(2.0 * each - 1.0) for each in share)
@@ -128,14 +128,14 @@ def cells_around(
     """Return the four cells whose centres are nearest to a point of a box's surface.
 
     Args:
-        faces: faces that have cells.
+        faces: the faces of the box that are divided into cells.
         box: the box.
         point: three coordinates () [m] of a point on the surface.
 
     Returns:
         cells: (4,) int32, numbers of the cells; repeated if a face has one cell in a direction.
         away: (4,), squared distances from the point to the cells' centres; a cell has size 1.
-        found: () bool, whether the face has cells.
+        found: () bool, whether the point's face has cells.
     """
     own, found = cell_of(faces, box, point)
     share = [(point[k] - box.lower[k]) / (box.upper[k] - box.lower[k]) for k in range(3)]

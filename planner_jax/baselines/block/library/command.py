@@ -96,7 +96,7 @@ def show_library(path: str, *, map: str | None = None) -> None:
 
 
 def check_library(path: str, *, num: int = 2000, seed: int = 0) -> None:
-    """Let the referee judge stored motions for random balls, `num` balls for each start pose."""
+    """Check motions by the referee, independently, for `num` random balls of each start pose."""
     require_size("num", num)
     require_seed(seed)
     require_memory("num", num, _CASE_BYTES)

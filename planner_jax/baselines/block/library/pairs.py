@@ -43,10 +43,10 @@ from planner_jax.task.block.motion import angles_at, bump_steps, step_weights
 FINE, COARSE = STRICT, (0.08, np.deg2rad(20.0))
 # [s], a ball may enter the outer box at most this time later than if there were no obstacles.
 _PATIENCE = 0.8
-# [rad], greatest angle of the shield's edge from horizontal, if it must block all balls that pass
-# through the two cells of a pair.
+# [rad], greatest angle of the shield's edge from horizontal, if it must block all possible balls.
 _ROLL = np.deg2rad(1.0)
-# [s], added to the ball's entry time of end poses that collide, so that they are tried last.
+# [s] Penalty of end poses that collide. It is added to a time in seconds by which end poses are
+# sorted, so that these poses are tried last.
 _TOUCHING = 10.0
 # Least distances of a shield from the two cells that the ball passes, as fractions of the distance
 # between these cells, for the tolerances FINE and COARSE.
