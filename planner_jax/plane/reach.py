@@ -134,7 +134,7 @@ def _move_y(rows: Array, move: Array) -> Array:
 
 
 def _move_x(rows: Array, move: Array) -> Array:
-    """Shift the bits of (words, ..., cells), cells along x, by `move` (...) cells, less than 32."""
+    """Move cells, bits of (words, ..., cells), along x by `move` (...) cells, less than 32."""
     none = jnp.zeros_like(rows[0])
     by = jnp.abs(move[..., None]).astype(jnp.uint32)
     carry = (32 - by) & 31

@@ -264,7 +264,7 @@ class _Loader(yaml.SafeLoader):
 
 
 def _merge(under: Mapping[str, Value], over: Mapping[str, Value]) -> dict[str, Value]:
-    """Merge two descriptions field by field; the second one overrides the first."""
+    """Merge two descriptions of a robot field by field; `over` overrides `under`."""
     merged = dict(under)
     for name, value in over.items():
         old = merged.get(name)

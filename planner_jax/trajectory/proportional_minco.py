@@ -247,7 +247,7 @@ def _motion(matrices: Array, columns: Array, piece_duration: Array) -> Motion:
 
 
 def trajectory_energy(maps: ProportionalMinco, rows: Array, offsets: Array, piece_duration: Array):
-    """Return the integral () of |p^(s)|^2 of a spline p(t) of M pieces.
+    """Return the integral () of |p^(s)|^2 of a spline p(t) of M pieces, with s = `maps.order`.
 
     `rows` (2s, 3) are the boundary rows, the scaled states at both ends, and `offsets` (O, 3) the
     whitened deviations of the waypoints from the smoothest spline.
@@ -257,12 +257,18 @@ def trajectory_energy(maps: ProportionalMinco, rows: Array, offsets: Array, piec
 
 
 def boundary_energy(maps: ProportionalMinco, rows: Array, piece_duration: Array) -> Array:
-    """Return the least integral () of |p^(s)|^2 for boundary rows (2s, 3): scaled end states."""
+    """Return the least integral () of |p^(s)|^2 for boundary rows (2s, 3): scaled end states.
+
+    p(t) is the spline through these states, and s = `maps.order`.
+    """
     return _boundary_form(maps, rows) * reciprocal(piece_duration) ** (2 * maps.order - 1)
 
 
 def offset_energy(maps: ProportionalMinco, offsets: Array, piece_duration: Array) -> Array:
-    """Return by how much () waypoint offsets (O, 3) raise the integral of |p^(s)|^2."""
+    """Return by how much () waypoint offsets (O, 3) raise the integral of |p^(s)|^2.
+
+    p(t) is the spline and s = `maps.order`. Without offsets the integral is least.
+    """
     rate = reciprocal(piece_duration)
     return maps.offset_energy * jnp.sum(offsets**2) * rate ** (2 * maps.order - 1)
 

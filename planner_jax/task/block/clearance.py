@@ -52,7 +52,7 @@ class _Poses(NamedTuple):
 
 
 class _Pairs(NamedTuple):
-    """P pairs of a moving body and a body that it must not touch, all of the same two shapes."""
+    """P pairs of a moving body and a body that it must not touch, such as segments and a box."""
 
     measure: Callable  # function of `space.distances` that returns the distance of two shapes
     bodies: tuple[Array, ...]  # arguments of `measure`; their last axes are (P or 1, N)

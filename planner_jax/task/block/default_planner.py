@@ -109,7 +109,7 @@ def read_learned_starts() -> tuple[np.ndarray, np.ndarray]:
 
 
 def _combine_excess(joints: Array, contact: Array, too_near: Array) -> Array:
-    """Return the largest excess: relative of joints and contact; 1 for 1 cm of `too_near` [m]."""
+    """Return the largest relative excess; a missing distance `too_near` [m] counts 1 per cm."""
     return jnp.maximum(jnp.maximum(joints, contact), 100.0 * too_near)
 
 
@@ -353,7 +353,7 @@ class OnlineBlock(Planner):
         return self.finish(case, flight, end.point, end.steps)
 
     def encode_straight(self, case: BlockCase, poses: EndPoses, index: Array) -> Array:
-        """Return the unknowns of the straight motion to the end pose with this index."""
+        """Return the unknowns of the straight motion to one of `poses`, which meet the ball."""
         time = poses.time[index]
         duration = jnp.maximum(time - case.delay, 1e-3)
         turned = poses.angles[index] - coast(case, duration, self.pieces)
@@ -429,8 +429,8 @@ class OnlineBlock(Planner):
         """
         moves, first, duration = self.decode(case, point)
         joints = joint_terms(case, moves, first, duration, self.weights, 1.0 - self.slack).excess
-        # The start is checked instead of the first sample after it, because one sample more would
-        # make a GPU a third slower.
+        # The start and all samples but the first one after it are checked: with one more time, a
+        # GPU would be a third slower.
         shares = (0.0, *(np.arange(min(2, self.checked), self.checked + 1) / self.checked))
         angles = angles_at(case.angles, first, moves, shares)
         gaps = least_clearances(case.arm, case.scene, angles)

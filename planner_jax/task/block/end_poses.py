@@ -52,7 +52,7 @@ def flight_of(case: BlockCase) -> Flight:
 
 
 def all_profiles(pieces: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return P speed profiles with K = `pieces` steps each, (P, K), and which end at rest, (P,)."""
+    """Return P speed profiles, rates (P, K) after K = `pieces` pieces, and which end at rest."""
     at_rest, free = profiles(pieces, True), profiles(pieces, False)
     return np.concatenate([at_rest, free]), np.arange(len(at_rest) + len(free)) < len(at_rest)
 

@@ -198,7 +198,7 @@ class ExactCatch(ChainPlanner[CatchCase, CatchPlan]):
         return self.join(offsets, natural)
 
     def _guess(self, context: CatchContext, guess: Array) -> Array:
-        """Return the 12 variables of each of N catches for one row of `guess_table`, (N, 12)."""
+        """Return the 12 variables of N catches for the row `guess` of `guess_table`, (N, 12)."""
         case = context.case
         factor, *of_catches = guess
         begin = jnp.zeros_like(context.times[:1])
@@ -226,7 +226,8 @@ class ExactCatch(ChainPlanner[CatchCase, CatchPlan]):
     def meet(self, natural: Array, context: CatchContext) -> ChainEnds:
         """Return the N catches that their 12 variables each describe, as ends of the segments.
 
-        The excess (2, N) has two rows: excess of the net's angle, and of the time over the horizon.
+        The excess (2, N) has two rows: relative excess of the net's angle, and of the catch's time
+        over the latest allowed time.
         """
         case, net = context.case, context.case.net
         durations = jnp.exp(natural[:, 0])

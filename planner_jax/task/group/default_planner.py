@@ -42,7 +42,7 @@ class GroupIntercept(Planner):
     patient: SpacetimeIntercept = SpacetimeIntercept("least")  # for legs that `planner` fails
 
     def plan_by(self, drive: Drive, cases: InterceptGroup) -> GroupPlan:
-        """Plan a batch of cases, or one case, leg after leg; `drive` runs the legs' planners."""
+        """Plan a case or a batch, one leg (drive to one target) after another."""
         if cases.batch_shape == ():
             plans = self.plan_by(drive, jax.tree.map(lambda leaf: leaf[None], cases))
             return jax.tree.map(lambda leaf: leaf[0], plans)
@@ -88,7 +88,7 @@ class GroupIntercept(Planner):
 
 
 def _is_open(status: Array) -> Array:
-    """Return whether a leg with this status is unsolved and worth a second try, by `patient`."""
+    """Return whether a drive with this status is unsolved and worth a second try, by `patient`."""
     return is_unsolved(status) | (status == Status.NO_PATH)
 
 

@@ -256,7 +256,7 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
         return natural.at[3:5].set(jnp.stack([jnp.sum(vel * each) for each in across]))
 
     def convert_point(self, point: Array, before: OptimisedPlanner) -> Array:
-        """Convert a point of a search without waypoint velocities: insert zero velocity offsets."""
+        """Add zero velocity offsets to decision variables `point` of a search without these."""
         if self.velocities == cast(ExactHit, before).velocities:
             return point
         places, own = point[: self._num_places], point[self._num_places :]
@@ -279,7 +279,7 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
         )
 
     def relative_excess(self, excess: Array) -> Array:
-        """Return the excess (5,) with ratios of squared speeds converted to ratios of speeds."""
+        """Return the excess (5,) of `meet`, with squared ratios of speeds converted to ratios."""
         return jnp.concatenate([excess[:2], Measure.ABOVE.relative(excess[2:])])
 
     def impact(self, natural: Array, context: HitContext) -> Impact:

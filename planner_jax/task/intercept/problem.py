@@ -74,7 +74,7 @@ class Guess:
 
 @dataclasses.dataclass(frozen=True)
 class MotionProblem:
-    """The least-squares problem of `SpacetimeIntercept`, whose fields of equal names it repeats."""
+    """The least-squares problem of `SpacetimeIntercept`, from which it copies its fields."""
 
     meet: Literal["given", "early", "least"] = "given"
     pieces: int = 32

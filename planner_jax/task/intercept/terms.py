@@ -240,7 +240,7 @@ def obstacle_terms(
 
 
 def join_obstacles(walls: Obstacles, movers: Obstacles) -> Obstacles:
-    """Return walls and movers in one `Obstacles`, with corners repeated to equal numbers."""
+    """Join walls and movers; repeat corners until all polygons have the same number of them."""
     size = max(walls.corners.shape[1], movers.corners.shape[1])
 
     def pad(corners: Array) -> Array:
