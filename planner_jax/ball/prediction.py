@@ -113,8 +113,7 @@ def _node_function(num_nodes: int) -> Callable:
                     if change.ndim == 0:
                         found[k] = found[k] + slope * change
                     else:
-                        along = slope * change[None, None]
-                        found[k] = found[k] + jnp.sum(along, axis=-1)
+                        found[k] = found[k] + jnp.sum(slope * change[None, None], axis=-1)
         return nodes, tuple(found)
 
     integrate_lanes = with_kernel(integrate, path, num_nodes, jvp=jvp)

@@ -95,7 +95,6 @@ def _cache(folder: Path | None) -> Finding:
 
 
 def _plans() -> Iterator[Finding]:
-    """Plan one hit and a batch of hits; yield the planning times and the referee's success rate."""
     import jax
     import numpy as np
 

@@ -136,8 +136,7 @@ def _integral(along: Along) -> Callable:
 
     def slopes_jvp(primals: tuple, tangents: tuple) -> tuple:
         moved = None if _is_still(tangents[2]) else jax.tree.map(_dense, tangents[2])
-        direction = (*map(_dense, tangents[:2]), moved)
-        return slopes_by_all(*primals), curvature(primals, direction)
+        return slopes_by_all(*primals), curvature(primals, (*map(_dense, tangents[:2]), moved))
 
     slopes_by_all = _with_kernel(_slopes_by_all, along, "slopes by all", slopes_jvp)
 

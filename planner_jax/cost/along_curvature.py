@@ -234,7 +234,6 @@ class _Constants:
 
     @property
     def num_moving(self) -> int:
-        """C, the number of variable columns."""
         return self.moving_samples.shape[-1]
 
 

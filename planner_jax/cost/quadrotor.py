@@ -45,10 +45,7 @@ def acceleration_excess(acc: Components, limits: QuadrotorLimits) -> Array:
 def body_rate_excess(
     acc: Components, jerk: Components, gravity: Array, limits: QuadrotorLimits
 ) -> Array:
-    """Return |omega|^2 / omega_max^2 - 1 for the body rates omega [rad/s] [Yu2023bat, eq. 18a].
-
-    omega follows from acceleration and jerk, since the quadrotor is differentially flat.
-    """
+    """Return |omega|^2 / omega_max^2 - 1 for the body rates omega [rad/s] [Yu2023bat, eq. 18a]."""
     return body_rate_squared(acc, jerk, gravity) * reciprocal(limits.body_rate) ** 2 - 1.0
 
 

@@ -82,10 +82,7 @@ class Stroke(abc.ABC, Generic[CaseT, PlanT]):
         return call_packed(self._solve_first, self._planner.rounds[1], self._planner, case)
 
     def again(self, plan: PlanT, elapsed: float, ball: BallState) -> PlanT:
-        """Plan again for a newer estimate of the ball, from the previous plan as guess.
-
-        The new plan starts at the state in `plan` after the time `elapsed` [s].
-        """
+        """Plan for a newer estimate of the ball, from the state in `plan` after `elapsed` [s]."""
         since: Any = np.float32(elapsed)
         task = Replanning(self._with_ball(ball), plan, since)
         return call_packed(self._solve_again, _AGAIN, self._replanner, task)

@@ -193,8 +193,8 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
 
         Returns:
             Boundary rows (N, 8, 3), which are scaled states at both ends of the segments; mean
-            durations of a piece (N,) [s]; the part of the cost (); and the greatest excess over a
-            limit at the ends ().
+            durations of a piece (N,) [s]; the part of the cost (); and the greatest excess at the
+                ends ().
         """
         ends = self.meet(natural, context)
         durations = ends.durations / self.num_pieces

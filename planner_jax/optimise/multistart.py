@@ -154,8 +154,7 @@ def _optimum_of(state: PyTree, config: Solver) -> Optimum:
 
 
 def _optimum_at(point: Array, evaluation: Evaluation, config: Solver) -> Optimum:
-    stationary = jnp.full((), config.patience == 0)
-    return Optimum(point, evaluation, jnp.zeros((), jnp.int32), stationary)
+    return Optimum(point, evaluation, jnp.zeros((), jnp.int32), jnp.full((), config.patience == 0))
 
 
 def solve_round(planner: "OptimisedPlanner", attempt: Round, case: PyTree) -> PyTree:
@@ -226,7 +225,6 @@ def solve_batch(planner: "OptimisedPlanner", attempt: Round, cases: PyTree) -> P
 
 
 def _stages(attempt: Round) -> tuple[Stage, ...]:
-    """Return the searches of a round (attempt) in order: the preliminary ones, then its own."""
     return (*attempt.stages, Stage(attempt.solver, attempt.settings))
 
 

@@ -161,8 +161,7 @@ def solve_damped(here: Curvature, damping: Array, config: NewtonConfig) -> tuple
         diagonal, beside = [jnp.ones_like(size)], []
     shift = jnp.maximum(-_lowest(diagonal, beside), 0.0)
     solve = lambda trial: _tridiagonal_solve(diagonal, beside, shift + trial)  # noqa: E731
-    trials = jnp.asarray(config.trial_dampings, gradient.dtype)
-    inside = size * jax.vmap(solve)(trials)  # (k, m)
+    inside = size * jax.vmap(solve)(jnp.asarray(config.trial_dampings, gradient.dtype))  # (k, m)
     steps = -jnp.matmul(inside, directions, precision=_HIGHEST)
     lengths = jnp.sqrt(jnp.sum(steps**2, axis=1, keepdims=True))
     steps = steps * jnp.minimum(1.0, config.step_cap / jnp.maximum(lengths, 1e-20))

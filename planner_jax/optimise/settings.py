@@ -166,8 +166,7 @@ def load_round(attempt: Round, is_counted: bool) -> Round | Fixed:
     """
 
     def load(solver: Solver) -> Solver:
-        is_long = not is_counted or solver.max_steps > COUNTED
-        if is_long or not isinstance(solver, LbfgsConfig):
+        if (not is_counted or solver.max_steps > COUNTED) or not isinstance(solver, LbfgsConfig):
             return solver
         return CountedLbfgs(**vars(solver))
 

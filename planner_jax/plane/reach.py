@@ -196,8 +196,7 @@ def _draw_movers(grid: Grid, movers: Obstacles, stencils: Array, time: Array) ->
 
 def _word_of(row: Array, at: Array) -> Array:
     by = jnp.minimum(jnp.abs(at), 31).astype(jnp.uint32)
-    moved = jnp.where(at >= 0, row << by, row >> by)
-    return jnp.where(jnp.abs(at) < 32, moved, jnp.uint32(0))
+    return jnp.where(jnp.abs(at) < 32, jnp.where(at >= 0, row << by, row >> by), jnp.uint32(0))
 
 
 def reach_set(
@@ -372,5 +371,4 @@ def goal_cells(
     cells = nearest[:, None].astype(around.dtype) + around[None]
     of_level = jax.vmap(jax.vmap(bit_at, (None, None, None, 0)), (None, None, 0, 0))
     of_all = jax.vmap(of_level, (None, 0, None, None))
-    is_reached = of_all(layer, jnp.arange(lattice.levels), bins, cells)
-    return cells, is_reached & headings[None, :, None]
+    return cells, of_all(layer, jnp.arange(lattice.levels), bins, cells) & headings[None, :, None]

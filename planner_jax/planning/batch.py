@@ -208,7 +208,6 @@ class _Batch:
     watch: Watch
 
     def sizes(self, attempt: Attempt) -> Sizes:
-        """Return the numbers of lanes (cases) that the compiled calls of an attempt may have."""
         return sizes_of(self.planner, attempt, self.chunk, self.mesh)
 
     def try_lanes(

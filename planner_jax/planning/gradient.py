@@ -54,8 +54,7 @@ def gradient(
         cases: one case or a batch.
         of: the number: a dotted name in the plan, such as "stroke.time", "cost" or "violation", or
             a function of one plan. Every new function object compiles a new program.
-        by: a dotted name in the case, or several, such as "racket_height", "limits", "net.radius"
-            or "extras.0.radius".
+        by: a dotted name in the case, or several, such as "limits" or "extras.0.radius".
         steps: iterations of conjugate gradients for the adjoint; the default depends on
             `curvature`. 0 is exact for "cost", by the envelope theorem.
         curvature: "products", the default, solves with products of the Hessian, which are exact

@@ -43,8 +43,7 @@ def plan(
         devices: devices that share a batch. By default all local ones, `jax.local_devices()`.
         time_limit: [s] time, compilation included, after which no attempt but the first starts;
             running computations are finished. Unsolved cases that have not been through all
-            attempts have the status `OUT_OF_TIME`; a limit does not change the plans of other
-            cases.
+            attempts have the status `OUT_OF_TIME`; a limit does not change other plans.
         progress: function that receives a `Progress` at the start and end of every attempt and
             after its chunks; `print` writes one line for each.
 

@@ -156,8 +156,7 @@ def clearances(case: dict, links: Sequence, angles: np.ndarray, sampled: np.ndar
 
     Args:
         case: arrays of B cases.
-        links: link to which each capsule of the arm belongs, 0 to 5 for links 1 to 6, -1 for the
-            base.
+        links: link of each capsule of the arm, 0 to 5 for links 1 to 6, -1 for the base.
         angles: (6, B, S) [rad], joint angles at S samples of each motion.
         sampled: (B, S) bool, samples to evaluate, at least one in each motion.
 
@@ -194,8 +193,7 @@ def _arm(case: dict, links: Sequence, angles: np.ndarray) -> tuple[list[_Capsule
         if link != _BASE:
             first, second = (positions[link] + rotate(turns[link], end) for end in (first, second))
         name = "the base" if link == _BASE else f"link {link + 1}"
-        radius = case["arm.capsule_radius"][:, k, None]
-        capsules.append(_Capsule(name, link, first, second, radius))
+        capsules.append(_Capsule(name, link, first, second, case["arm.capsule_radius"][:, k, None]))
     wide = case["arm.shield_half"][:, None]
     half = np.stack([np.full_like(wide, 0.5 * THICKNESS), wide, wide])
     middle = shield_middle(case, turns, positions) - 0.5 * THICKNESS * turns[5][:, 0]

@@ -1,9 +1,8 @@
 """Float64 NumPy referee of catches: decides by physics whether a plan succeeds.
 
 A catch is a quadrotor's meeting with a moving target in the hoop of its net. `referee.quadrotor`
-checks the flight, this module the plan's order of targets, its catch times and the targets'
-positions. Only extra limits (`referee.extras`) are code that planners use too. World frame, z up,
-SI units.
+checks the flight, this module the plan's order of targets, catch times and targets' positions. Only
+extra limits (`referee.extras`) are code that planners use too. World frame, z up, SI units.
 
 Equations of [Yu2023catch]: a ball with linear drag (eq. 9); the net's centre p + l z_d at the
 height l above the quadrotor's position p (eq. 22); and the angle between z_d and minus the ball's
@@ -389,8 +388,7 @@ def _catch_time(case: dict, held: np.ndarray, ends: np.ndarray) -> tuple:
     after = np.where(held, 0.0, shortest).min(axis=1, keepdims=True)
     shortest = np.where(after < 0.0, np.minimum(shortest, after), shortest)
     off = np.maximum(np.abs(case["times"] - ends), ends - case["horizon"])
-    failed = (off > CONTACT_TIME_TOLERANCE) | (shortest <= 0.0)
-    return failed, np.maximum(off, -shortest), ends
+    return (off > CONTACT_TIME_TOLERANCE) | (shortest <= 0.0), np.maximum(off, -shortest), ends
 
 
 def _worst(test: tuple, held: np.ndarray) -> tuple:

@@ -291,5 +291,4 @@ def _contact_time(case: dict, end: np.ndarray, ball: np.ndarray) -> tuple:
     height = np.minimum(case["ball.pos"][:, 2], ball[2])
     grounded = np.maximum(-height, 0.0) / np.maximum(np.abs(ball[5]), 1e-3)
     excess = np.maximum(np.maximum(claim, -shortest), grounded)
-    failed = (claim > CONTACT_TIME_TOLERANCE) | (shortest <= 0.0) | (height <= 0.0)
-    return failed, excess, end
+    return (claim > CONTACT_TIME_TOLERANCE) | (shortest <= 0.0) | (height <= 0.0), excess, end

@@ -115,9 +115,8 @@ def referee_intercepts(
         truth: true paths of the B targets; they replace `cases.target`, which may be a prediction.
         target_positions: function `(target, times (B,) [s]) -> positions (B, 2) [m]` for targets
             of other classes. If passed, it is called for the known classes too.
-        tolerance: relative tolerance of every limit of the car, of the case's tolerance and its
-            heading tolerance; absolute tolerance, in SI units, of the plan's first pose, speed and
-            curvature.
+        tolerance: relative tolerance of every limit of the car, the case's tolerance and its
+            heading tolerance; absolute tolerance [SI] of the plan's first pose, speed, curvature.
         contact_tolerance: [m], greatest depth of the body in an obstacle, and greatest distance of
             its middle outside the map.
 

@@ -48,8 +48,8 @@ def referee_groups(
     """Decide for every plan of a batch of group interceptions whether it succeeds.
 
     Leg k, the drive to the k-th target, must start with the pose, speed and curvature at the end of
-    leg k - 1, within the tolerance of `referee_intercepts`, and end within the remainder of the
-    case's time.
+    leg k - 1, within the tolerance of `referee_intercepts`, and end within the case's remaining
+    time.
 
     Args:
         cases: object with the fields of `InterceptGroup`, for B cases.
@@ -83,8 +83,7 @@ def referee_groups(
         )
     together = {name: np.stack([each[name] for each in found], axis=1) for name in found[0]}
     fails = ~together["success"] & there
-    last = np.maximum(there.sum(axis=1) - 1, 0)
-    leg = np.where(fails.any(axis=1), fails.argmax(axis=1), last)
+    leg = np.where(fails.any(axis=1), fails.argmax(axis=1), np.maximum(there.sum(axis=1) - 1, 0))
     fields = {name: leaf[lanes, leg] for name, leaf in together.items()}
     fields["success"] = is_order & ~fails.any(axis=1)
     fields["failed_limit"] = np.where(is_order, fields["failed_limit"], "order")

@@ -100,8 +100,7 @@ def read_leaves(
     """Read arrays of cases or plans, by the dotted paths of their fields, and check their shapes.
 
     `shapes` are the shapes of the arrays of a single case, without the batch axis of length
-    `num_lanes`. Names in the result and in errors start with `prefix`. Fields of `tree` that are
-    None are left out.
+    `num_lanes`. Names in the result and in errors start with `prefix`. None fields are left out.
 
     Raises:
         ValueError: an array does not have the shape (B, ...) that `shapes` requires.

@@ -323,8 +323,7 @@ def joint_errors(pieces: Pieces, head_state: np.ndarray) -> tuple:
     total = np.where(flown, durations, 0.0).sum(axis=1)
     period = np.maximum(total / np.maximum(flown.sum(axis=1), 1), SHORTEST_PIECE)
     weights = np.stack([period**n / math.factorial(n) for n in range(4)])
-    head = np.moveaxis(head_state, 0, -1)
-    head_error = np.linalg.norm(starts[..., 0] - head, axis=1) * weights
+    head_error = np.linalg.norm(starts[..., 0] - np.moveaxis(head_state, 0, -1), axis=1) * weights
     jumps = np.linalg.norm(starts[..., 1:] - ends[..., :-1], axis=1)
     jump = np.zeros_like(durations)
     jump[:, 1:] = np.where(flown[:, 1:], (jumps * weights[:, :, None]).max(axis=0), 0.0)

@@ -34,8 +34,7 @@ def rotate_back(rotation: np.ndarray, vector: np.ndarray) -> np.ndarray:
 def from_segment(point: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """Return the distances [m] of points from the segments `first` to `second`, all (3, ...)."""
     span, away = second - first, point - first
-    share = np.clip(_ratio(dot(away, span), dot(span, span)), 0.0, 1.0)
-    return length(away - share * span)
+    return length(away - np.clip(_ratio(dot(away, span), dot(span, span)), 0.0, 1.0) * span)
 
 
 def between_segments(

@@ -108,8 +108,7 @@ def inverse_kinematics(arm: Arm, rotation: Array, middle: Array) -> tuple[Array,
     angles, reached = jax.vmap(branches)(*jnp.asarray(_ARM_BRANCHES, wrist.dtype))
     angles, reached = angles.reshape(8, 6), reached.reshape(8)
     lower, upper = jnp.asarray(arm.lower)[None], jnp.asarray(arm.upper)[None]
-    turns = jnp.round((angles - 0.5 * (lower + upper)) / (2.0 * jnp.pi))
-    angles = angles - 2.0 * jnp.pi * turns
+    angles = angles - 2.0 * jnp.pi * jnp.round((angles - 0.5 * (lower + upper)) / (2.0 * jnp.pi))
     return angles, reached & jnp.all((angles >= lower) & (angles <= upper), axis=1)
 
 

@@ -5,8 +5,7 @@ chain of six bodies. Each of the six bodies has one hinge joint, an inertial, an
 capsules and spheres. The sixth body also has a square box and a site, both named shield; the site
 is at the middle of the box's face along +x. A key named home holds the angles at which the arm
 waits. Any other element inside the arm is an error, including MuJoCo's defaults for classes of
-elements. Elements around the arm (geoms of the world, lights, cameras, actuators, sensors, options)
-are ignored.
+elements. Elements around the arm, such as lights, cameras, actuators and sensors, are ignored.
 """
 
 import functools

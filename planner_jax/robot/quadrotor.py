@@ -185,8 +185,7 @@ def tilt_quaternion(normal: Array) -> Array:
 
 def greatest_speed(head_state: Array, limits: QuadrotorLimits) -> Array:
     """Return an upper bound () [m/s] on the speed: the limit, or the speed at time 0 if greater."""
-    first = jnp.sqrt(jnp.sum(head_state[1] * head_state[1]))
-    return jnp.maximum(ALLOWED * limits.speed, first)
+    return jnp.maximum(ALLOWED * limits.speed, jnp.sqrt(jnp.sum(head_state[1] * head_state[1])))
 
 
 def beyond_reach(

@@ -37,10 +37,10 @@ CRAZYFLIE = QuadrotorModel(
     "drag torque); lag, net and limits assumed",
 )
 
-# A racing quadrotor. Mass and static thrust (870 g, 35 N) are from [Kaufmann2023], whose propellers
-# have 6 inches. All other numbers are assumptions. A diagonal of 330 mm is usual for such frames.
-# The inertia assumes 60 g of motor and propeller at the end of each arm, and the remainder within
-# 4 cm of the centre.
+# A racing quadrotor. Mass and static thrust (870 g, 35 N) are from [Kaufmann2023], with 6-inch
+# propellers. All other numbers are assumptions. A diagonal of 330 mm is usual for such frames. The
+# inertia assumes 60 g of motor and propeller at the end of each arm, and the remainder within 4 cm
+# of the centre.
 RACER = QuadrotorModel(
     name="racer",
     mass=0.87,

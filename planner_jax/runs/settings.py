@@ -50,10 +50,7 @@ def require_count(name: str, value: int | None, least: int, *, none: bool = Fals
 
 @dataclasses.dataclass(frozen=True)
 class SweepSettings:
-    """Settings that the sweeps of all tasks have; a task's subclass adds further settings.
-
-    They determine all numbers in a run's rows. A value that breaks its rule raises `ArgumentError`.
-    """
+    """Settings that the sweeps of all tasks have; a task's subclass adds further settings."""
 
     planner: str | None = option(None, "NAME", "")  # None selects the task's first planner
     suite: str | None = option(None, "NAME", "")  # None selects the task's first suite

@@ -8,8 +8,7 @@ distance of its axis minus its radius. Any frame, SI units; the ground is the x-
 * a rectangle: its `middle` (3,) [m] and `edges` (2, 3) [m], halves of its edges as vectors from the
   middle, at right angles and longer than zero;
 * a box along the axes: its corners `lower` and `upper` (3,) [m], `lower` <= `upper`;
-* a vertical line of infinite length, such as the axis of a pole: its `position` (2,) [m] on the
-  ground.
+* a vertical line of infinite length, such as a pole's axis: its `position` (2,) [m].
 
 A distance is the least length |gap| of a vector between points of two bodies. The derivative of the
 distance is the derivative of |gap| with the nearest points fixed on their bodies (the envelope

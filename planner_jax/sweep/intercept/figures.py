@@ -151,8 +151,7 @@ def draw_drive(axes: Axes, drive: SampledDrive, colours: ScalarMappable) -> None
     draw_map(axes, drive.setting, drive.walls)
     end = float(np.nan_to_num(row["meeting_time"]))
     times = instants(end, _MOST_BODIES)
-    every = max(-(-len(times) * len(drive.movers) // _MOST_MOVERS), 1)
-    for time in times[::every]:
+    for time in times[:: max(-(-len(times) * len(drive.movers) // _MOST_MOVERS), 1)]:
         moved = [m + time * v for m, v in zip(drive.movers, drive.velocities, strict=True)]
         draw_polygons(axes, moved, colours.to_rgba(time))
     for corners, velocity in zip(drive.movers, drive.velocities, strict=True):

@@ -78,8 +78,7 @@ def end_poses(
     profile is the one that stays farthest below the joints' limits; with `quickest`, motions that
     end at rest have the profile that can be executed in the least time.
     """
-    share = (np.arange(points) + 0.5) / points
-    time = flight.earliest + share * (flight.latest - flight.earliest)
+    time = flight.earliest + (np.arange(points) + 0.5) / points * (flight.latest - flight.earliest)
     offset = case.offset * jnp.asarray(_OFFSETS[np.arange(points) % len(_OFFSETS)], time.dtype)
 
     def solve_point(time: Array, offset: Array) -> tuple[Array, Array]:

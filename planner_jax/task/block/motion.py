@@ -85,8 +85,7 @@ def joint_terms(
     of_first, of_steps = (jnp.asarray(each, dtype) for each in step_weights(pieces, knots))
     rise = jnp.asarray(np.eye(pieces) - np.eye(pieces, k=-1), dtype)
     rates = steps / duration
-    rises = steps - jnp.concatenate([first[None], steps[:-1]])
-    accelerations = rises * (pieces / duration**2)
+    accelerations = (steps - jnp.concatenate([first[None], steps[:-1]])) * (pieces / duration**2)
     angles = angles_at(case.angles, first, steps, knots)
     middle = 0.5 * (case.arm.upper + case.arm.lower)
     half = 0.5 * (case.arm.upper - case.arm.lower)

@@ -146,8 +146,7 @@ def _state(case: BlockCase, plan: BlockPlan, elapsed: Array) -> tuple[Array, Arr
     motion = append_braking(case, plan.motion)
     is_over = elapsed >= jnp.sum(motion.durations)
     elapsed = jnp.minimum(elapsed, jnp.sum(motion.durations))
-    rates = jnp.where(is_over, 0.0, evaluate(motion, elapsed, 1))
-    return evaluate(motion, elapsed), rates
+    return evaluate(motion, elapsed), jnp.where(is_over, 0.0, evaluate(motion, elapsed, 1))
 
 
 _states = jax.jit(jax.vmap(_state))

@@ -95,8 +95,7 @@ def _is_valid(suite: Suite, pos: np.ndarray, vel: np.ndarray, duration: float) -
             return False
 
     def within(half: float, height: float) -> np.ndarray:
-        inside = (np.abs(path[:, :2]) < half).all(axis=1)
-        return inside & (path[:, 2] > 0.0) & (path[:, 2] < height)
+        return (np.abs(path[:, :2]) < half).all(axis=1) & (path[:, 2] > 0.0) & (path[:, 2] < height)
 
     outer = within(OUTER_HALF, OUTER_HEIGHT)
     if not outer.any() or within(INNER_HALF, INNER_HEIGHT).any():

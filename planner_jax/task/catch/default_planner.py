@@ -246,8 +246,7 @@ class ExactCatch(ChainPlanner[CatchCase, CatchPlan]):
         excess = (jnp.cos(angle) - facing) / (angle * jnp.sin(angle))
         excess = jnp.where(moving, excess, -1.0)
         tail_states = jnp.stack([pos, natural[:, 3:6], acc, natural[:, 9:12]], axis=1)
-        # Feasible plans may exceed a limit by the tolerance. It is added here, so that no catch is
-        # later than the horizon.
+        # Feasible plans may exceed a limit by the tolerance, added here so that no catch is late.
         late = times / context.horizon - 1.0 + FEASIBILITY_TOLERANCE
         return ChainEnds(
             durations=durations,

@@ -54,10 +54,7 @@ def _timetable(group: InterceptGroup) -> tuple[Array, Array]:
 def _next(
     group: InterceptGroup, table: tuple[Array, Array], last: _Meeting, target: Array
 ) -> _Meeting:
-    """Estimate the earliest meeting with a target after the meeting `last`.
-
-    `table` has times and the positions of all targets at these times, from `_timetable`.
-    """
+    """Estimate the earliest meeting with a target after `last`; `table` is from `_timetable`."""
     times, positions = table[0], table[1][target]
     limits = group.shared.limits
     away = positions - last.position[None]

@@ -75,9 +75,8 @@ def planner(
 
     Args:
         name: one of these names, or the name of a planner of another package.
-        recovery: kind of the trajectory after the impact, which keeps all limits: "brake" ends at
-            standstill wherever this costs least, "home" ends at the start position. By default the
-            plan ends at the impact.
+        recovery: trajectory after the impact, which keeps all limits: "brake" ends at standstill
+            wherever this costs least, "home" at the start position. None: no such trajectory.
         effort: "feasible" stops as soon as every limit holds; "good" and "best" lower the cost.
         **options: fields of the planner's dataclass, for example `rounds`.
 
@@ -104,8 +103,7 @@ def judge(cases: HitCase, plans: HitPlan, **settings: object) -> HitVerdict:
     Args:
         cases: one case, or a batch.
         plans: one plan for each case.
-        **settings: settings of `referee_hits`, such as `drag_after_impact`: whether the returned
-            ball has drag.
+        **settings: settings of `referee_hits`, such as `drag_after_impact` of the returned ball.
 
     Returns:
         A verdict with the batch shape of the cases: whether each plan is a `success`, the reason

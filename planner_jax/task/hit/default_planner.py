@@ -169,7 +169,6 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
         return 3 * (self.num_pieces - 1)
 
     def _fit_scale(self, scale: tuple[float, ...]) -> tuple[float, ...]:
-        """Return `scale`, with units of the waypoint velocities inserted if these are missing."""
         places = self._num_places
         if not self.velocities or len(scale) != places + self.num_end_variables:
             return scale
@@ -182,8 +181,7 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
         velocities as variables. There is none for cases with the user's extra terms, such as
         obstacles: the side on which a search starts decides on which side it ends.
         """
-        is_usual = self.proportions == _PROPORTIONS and not case.extras
-        if not self.learned or not is_usual:
+        if not self.learned or not (self.proportions == _PROPORTIONS and not case.extras):
             return None
         if self.scale != self._fit_scale(self._usual_scale):
             return None

@@ -127,8 +127,7 @@ def case(
     (Section V). This library assumes that the map is 8 m x 8 m and the car a model of scale 1:10.
 
     Args:
-        target: path of the target, such as a `TurningPath`; for a batch every leaf has a leading
-            axis B.
+        target: path of the target, such as a `TurningPath`; in a batch every leaf has an axis B.
         time: () or (B,) [s], of the meeting, > 0. The time and every following number is one value
             for all cases, or one value for each case.
         start: (3,) x, y of the rear axle's middle [m], and heading [rad], at time 0.

@@ -132,8 +132,7 @@ def _candidates(suite: Suite, kinds: np.ndarray, uniform: np.ndarray) -> Draws:
     """
     turning, count_walls = kinds[:, 0] < 0.5, _integer(kinds[:, 1], *suite.num_walls)
     count_movers = _integer(kinds[:, 2], *suite.num_movers)
-    cuts = np.cumsum([7, suite.wall_room[0] * (2 + _SHAPE)])
-    u, walls, movers = np.split(uniform, cuts, axis=1)
+    u, walls, movers = np.split(uniform, np.cumsum([7, suite.wall_room[0] * (2 + _SHAPE)]), axis=1)
     start = np.stack([np.full(len(u), START_X), _between(u[:, 0], 1.0, SIZE - 1.0)], axis=1)
     meeting = anywhere(u[:, 1:3])
     walls = walls.reshape(len(u), suite.wall_room[0], 2 + _SHAPE)

@@ -244,8 +244,7 @@ def join_obstacles(walls: Obstacles, movers: Obstacles) -> Obstacles:
     size = max(walls.corners.shape[1], movers.corners.shape[1])
 
     def pad(corners: Array) -> Array:
-        more = size - corners.shape[1]
-        return jnp.concatenate([corners, *[corners[:, -1:]] * more], axis=1)
+        return jnp.concatenate([corners, *[corners[:, -1:]] * (size - corners.shape[1])], axis=1)
 
     walls, movers = (dataclasses.replace(x, corners=pad(x.corners)) for x in (walls, movers))
     return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), walls, movers)
