@@ -41,7 +41,6 @@ def _full_name(kind: str) -> str:
 
 
 def _definition(kind: str) -> str:
-    """Return the definition of a ROS message type, and of all types that its fields have."""
     types = [kind]
     for each in types:  # the loop also visits the types that it appends
         inner = (line.split()[0].removesuffix("[]") for line in _TYPES[each].splitlines())

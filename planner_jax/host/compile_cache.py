@@ -54,7 +54,6 @@ def keep_compiled_programs() -> Path | None:
 
 
 def _delete_oldest(folder: Path) -> None:
-    """Delete the programs that were used least recently while the folder is larger than `LIMIT`."""
     checked = folder / "checked"  # its time of change is the time of the last check
     with contextlib.suppress(OSError):  # a folder that cannot be written, or another process
         if checked.exists() and time.time() - checked.stat().st_mtime < _CHECKED_EVERY:

@@ -192,9 +192,8 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
         """Compute the part of the objective that depends only on K end variables of N segments.
 
         Returns:
-            Boundary rows (N, 8, 3), which are scaled states at both ends of the segments; mean
-            durations of a piece (N,) [s]; the part of the cost (); and the greatest excess at the
-                ends ().
+            Boundary rows (N, 8, 3), scaled states at both ends of the segments; mean durations of a
+            piece (N,) [s]; the part of the cost (); and the greatest excess at the ends ().
         """
         ends = self.meet(natural, context)
         durations = ends.durations / self.num_pieces

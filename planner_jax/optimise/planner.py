@@ -108,10 +108,7 @@ class OptimisedPlanner(Planner[CaseT, PlanT], abc.ABC):
         return jnp.zeros((), bool)
 
     def convert_point(self, point: Array, before: "OptimisedPlanner") -> Array:
-        """Convert a point (n,) of the same planner with other settings to this planner's variables.
-
-        The point is returned unchanged unless the settings change the variables.
-        """
+        """Convert a point (n,) of this planner with other settings to this planner's variables."""
         return point
 
     @property

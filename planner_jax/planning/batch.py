@@ -278,10 +278,7 @@ class _Batch:
             yield from later
 
     def plan_resident(self, attempts: Sequence[Attempt], cases: PyTree) -> tuple[PyTree, Array]:
-        """Return plans of cases in jax arrays; only numbers of unsolved cases reach the host.
-
-        Each device plans an equal part of the batch, and never takes over cases of another device.
-        """
+        """Return plans of cases in jax arrays; only numbers of unsolved cases reach the host."""
         planner, mesh, watch, num = self.planner, self.mesh, self.watch, count_lanes(cases)
         if num % mesh.size:  # repeat the last case until all devices have equally many cases
             cases = _take(cases, np.arange(-(-num // mesh.size) * mesh.size))
@@ -334,7 +331,6 @@ class _Batch:
 
 @jax.jit
 def _take(tree: PyTree, lanes: PyTree) -> PyTree:
-    """Return entries of every leaf by index; an index beyond the end selects the last entry."""
     return jax.tree.map(lambda leaf: leaf[jnp.minimum(lanes, leaf.shape[0] - 1)], tree)
 
 

@@ -305,7 +305,6 @@ def _product(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 
 
 def _cross(axis: np.ndarray) -> np.ndarray:
-    """Return the matrices (3, 3, ...) that map v to `axis` x v, for axes (3, ...)."""
     (x, y, z), none = axis, np.zeros_like(axis[0])
     return np.array([[none, -z, y], [z, none, -x], [-y, x, none]])
 

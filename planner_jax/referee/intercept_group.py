@@ -48,8 +48,7 @@ def referee_groups(
     """Decide for every plan of a batch of group interceptions whether it succeeds.
 
     Leg k, the drive to the k-th target, must start with the pose, speed and curvature at the end of
-    leg k - 1, within the tolerance of `referee_intercepts`, and end within the case's remaining
-    time.
+    leg k - 1, within the tolerance of `referee_intercepts`, and end in the case's remaining time.
 
     Args:
         cases: object with the fields of `InterceptGroup`, for B cases.

@@ -58,7 +58,6 @@ def _call(
 
 @functools.cache
 def _start_workers() -> tuple[ThreadPoolExecutor, SimpleQueue]:
-    """Start a worker process and a waiting thread for each core; they stop with the program."""
     num, idle = cores(), SimpleQueue()
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), **_ONE_THREAD}
     pipe, command = subprocess.PIPE, [sys.executable, "-m", __name__]

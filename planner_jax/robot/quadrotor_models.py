@@ -38,9 +38,8 @@ CRAZYFLIE = QuadrotorModel(
 )
 
 # A racing quadrotor. Mass and static thrust (870 g, 35 N) are from [Kaufmann2023], with 6-inch
-# propellers. All other numbers are assumptions. A diagonal of 330 mm is usual for such frames. The
-# inertia assumes 60 g of motor and propeller at the end of each arm, and the remainder within 4 cm
-# of the centre.
+# propellers. All other numbers are assumptions. A diagonal of 330 mm is usual. The inertia assumes
+# 60 g of motor and propeller at the end of each arm, the remainder within 4 cm of the centre.
 RACER = QuadrotorModel(
     name="racer",
     mass=0.87,

@@ -147,7 +147,6 @@ def _make(job: bytes, number: int) -> Made:
 
 @functools.lru_cache(maxsize=1)
 def _maker_of(job: bytes) -> Maker:
-    """Restore the `Maker` of a pickled run; raise `WorkersFailed` if the worker's code differs."""
     environ, config, (task, settings, makers, run) = pickle.loads(job)
     # JAX raises an error if this variable and XLA_CLIENT_MEM_FRACTION are both set.
     os.environ.pop("XLA_PYTHON_CLIENT_MEM_FRACTION", None)

@@ -38,11 +38,7 @@ def make_empty_plan(case: BlockCase, pieces: int) -> BlockPlan:
 
 
 def explain_status(poses: EndPoses, status: Array) -> Array:
-    """Return a plan's status () int32: OUT_OF_REACH if it is unsolved and no end pose exists.
-
-    In an end pose the shield meets the ball. There is none if the ball misses the protected inner
-    box or the outer box around it, or if the shield reaches the ball nowhere between both boxes.
-    """
+    """Return a plan's status () int32: OUT_OF_REACH if it is unsolved and no end pose exists."""
     is_kept = is_solved(status) | jnp.any(jnp.isfinite(poses.effort))
     return jnp.where(is_kept, status, Status.OUT_OF_REACH).astype(jnp.int32)
 

@@ -97,8 +97,7 @@ def case(
     replaces it by the order that it decides.
 
     Args:
-        targets: paths of the targets, such as a `TurningPath`; leaves have leading axes (N,) or (B,
-            N).
+        targets: paths of targets, such as a `TurningPath`; leaves have leading axes (N,), (B, N).
         time: () [s], time before which all targets must be met, or (B,) for B cases.
         present: () or (N,) or (B, N) bool, whether each target exists.
         **settings: arguments of `pj.intercept.case`, such as `start` and `walls`.

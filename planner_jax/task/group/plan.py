@@ -13,8 +13,8 @@ class GroupPlan(Plan):
     """One plan with a leg, that is a drive, to each of N targets; or a batch of plans.
 
     Every leg starts at the state and the time at which the previous leg ends. Legs to absent
-    targets, and legs after an unsolved leg, have zero duration. The cost is the time [s] when the
-    last target is met.
+    targets, and after an unsolved leg, have zero duration. The cost is the time [s] when the last
+    target is met.
     """
 
     order: Array  # (N,) int32, index of the target that is met first, second, ...

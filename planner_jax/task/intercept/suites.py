@@ -107,7 +107,6 @@ def draw_accepted(
 
 
 def _count_numbers(suite: Suite) -> int:
-    """Return the number of random numbers from which one candidate case of a suite is made."""
     return 7 + suite.wall_room[0] * (2 + _SHAPE) + suite.mover_room[0] * (3 + _SHAPE)
 
 
