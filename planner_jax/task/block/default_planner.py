@@ -56,11 +56,11 @@ from planner_jax.task.block.end_poses import (
     flight_of,
 )
 from planner_jax.task.block.motion import (
-    JointTerms,
     Weights,
     angles_at,
     bump_steps,
     joint_terms,
+    lift_to_unknowns,
     polynomial,
     speed_up,
     step_weights,
@@ -129,44 +129,6 @@ def rank_poses(poses: EndPoses, num: int, most: float) -> Array:
     noise = jnp.asarray(rng.random(poses.effort.shape[0]), poses.effort.dtype)
     late = jnp.where(poses.effort > most, 10.0 * poses.effort, 0.0)
     return lax.top_k(-(poses.effort + noise + late), num)[1]
-
-
-def _lift_to_unknowns(
-    lift: Array, drift: Array, grams: Array, pushes: Array, joints: JointTerms
-) -> tuple[Array, Array]:
-    """Return J^T r and J^T J, where J is the Jacobian of all residuals r by all unknowns.
-
-    The unknowns are the rates of each of the six joints after K pieces of the motion, multiplied by
-    its duration, and the time of contact.
-
-    Args:
-        lift: (W, K), derivatives of a joint's angle at W samples by its K unknowns.
-        drift: (W, 6), derivatives of the angles at the samples by the time of contact.
-        grams: (W, 7, 7), J^T J of the residuals at each sample, by angles and time.
-        pushes: (W, 7), J^T r of these residuals.
-        joints: terms of the joints' limits and accelerations.
-    """
-    grams_q, grams_t = grams[:, :6, :6], grams[:, :6, 6]
-    moved = jnp.einsum("wij,wj->wi", grams_q, drift, precision=_HIGHEST) + grams_t
-    time_stiffness = jnp.sum(grams[:, 6, 6] + jnp.sum(drift * (moved + grams_t), axis=1))
-    time_push = jnp.sum(pushes[:, 6] + jnp.sum(drift * pushes[:, :6], axis=1))
-    stiffness = jnp.einsum("wk,wl,wij->kilj", lift, lift, grams_q, precision=_HIGHEST)
-    coupling = jnp.einsum("wk,wi->ki", lift, moved, precision=_HIGHEST)
-    steps_push = jnp.einsum("wk,wi->ki", lift, pushes[:, :6], precision=_HIGHEST)
-    each = jnp.eye(6, dtype=lift.dtype)
-    of_each = joints.curvature[:, :-1, :-1]
-    stiffness += jnp.einsum("ikl,ij->kilj", of_each, each, precision=_HIGHEST)
-    coupling += joints.curvature[:, :-1, -1].T
-    steps_push += joints.gradient[:, :-1].T
-    time_push += jnp.sum(joints.gradient[:, -1])
-    time_stiffness += jnp.sum(joints.curvature[:, -1, -1])
-    size = 6 * lift.shape[1]
-    curvature = jnp.zeros((size + 1, size + 1), lift.dtype)
-    curvature = curvature.at[:size, :size].set(stiffness.reshape(size, size))
-    curvature = curvature.at[:size, size].set(coupling.reshape(-1))
-    curvature = curvature.at[size, :size].set(coupling.reshape(-1))
-    curvature = curvature.at[size, size].set(time_stiffness)
-    return jnp.append(steps_push.reshape(-1), time_push), curvature
 
 
 @jax.tree_util.register_static
@@ -410,7 +372,7 @@ class OnlineBlock(Planner):
         chosen = jnp.append(worst, self.samples - 1)
         lift = of_steps[chosen]  # (W + 1, K)
         drift = of_first[chosen][:, None] * case.rates[None]  # (W + 1, 6)
-        gradient, curvature = _lift_to_unknowns(lift, drift, grams, pushes, joints)
+        gradient, curvature = lift_to_unknowns(lift, drift, grams, pushes, joints)
         size = 6 * pieces
         ends_free = jnp.where(case.ends_at_rest, 0.0, 1.0)
         free = jnp.ones(size + 1, dtype).at[size - 6 : size].set(ends_free)

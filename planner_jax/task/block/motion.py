@@ -17,6 +17,8 @@ from jax import Array, lax
 from planner_jax.task.block.case import BlockCase
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
 
+_HIGHEST = lax.Precision.HIGHEST
+
 
 @dataclasses.dataclass(frozen=True)
 class Weights:
@@ -205,3 +207,41 @@ def profiles(pieces: int, ends_at_rest: bool) -> np.ndarray:
         rates = np.concatenate([[0.0], shape])
         shapes.append(shape * pieces / np.sum(0.5 * (rates[1:] + rates[:-1])))
     return np.array(shapes)
+
+
+def lift_to_unknowns(
+    lift: Array, drift: Array, grams: Array, pushes: Array, joints: JointTerms
+) -> tuple[Array, Array]:
+    """Return J^T r and J^T J, where J is the Jacobian of all residuals r by all unknowns.
+
+    The unknowns are the rates of each of the six joints after K pieces of the motion, multiplied by
+    its duration, and the time of contact.
+
+    Args:
+        lift: (W, K), derivatives of a joint's angle at W samples by its K unknowns.
+        drift: (W, 6), derivatives of the angles at the samples by the time of contact.
+        grams: (W, 7, 7), J^T J of the residuals at each sample, by angles and time.
+        pushes: (W, 7), J^T r of these residuals.
+        joints: terms of the joints' limits and accelerations.
+    """
+    grams_q, grams_t = grams[:, :6, :6], grams[:, :6, 6]
+    moved = jnp.einsum("wij,wj->wi", grams_q, drift, precision=_HIGHEST) + grams_t
+    time_stiffness = jnp.sum(grams[:, 6, 6] + jnp.sum(drift * (moved + grams_t), axis=1))
+    time_push = jnp.sum(pushes[:, 6] + jnp.sum(drift * pushes[:, :6], axis=1))
+    stiffness = jnp.einsum("wk,wl,wij->kilj", lift, lift, grams_q, precision=_HIGHEST)
+    coupling = jnp.einsum("wk,wi->ki", lift, moved, precision=_HIGHEST)
+    steps_push = jnp.einsum("wk,wi->ki", lift, pushes[:, :6], precision=_HIGHEST)
+    each = jnp.eye(6, dtype=lift.dtype)
+    of_each = joints.curvature[:, :-1, :-1]
+    stiffness += jnp.einsum("ikl,ij->kilj", of_each, each, precision=_HIGHEST)
+    coupling += joints.curvature[:, :-1, -1].T
+    steps_push += joints.gradient[:, :-1].T
+    time_push += jnp.sum(joints.gradient[:, -1])
+    time_stiffness += jnp.sum(joints.curvature[:, -1, -1])
+    size = 6 * lift.shape[1]
+    curvature = jnp.zeros((size + 1, size + 1), lift.dtype)
+    curvature = curvature.at[:size, :size].set(stiffness.reshape(size, size))
+    curvature = curvature.at[:size, size].set(coupling.reshape(-1))
+    curvature = curvature.at[size, :size].set(coupling.reshape(-1))
+    curvature = curvature.at[size, size].set(time_stiffness)
+    return jnp.append(steps_push.reshape(-1), time_push), curvature
