@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from planner_jax.core.compiled import Fixed, place_numbers, with_run_time_numbers
+from planner_jax.core.compiled import place_numbers, with_run_time_numbers
 from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import (
     FEASIBILITY_TOLERANCE,
@@ -92,6 +92,12 @@ class Search(Attempt):
     )
 
 
+@with_run_time_numbers("straight")
+@dataclasses.dataclass(frozen=True)
+class StraightSearch(Search):
+    """A search of straight motions alone, without least squares (`tries` is 0)."""
+
+
 _LEAST_SQUARES = (
     Search(straight=0, tries=4, kept=2),
     Search(straight=0, tries=11, first=4, kept=5, in_turn=False),
@@ -161,14 +167,14 @@ class OnlineBlock(Planner):
         """The searches for a plan, in the order in which they are tried."""
         return self.searches
 
-    def load_attempt(self, attempt: Search, cases: BlockCase) -> Search | Fixed:
+    def load_attempt(self, attempt: Search, cases: BlockCase) -> Search:
         """Return a search as arguments of one compiled program, which all searches share.
 
-        For a single case, searches of straight motions alone have small programs of their own, so
-        that the first plan comes soon.
+        For a single case, searches of straight motions alone share a smaller program, so that the
+        first plan comes soon.
         """
         is_small = cases.batch_shape == () and not attempt.tries
-        return Fixed(attempt) if is_small else place_numbers(attempt)
+        return place_numbers(StraightSearch(**vars(attempt)) if is_small else attempt)
 
     def solve(self, case: BlockCase, attempt: Search) -> BlockPlan:
         """Return the plan of one case: a straight motion, else least squares from the starts.
@@ -179,7 +185,7 @@ class OnlineBlock(Planner):
         """
         flight, poses, order = self._rank(case)
         straight = self._count_straight(flight, poses, attempt)
-        if isinstance(attempt.tries, int) and attempt.tries == 0:
+        if isinstance(attempt, StraightSearch):
             plan = self._plan_straight(case, flight, poses, order, straight)
             return dataclasses.replace(plan, status=explain_status(poses, plan.status))
         model = lambda point: self.model(point, case, flight)  # noqa: E731
