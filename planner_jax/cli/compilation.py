@@ -43,11 +43,12 @@ def record_programs() -> Iterator[dict[str, Program]]:
 
     programs: dict[str, Program] = collections.defaultdict(Program)
 
-    def listen(event: str, seconds: float, fun_name: str = "", **_: object) -> None:
+    def listen(event: str, duration_secs: float, **kwargs: str | int) -> None:
         event = event.removeprefix("/jax/core/compile/").removesuffix("_duration")
         if field := _EVENTS.get(event):
-            program = programs[fun_name.removeprefix("jit(").removesuffix(")")]
-            setattr(program, field, getattr(program, field) + seconds)
+            name = str(kwargs.get("fun_name", ""))
+            program = programs[name.removeprefix("jit(").removesuffix(")")]
+            setattr(program, field, getattr(program, field) + duration_secs)
             program.versions += field == "compiling"
 
     with tempfile.TemporaryDirectory() as folder:

@@ -10,6 +10,7 @@ import numpy as np
 from flax import struct
 from jax import Array, lax
 
+from planner_jax.core.arithmetic import host_leaf
 from planner_jax.plane.reach import SPAN, Grid, Lattice, ReachSet, bit_at
 
 # Costs of one step of a path. The step with the least cost minus Gumbel noise is drawn.
@@ -48,7 +49,7 @@ def draw_noise(lattice: Lattice, num: int, seed: int, candidates: int) -> PathNo
     ends = rng.gumbel(size=(num, candidates, lattice.levels, lattice.headings, 9))
     steps = rng.gumbel(size=(num, candidates, lattice.layers, 3 * (2 * SPAN + 1)))
     layers = rng.gumbel(size=(num, lattice.layers + 1))
-    return PathNoise(*(each.astype(np.float32) for each in (layers, ends, steps)))
+    return PathNoise(*(host_leaf(each, np.float32) for each in (layers, ends, steps)))
 
 
 def _velocity(level: Array, heading: Array, grid: Grid) -> Array:

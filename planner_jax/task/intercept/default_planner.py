@@ -124,16 +124,16 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
 
         With `tries_all`, or if the meeting time is free, all paths are tried for the best plan.
         """
-        problem, attempt = self.problem, self._load(attempt)
-        found = search_reach(case, attempt, is_time_free=problem.is_time_free)
-        stages = problem.list_stages(attempt)
-        num = jnp.where(found.is_reached, attempt.paths, 0)
+        problem, search = self.problem, self._load(attempt)
+        found = search_reach(case, search, is_time_free=problem.is_time_free)
+        stages = problem.list_stages(search)
+        num = jnp.where(found.is_reached, search.paths, 0)
 
         def try_path(state: tuple) -> tuple:
             k, best = state
-            noise = jax.tree.map(lambda leaf: leaf[k], attempt.noise)
-            guess = self._guess(case, found, noise, attempt)
-            return k + 1, select(problem.refine(case, found.field, guess, attempt, stages), best)
+            noise = jax.tree.map(lambda leaf: leaf[k], search.noise)
+            guess = self._guess(case, found, noise, search)
+            return k + 1, select(problem.refine(case, found.field, guess, search, stages), best)
 
         def is_open(state: tuple) -> Array:
             k, best = state
@@ -141,17 +141,17 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
             return (k < num) & (tries_all | ~is_solved(best.status))
 
         _, best = lax.while_loop(is_open, try_path, (0, make_straight_plan(case, self.pieces)))
-        return self._explain(case, attempt, found, best)
+        return self._explain(case, search, found, best)
 
     def solve_at_once(self, cases: InterceptCase, attempt: Search) -> InterceptPlan:
         """Return the plans of a batch: try all paths together, select the best of each case."""
-        attempt = self._load(attempt)
+        search = self._load(attempt)
         # `layers` is the number of times of the reach set. It is equal for all cases of the batch.
-        layers = jnp.max(jax.vmap(lambda case: make_grid(case, attempt.lattice).num)(cases))
-        return jax.vmap(lambda case: self._solve_all_paths(case, attempt, layers))(cases)
+        layers = jnp.max(jax.vmap(lambda case: make_grid(case, search.lattice).num)(cases))
+        return jax.vmap(lambda case: self._solve_all_paths(case, search, layers))(cases)
 
     def _solve_all_paths(
-        self, case: InterceptCase, attempt: Search, layers: Array
+        self, case: InterceptCase, attempt: LoadedSearch, layers: Array
     ) -> InterceptPlan:
         """Try all paths of one case; refine only the best plan, or all plans with `tries_all`."""
         problem = self.problem
