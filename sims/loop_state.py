@@ -44,7 +44,15 @@ class Pilot(Protocol):
         ...
 
     def choose(self, asked: Any, outlook: Outlook, found: tuple[Any, ...]) -> tuple[Any, Array]:
-        """Select one of the plans `found`; return it, and whether it replaces the current plan."""
+        """Select one of the new plans; return the plan, and whether it replaces the current plan.
+
+        Each task has its own rule, which compares violations of limits and, for catches, costs.
+
+        Args:
+            asked: the planning problem that `pose_problem` returned.
+            outlook: the predicted situation at the time when the new plan would take effect.
+            found: the plans for this problem, one for each function in `searches`.
+        """
         ...
 
     def times(self, plan: Any) -> Array:

@@ -146,10 +146,12 @@ class Planner(Generic[CaseT, PlanT]):
         return self
 
     def begin(self, *args: PyTree, **news: PyTree) -> Case:
-        """Return the cases that a re-planner solves while their plans are executed.
+        """Return the cases of a re-planner: what remains of cases whose plans are being executed.
 
-        A re-planner takes the arguments of `pj.replan`: the cases, the previous plans, the time
-        since the plans started, and changed quantities by name.
+        The returned cases start at the robot's present state, contain the changed quantities and
+        the previous plans, and leave out what is already done, such as targets caught. A re-planner
+        takes the arguments of `pj.replan`: the original cases, the previous plans, the time since
+        the plans started, and changed quantities by name.
 
         Raises:
             TypeError: the planner is not a re-planner.

@@ -121,10 +121,21 @@ def columns_columns(along: Along, at_samples: tuple[Array, ...], given: int = 0)
 def block_and_diagonal(
     along: Along, at_samples: tuple[Array, ...], num: int, given: int = 0
 ) -> tuple[Array, Array]:
-    """Return second derivatives of a segment's penalty by its C variable columns, but not all.
+    """Return a part of the second derivatives of a segment's penalty by its C variable columns.
 
-    They are the block (E, 3, E, 3) for the first E = `num` columns, and the diagonal (C - E, 3) for
-    the other columns.
+    Columns are vectors (3,) that, with the durations, determine the motion: boundary rows (scaled
+    end states) and whitened waypoint offsets. All derivatives that are in neither result below are
+    left out.
+
+    Args:
+        along: functions of the excess over limits, and the quadrature.
+        at_samples: second derivatives at the samples, the field of `AlongCurvature`.
+        num: E, the number of columns in the block.
+        given: number of fixed columns, which precede the variable columns.
+
+    Returns:
+        block: (E, 3, E, 3), all second derivatives by the first E variable columns.
+        diagonal: (C - E, 3), second derivatives by each component of the other columns, twice.
     """
     among = [(c, f) for c in range(num) for f in range(num)]
     alone = [(c, c) for c in range(num, _constants(along, given).num_moving)]

@@ -113,7 +113,12 @@ def between_boxes(
 
 
 def _edges_to_box(middle, rotation, half, other) -> np.ndarray:
-    """Return the least distances (P,) [m] of the first boxes' edges from the second boxes."""
+    """Return the least distances (P,) [m] of the first boxes' 12 edges from the second boxes.
+
+    As in `between_boxes`, each second box is centred at the origin of its own frame. In this frame
+    the first box has its centre `middle` (3, P) [m]; `rotation` (3, 3, P) maps the first box's
+    frame to it. Half edges (3, P) [m] are `half` for first boxes and `other` for second boxes.
+    """
     edges = rotation * half  # (3, 3, P), three vectors along the edges, half as long as an edge
     starts = [
         middle + first * edges[:, (k + 1) % 3] + second * edges[:, (k + 2) % 3] - edges[:, k]

@@ -148,9 +148,12 @@ def fly_catches(
 ) -> CatchFlights:
     """Plan and simulate a batch of flights with thrown balls.
 
-    Whenever a ball comes into sight, its catch and the catch of the next, still unseen ball are
-    planned without an earlier plan as first guess (`plan_ahead`). This plan starts where the last
-    catch of an earlier ball will be made. From then on the loop replans all remaining catches.
+    In each flight a quadrotor with a net catches balls that are thrown at fixed intervals. When a
+    ball comes into sight, its catch is planned without an earlier plan as first guess, together
+    with the catch of the next ball (`plan_ahead`). The next ball is not thrown yet, so its flight
+    is guessed: the shortest throw of the suite (`earliest_throw`). The plan starts at the last
+    planned catch of an earlier ball, or at once if no such catch remains. Until the next ball comes
+    into sight, the loop replans all remaining catches.
 
     Args:
         loop: settings of the closed loop: world, sensing and rates.

@@ -32,7 +32,12 @@ _NET_TESTS = {
 
 
 class CatchTally(Tally):
-    """Counts of successes, and means of the share caught, catch times and optimal time ratio."""
+    """Counts of successes, and means of three further quantities of catches.
+
+    They are the number of caught targets divided by the number of targets in a case; the times of
+    catches [s]; and the optimal time ratio |T_o - T_p| / T_o of the solved cases, with first
+    decided catch times T_p and optimised catch times T_o [Yu2023catch, eq. 29].
+    """
 
     READS = (*COUNTED, "caught", "present", "catch_times", "time_ratio")
 

@@ -68,7 +68,8 @@ from planner_jax.task.block.motion import (
 from planner_jax.task.block.plan import BlockPlan, explain_status, make_empty_plan
 
 _HIGHEST = lax.Precision.HIGHEST
-# Number of starting points in a group, and number of them that a GPU refines at the same time.
+# Number of starting points in a group, and number of starting points of a group that are refined at
+# the same time on a GPU.
 _GROUP, _WIDTH = 4, 2
 
 

@@ -134,7 +134,12 @@ def joint_terms(
 
 
 def bump_steps(height: Array, pieces: int) -> Array:
-    """Return the steps of a detour: angles rise by `height` (6,) [rad] and fall, as sin^2."""
+    """Return offsets (K, 6) [rad] of a motion's parameters that add a detour to its joint angles.
+
+    The detour height sin^2(pi s), with time s as a fraction of the duration, reaches `height` (6,)
+    [rad] at half of the duration and ends at zero. The offsets are its rates at the ends of the
+    K = `pieces` pieces, multiplied by the duration: pi height sin(2 pi s).
+    """
     knots = np.arange(1, pieces + 1) / pieces
     return jnp.asarray(np.pi * np.sin(2.0 * np.pi * knots), height.dtype)[:, None] * height[None]
 
