@@ -1,4 +1,4 @@
-"""Measure the time that a new process takes to its first plans, most of which is compilation.
+"""Measure how long a new process takes to its first plans; most of this time is compilation.
 
     python -m benchmarks.first_plan [--rows hit,block-64] [--out DIR]
 

@@ -163,7 +163,7 @@ def _add_row(
     plans = jax.device_get(timed.plans)
     success = card.judge(*jax.tree.map(lambda leaf: leaf[:_JUDGED], (host, plans))).success
     speed = plans.status.size / timed.fastest
-    _tell(f"{speed:,.0f} plans/s, of which the referee accepts {100.0 * success.mean():.3f} %.")
+    _tell(f"{speed:,.0f} plans/s; the referee accepts {100.0 * success.mean():.3f} % of the plans.")
     _tell("Comparing costs with a longer search, if the task has one; it compiles first.")
     gaps = cost_gaps(planner, host, plans, devices, card=card)
     bench.count(success, gaps)

@@ -1,4 +1,4 @@
-"""What planners say of their compiled programs: run-time numbers of settings, and the platform.
+"""Run-time numbers of compiled programs, and the platform for which a program is traced.
 
 An attempt of a planner, such as a number of iterations from a starting point, is mostly numbers. If
 these are arguments of a compiled program, all attempts of a planner share one program.

@@ -33,7 +33,7 @@ Kernel = Callable[[Sequence[Array]], Sequence[Array] | None]
 
 
 class Kernels(enum.Enum):
-    """Whether programs for CUDA use the library's kernels; the values are texts for users."""
+    """The use of the library's own CUDA kernels in programs; the values are texts for users."""
 
     ON = "on"
     OFF = f"off, by {SWITCH}"

@@ -217,7 +217,7 @@ def _gap_to_rectangle(nearest: Any, ends: Array, middle: Array, edges: Array) ->
 
 
 class _Slab(NamedTuple):
-    """Where a segment's line enters and leaves a slab, the space between two parallel planes."""
+    """The part of a segment's line inside a slab, the space between two parallel planes."""
 
     enters: Array  # () fraction of the segment at which its line enters the slab
     leaves: Array  # () fraction at which the line leaves the slab, at least `enters`

@@ -65,7 +65,7 @@ Workers = Callable[["Maker", Iterable[int]], Generator[Callable[[], Made], None,
 
 @dataclass(frozen=True)
 class Maker:
-    """What makes the rows of a sweep: the source of its cases, its planner and its referee."""
+    """The maker of a sweep's rows: a source of cases, a planner and a referee."""
 
     sweep: Sweep
     source: Source  # draws or reads the cases

@@ -118,7 +118,8 @@ def rows_of_pieces(of_piece: np.ndarray, pieces: int) -> np.ndarray:
 def bounds_of_pieces(lower: Array, upper: Array) -> tuple[Array, Array]:
     """Convert bounds (K, W) on W values of each of K pieces into bounds on the curve's values.
 
-    The values are those of `rows_of_pieces`. Where two pieces meet, the stricter bound applies.
+    The rows of `rows_of_pieces` compute these values. Where two pieces meet, the stricter bound
+    applies.
     """
 
     def flat(bounds: Array, at_joints: Array) -> Array:

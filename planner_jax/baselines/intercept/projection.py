@@ -205,7 +205,7 @@ def _cover_run(
     def edge(side: float) -> Array:
         """Return the lowest straight line above all rectangles (side 1).
 
-        Side -1 gives the highest line below all rectangles. The slopes are those of `_SLOPES`.
+        Side -1 gives the highest line below all rectangles. The lines have the slopes `_SLOPES`.
         """
         height = side * station + half_step
         highest = jnp.max(jnp.where(is_in, height, -jnp.inf), axis=1)

@@ -23,7 +23,7 @@ from planner_jax.ball.flight import BallState, drag_free_flight
 
 
 class Sight(enum.IntEnum):
-    """Whether a ball was observed often enough to fit its flight."""
+    """The outcome of observing a ball: enough observations for a fit of its flight, or too few."""
 
     SEEN = 0
     NEVER_SEEN = 1

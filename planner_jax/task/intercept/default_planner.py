@@ -124,7 +124,7 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
 
         With `tries_all`, or if the meeting time is free, all paths are tried for the best plan.
         """
-        problem, search = self.problem, self._load(attempt)
+        problem, search = self.problem, self.load_attempt(attempt, case)
         found = search_reach(case, search, is_time_free=problem.is_time_free)
         stages = problem.list_stages(search)
         num = jnp.where(found.is_reached, search.paths, 0)
@@ -145,7 +145,7 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
 
     def solve_at_once(self, cases: InterceptCase, attempt: Search) -> InterceptPlan:
         """Return the plans of a batch: try all paths together, select the best of each case."""
-        search = self._load(attempt)
+        search = self.load_attempt(attempt, cases)
         # `layers` is the number of times of the reach set. It is equal for all cases of the batch.
         layers = jnp.max(jax.vmap(lambda case: make_grid(case, search.lattice).num)(cases))
         return jax.vmap(lambda case: self._solve_all_paths(case, search, layers))(cases)
@@ -173,9 +173,6 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
 
     def load_attempt(self, attempt: Search, cases: InterceptCase) -> LoadedSearch:
         """Return a search as arguments of one compiled program, which all searches share."""
-        return self._load(attempt)
-
-    def _load(self, attempt: Search) -> LoadedSearch:
         if isinstance(attempt, LoadedSearch):
             return attempt
         attempts = self.attempts if attempt in self.attempts else (attempt,)

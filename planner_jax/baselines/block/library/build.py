@@ -56,7 +56,7 @@ _CHECKED_AT_ONCE = 1024  # number of stored motions whose distances are computed
 
 @dataclasses.dataclass(frozen=True)
 class Portions:
-    """How many pairs of cells are planned at a time on a CPU or on a GPU."""
+    """Batch sizes for planning pairs of cells (one of the outer, one of the inner box)."""
 
     pairs: int  # number of pairs that are planned and written to disk as one part
     lanes: tuple[int, int]  # small and large batch size of one planner call, for each device

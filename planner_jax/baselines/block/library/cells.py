@@ -209,7 +209,7 @@ def _corners(faces: tuple[Face, ...], box: Box) -> tuple[np.ndarray, np.ndarray]
 
 
 def nominal_ball(outer: Array, inner: Array) -> tuple[BallState, Array]:
-    """Return a ball that flies from the centre of an outer box's cell to that of an inner box's.
+    """Return a ball that flies from the centre of an outer cell to the centre of an inner cell.
 
     Args:
         outer: (2, 3) [m], corners of the outer cell, lowest and highest.
