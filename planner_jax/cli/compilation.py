@@ -63,7 +63,7 @@ def record_programs() -> Iterator[dict[str, Program]]:
         for path in Path(folder).iterdir():
             name = re.sub(r"^jax_\d+_|\.jaxpr\.txt$", "", path.name)
             programs[name].equations += len(re.findall(r"^\s*\S.* = ", path.read_text(), re.M))
-    # Functions within a program are traced as well, but are not compiled by themselves.
+    # Functions within a program are traced as well, but not compiled alone; they have no row.
     for name in [name for name, program in programs.items() if not program.versions]:
         del programs[name]
 

@@ -214,7 +214,7 @@ def _quote_command() -> str:
 
 
 def _how_to_continue(out: Path, again: str, sign: str = "manifest.json") -> str:
-    """Return the advice `again` if the run has written its file `sign`; else nothing can resume."""
+    """Return the advice `again` if folder `out` has the file `sign`, else `stopping.NOTHING`."""
     return again if (out / sign).exists() else stopping.NOTHING
 
 

@@ -44,7 +44,10 @@ class Client:
         *,
         measured: float | None = None,
     ) -> Answer | None:
-        """Send the robot's position, velocity and acceleration in SI units; otherwise as `ball`."""
+        """Send the robot's state in SI units; return the answer, or None after the timeout.
+
+        `measured` is the time of the observation, as in the method `ball`.
+        """
         return self._send(ROBOT, measured, (*pos, *vel, *acc), 0)
 
     def _send(

@@ -37,7 +37,7 @@ def without_recovery(path: PiecewisePolynomial, gravity: Array) -> Course:
 def with_recovery(
     path: PiecewisePolynomial, gravity: Array, limits: QuadrotorLimits
 ) -> tuple[Course, bool]:
-    """Append a recovery trajectory to standstill; return both, and whether it keeps limits."""
+    """Append a recovery trajectory; return the course, and whether it keeps the limits."""
     state: Any = state_on(path, np.sum(path.durations))
     case = RecoveryCase(state, state[0], gravity, limits)
     rest: RecoveryPlan = solve_one(_REST, case, _REST.rounds[0])

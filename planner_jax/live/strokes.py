@@ -82,7 +82,7 @@ class Stroke(abc.ABC, Generic[CaseT, PlanT]):
         return call_packed(self._solve_first, self._planner.rounds[1], self._planner, case)
 
     def again(self, plan: PlanT, elapsed: float, ball: BallState) -> PlanT:
-        """Plan for a newer estimate of the ball, from the state in `plan` after `elapsed` [s]."""
+        """Improve `plan` for a newer estimate of the ball, from its state after `elapsed` [s]."""
         since: Any = np.float32(elapsed)
         task = Replanning(self._with_ball(ball), plan, since)
         return call_packed(self._solve_again, _AGAIN, self._replanner, task)
@@ -144,7 +144,7 @@ class HitStroke(Stroke[HitCase, HitPlan]):
 
 
 def _time_left(case: CatchCase) -> Array:
-    """Return the time (1,) [s] until a falling ball is too low for the net, 0 if it is already."""
+    """Return the time (1,) [s] until a falling ball is too low for the net; 0 if it is too low."""
     height = case.limits.min_height + case.net.height
     path = jax.tree.map(lambda leaf: leaf[0], case.targets)
     # The bisection starts at the ball's highest point, since a rising ball may be low at time 0.

@@ -263,7 +263,7 @@ def _distance(one: _Capsule | _Box, other: _Capsule | _Box) -> np.ndarray:
 
 
 def _least(pairs: list[_Pair], sampled: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Find each plan's least distance over `pairs` of solids, and over samples to evaluate.
+    """Find each motion's least distance over `pairs` of solids, and over samples to evaluate.
 
     `sampled` (B, S) is true for these samples. Returns arrays (B,): the distance [m], the index of
     its sample, and the name of its pair.
@@ -296,7 +296,7 @@ def _least(pairs: list[_Pair], sampled: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def _pick_samples(values: np.ndarray, lane: np.ndarray, sample: np.ndarray) -> np.ndarray:
-    """Return values[..., lane, sample]; values that do not change have a last axis of length 1."""
+    """Return `values` at sample `sample[k]` of motion `lane[k]`; constants have one sample."""
     return values[..., lane, sample if values.shape[-1] > 1 else 0]
 
 

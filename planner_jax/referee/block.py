@@ -210,7 +210,6 @@ def _judge(case: dict, links: tuple, relative: float, contact: float) -> dict:
 
 
 def _times(case: dict, stays: np.ndarray) -> tuple:
-    """Test contact time, durations, and the time `stays` (B,) [s] from motion's end to contact."""
     contact = case["plan.contact_time"]
     shortest = case["plan.motion.durations"].min(axis=1)
     off = np.maximum.reduce([case["delay"] - contact, -stays, contact - LONGEST_PLAN, -shortest])
@@ -228,7 +227,7 @@ class _Motion:
 
 
 def _extremes(motion: _Motion) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return joint angles, rates, accelerations at extrema and ends of pieces, each with times."""
+    """Return joint angles, rates and accelerations, each with times, at extrema and piece ends."""
     degree, shape = len(motion.coeffs) - 1, motion.coeffs.shape[1:]
     ends = np.stack([np.zeros(shape), np.broadcast_to(motion.durations, shape)])
     times, found = ends, []
@@ -249,7 +248,7 @@ def _extremes(motion: _Motion) -> list[tuple[np.ndarray, np.ndarray]]:
 
 
 def _worst(excess: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return each plan's greatest excess over all joints, pieces and times; its time and joint."""
+    """Return each plan's greatest excess over all joints, pieces and times, its time and joint."""
     by_lane = flat(np.moveaxis(excess, 2, 0))
     lanes, top = np.arange(len(by_lane)), by_lane.argmax(axis=1)
     k, joint, piece = np.unravel_index(top, (*excess.shape[:2], excess.shape[3]))
@@ -307,7 +306,7 @@ def _final(motion: _Motion, stays: np.ndarray) -> np.ndarray:
 
 
 def _clearances(case: dict, links: tuple, motion: _Motion, turning: np.ndarray) -> dict[str, tuple]:
-    """Return for each kind of obstacle each plan's least distance, its time and the arm's part.
+    """Return by kind of obstacle each plan's least distance [m], its time [s], and the arm's part.
 
     `turning` (B, M) [rad/s] bounds the norm of the joint rates in each piece.
     """
@@ -352,7 +351,6 @@ def _sample(
 
 
 def _judge_contact(case: dict, angles: np.ndarray, relative: float, contact: float) -> tuple:
-    """Test the contact at joint angles (6, B): ball on shield, not in inner box; tilt in limit."""
     time, fall = case["plan.contact_time"], np.array([[0.0], [0.0], [1.0]]) * case["gravity"]
     ball = case["ball.pos"].T + case["ball.vel"].T * time - 0.5 * fall * time**2
     turns, positions = links_of(case, angles[..., None])

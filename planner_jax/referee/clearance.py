@@ -91,7 +91,7 @@ def _edges(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _separation(corners, normals, pose, half) -> np.ndarray:
-    """Return distances [m] of rectangles from polygons; minus the depth where they overlap.
+    """Return distances [m] of rectangles from polygons, or minus the depth of their overlap.
 
     The gap along the normal of each edge is computed. If the greatest gap is negative, it is minus
     the depth of the overlap. Otherwise the distance is between a corner of one shape and an edge of

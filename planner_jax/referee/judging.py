@@ -29,7 +29,7 @@ class Verdict:
     # `{time}`, `{excess}` and any field of the verdict. The limits are tested in this order, and
     # `failed_limit` is the first limit whose test fails.
     SENTENCES: ClassVar[dict[str, str]]
-    # For some limits by name, the sentence that replaces the sentence above for an infinite excess.
+    # For some limits by name, the sentence that is used instead if the excess is infinite.
     UNBOUNDED: ClassVar[dict[str, str]] = {}
 
     success: np.ndarray  # (B,) bool, whether the plan keeps every limit
@@ -82,7 +82,8 @@ CONTACT_TIME_TOLERANCE = 1e-4
 # is divided by this number.
 SMALLEST_LIMIT = 1e-3
 _FEWEST_LANES = 256  # least number of plans that one thread judges
-# With at least so many plans and so many cores, processes judge a batch instead of threads.
+# Processes instead of threads judge a batch with at least this number of plans, on this number of
+# cores.
 _MANY_LANES, _MANY_CORES = 16384, 4
 
 

@@ -214,7 +214,7 @@ def _tops(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def peaks(pieces: Pieces, gravity: np.ndarray, intervals: int) -> dict[str, tuple]:
-    """Find the maxima of speed, acceleration, thrust and others along trajectories, by name.
+    """Find the maxima of speed, acceleration, thrust and other quantities, by name.
 
     Each result has two arrays: the maximum of each plan, and its time. Every piece is sampled at
     both ends and inside. The search then starts at the highest vertex of a parabola through three

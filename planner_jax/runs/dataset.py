@@ -30,7 +30,7 @@ class DamagedPart(ValueError):
 
 
 def encode(rows: pa.Table, record: Mapping[str, object]) -> bytes:
-    """Return the bytes of a Parquet file of `rows`, with `record` on their making as metadata."""
+    """Return the bytes of a Parquet file of `rows`, with the JSON object `record` as metadata."""
     metadata = {**(rows.schema.metadata or {}), _RECORD: json.dumps(record).encode()}
     text = [field.name for field in rows.schema if pa.types.is_string(field.type)]
     others = [field.name for field in rows.schema if not pa.types.is_list(field.type)]
@@ -94,7 +94,7 @@ class Dataset:
         self.write(0, encode(rows, {}))
 
     def damages(self, num: int | None = None) -> dict[Path, str]:
-        """Return why files are damaged, by path, or that there are not `num` rows in total."""
+        """Return by path why files are damaged, or why the folder has not `num` rows in total."""
         found, counted = {}, 0
         for place, path in enumerate(self.files()):
             try:

@@ -31,7 +31,7 @@ _TRIES, _BETWEEN = 20, 0.01  # number of attempts to take the lock, and [s] paus
 
 
 class RunFolder:
-    """The folder `path` of one run. Error messages call the argument with this path `name`."""
+    """The folder `path` of one run; in error messages, `name` stands for the argument `path`."""
 
     def __init__(self, path: str | os.PathLike, name: str = "out"):
         self.name = name

@@ -26,7 +26,7 @@ def percent(successes: int, num: int) -> str:
     return f"{rate:.2f}"
 
 
-# Columns of the rows from which every sweep is counted.
+# Columns of a sweep's rows from which its successes and failures are counted.
 COUNTED = ("index", "success", "status", "failed_limit")
 
 

@@ -85,7 +85,7 @@ class Maker:
         return cls(sweep, source, sweep.planner(source.settings), makers, description, run)
 
     def plan(self, chunk: Chunk, clock: CompileClock) -> tuple[PyTree, Record]:
-        """Plan a chunk of cases; return the plans, and a record with times and numbers of them."""
+        """Plan a chunk (block) of cases; return the plans, and a record with counts and times."""
         plans, seconds, warm = measure(lambda: self.sweep.plan(self.planner, chunk.cases))
         return plans, {
             "run": self.run,

@@ -89,7 +89,7 @@ def sample_motion(
 
 
 def sample_rest(row: Row, num: int) -> SampledMotion | None:
-    """Sample the recovery trajectory to standstill in a stored row; None if it has none."""
+    """Sample the recovery trajectory to standstill in a stored row; None if the row has none."""
     if row["recovery_durations"] is None:
         return None
     rest = sample_motion(row["recovery_coeffs"], row["recovery_durations"], num)

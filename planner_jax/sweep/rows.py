@@ -65,7 +65,7 @@ def quadrotor_plan(row: Row, setting: Entries) -> QuadrotorPlan:
 
 
 def arm_plan(row: Row, _: Entries) -> ArmPlan:
-    """Restore an arm's plan from a run's row; its motion starts at the time `delay` in the row."""
+    """Restore an arm's plan from a run's row; the motion starts at the `delay` [s] of its case."""
     return ArmPlan(
         **_outcome(row), motion=_polynomial(row["motion_coeffs"], row["motion_durations"], 6)
     )

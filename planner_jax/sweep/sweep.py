@@ -111,7 +111,7 @@ class Sweep(Generic[AnySettings]):
         return {}
 
     def tally(self, settings: AnySettings) -> Tally:
-        """Return an object that counts rows for the summary, all counts at zero."""
+        """Return a new counter of rows, from which the summary of a run is made."""
         return self.counts()
 
     def title(self, manifest: Entries) -> str:

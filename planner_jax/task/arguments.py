@@ -32,7 +32,7 @@ _DRAWN_BYTES = 1_000  # [B], estimated memory of one case of a suite
 def array_of(
     name: str, value: object, batch: tuple[int, ...], shape: tuple[int, ...], dtype: DTypeLike
 ) -> Array:
-    """Return the argument `value` as an array of shape `batch + shape`; errors: `numbers_of`."""
+    """Return the argument `value` as an array of shape `batch + shape`; raise as `numbers_of`."""
     with np.errstate(over="ignore"):  # a number too large for `dtype` becomes infinite, no warning
         return jnp.asarray(numbers_of(name, value, batch, shape), dtype)
 

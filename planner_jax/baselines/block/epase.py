@@ -55,7 +55,7 @@ class OpenStates:
         self._lengths, self._closed = {_cell_of(start.angles): 0.0}, set()
 
     def pop(self) -> State | None:
-        """Remove and return the next state whose grid cell was not returned before, or None."""
+        """Remove and return the next state in a grid cell not returned yet; None without one."""
         while self._states:
             state = heapq.heappop(self._states)[2]
             if (cell := _cell_of(state.angles)) not in self._closed:
@@ -64,7 +64,7 @@ class OpenStates:
         return None
 
     def steps_from(self, state: State) -> list[State]:
-        """Return the states one step away whose grid cell is unexpanded and has no shorter path."""
+        """Return a state's neighbours in grid cells without an expanded state or a shorter path."""
         neighbours = state.angles + STEPS
         lengths = state.length + np.linalg.norm(neighbours - state.angles, axis=1)
         return [
@@ -97,7 +97,7 @@ class EpaseBlock(PathThenTime):
     def path_to(
         self, case: BlockCase, free: FreeSpace, goal: Goal, left: Clock
     ) -> np.ndarray | None:
-        """Return a collision-free joint path (N, 6) [rad], or None; `left` gives the time left."""
+        """Return a collision-free joint path (N, 6) [rad], or None if none is found in time."""
         end = np.asarray(goal.angles, float)
         states = OpenStates(State(np.asarray(case.angles, float), 0.0), end, self.weight)
         while left() > 0.0 and (state := states.pop()) is not None:

@@ -1,7 +1,7 @@
 """Collision checks of joint angles in batches, called by the search planners on the host.
 
-A search checks few angles at a time. Batches are padded to one of a few fixed sizes, so that only
-one program for each size has to be compiled.
+A search checks few poses of the arm at a time. Batches are padded to one of a few fixed sizes, so
+that only one program for each size has to be compiled.
 """
 
 import functools

@@ -114,7 +114,7 @@ class InsatBlock(PoseByPose):
         return None
 
     def lift(self, case: BlockCase, free: FreeSpace, goal: Goal, state: State) -> bool:
-        """Compute the spline from the start to a state; return whether a valid spline exists."""
+        """Compute the cheapest spline from the start to a state; return False if none is valid."""
         found = self.best_spline(case, free, goal, state, rests=False)
         if found is None:
             return False
@@ -172,7 +172,7 @@ class InsatBlock(PoseByPose):
 
 @functools.cache
 def _compile(dtype: np.dtype, config: lbfgs.LbfgsConfig) -> None:
-    """Compile the spline programs before the search, so that compiling is no search time."""
+    """Compile the spline programs before the search, so that its time does not count."""
     joints = host_leaf(np.zeros(6, dtype))
     guesses = np.zeros((ANCESTORS, CONTROL_POINTS, 6), dtype)
     bounds = Bounds(joints, joints, joints + 1, joints + 1)
@@ -181,7 +181,7 @@ def _compile(dtype: np.dtype, config: lbfgs.LbfgsConfig) -> None:
 
 
 def _fit_points(path: np.ndarray, end: np.ndarray, rests: bool) -> np.ndarray:
-    """Fit control points (m, 6) to a path (N, 6) and its straight extension to `end` (6,)."""
+    """Fit control points (m, 6) [rad] to a path (N, 6), continued straight to `end` (6,)."""
     straight = path[-1] + _SHARES[1:, None] * (end - path[-1])
     curve = np.concatenate([path, straight])
     lengths = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1)))
@@ -196,7 +196,6 @@ def _fit_points(path: np.ndarray, end: np.ndarray, rests: bool) -> np.ndarray:
 
 @functools.cache
 def _fit_matrices(stop: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the spline basis (S, m) at S samples, and the pseudo-inverse of columns 2 to stop."""
     of_points = basis(DEGREE, CONTROL_POINTS, _SHARES)
     return of_points, np.linalg.pinv(of_points[:, 2:stop])
 

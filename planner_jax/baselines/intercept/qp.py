@@ -201,7 +201,7 @@ def solve_qp(
 def _search(
     normals: Numbers, is_free: Array, low: Array, high: Array, slack: Array, config: QpConfig
 ) -> _Search:
-    """Run the dual method, first without active bounds, until an optimum or no possible step."""
+    """Run the dual method from no active bounds to an optimum, or until no step is possible."""
     num, size = normals.shape
     slots = min(config.active, size)
     dtype = normals.dtype

@@ -277,7 +277,6 @@ def corridor(
     at_begin, at_end = blocked.start[None] <= start, blocked.end[None] >= start + length
 
     def line(edge: tuple[Array, Array], side: float) -> tuple[Array, Array]:
-        """Return bounds above (side 1) or below (side -1) polygon edges: start and rise [m]."""
         own = (edge[1] - edge[0]) / duration
         if lines == "edges":
             chosen = own

@@ -88,7 +88,7 @@ class StudyCounts:
                 values.append(rows[name].to_numpy())
 
     def summary(self) -> Entries:
-        """Return the fits' median error [m], the share up to 0.1 m, and planning times [s]."""
+        """Return the fits' median error [m], share of errors <= 0.1 m, and planning times [s]."""
         found = {}
         if self._errors:
             errors = np.concatenate(self._errors)

@@ -21,7 +21,7 @@ from planner_jax.sweep.sweep import Sweep
 
 
 class BlockTally(Tally):
-    """Counts of successes, and means of execution times, errors of fitted flights and others."""
+    """Counts of successes, mean execution time, errors of flight fits, and planning times."""
 
     MEANS = ("execution_time",)
     READS = (*COUNTED, *MEANS, *StudyCounts.READS)
@@ -47,7 +47,7 @@ class BlockSweep(Sweep[BlockSettings]):
     plan_of_row = staticmethod(arm_plan)
 
     def columns(self, batch: RefereedBatch) -> Sequence[Column]:
-        """Return the columns of the rows, with further columns for a simulated camera or clock."""
+        """Return the columns of the rows, more if a camera or planning time is simulated."""
         return [*COLUMNS, *columns_of(batch.plans)]
 
     def planner(self, settings: BlockSettings) -> Planner:

@@ -95,7 +95,7 @@ class CatchSweep(Sweep[CatchSettings]):
         return {**first_values(cases, ["gravity"]), **net, **first_values(cases.limits)}
 
     def tally(self, settings: CatchSettings) -> CatchTally:
-        """Return an object that counts rows for the summary, all counts at zero."""
+        """Return a new counter of rows, from which the summary of a run is made."""
         return CatchTally(decides=settings.planner != "mpp")
 
     def table(self, manifest: Entries) -> RateTable:

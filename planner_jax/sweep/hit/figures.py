@@ -135,7 +135,7 @@ _PANELS = ("speed", "acceleration", "body_rate", "thrust")
 
 
 def motion_figure(figure: Figure, run: RunRows) -> None:
-    """Draw several planners' plans for one serve over time: height, speed, thrust and others."""
+    """Draw planners' plans for one serve over time: heights, speeds, accelerations, thrusts."""
     quadrotor_figure(figure, run, _PANELS, _draw_heights, _word)
 
 

@@ -116,7 +116,7 @@ def read_learned_starts() -> tuple[np.ndarray, np.ndarray]:
 
 
 def _combine_excess(joints: Array, contact: Array, too_near: Array) -> Array:
-    """Return the largest relative excess; a missing distance `too_near` [m] counts 1 per cm."""
+    """Return the largest relative excess; 1 cm of missing distance `too_near` [m] counts as 1."""
     return jnp.maximum(jnp.maximum(joints, contact), 100.0 * too_near)
 
 
@@ -265,7 +265,7 @@ class OnlineBlock(Planner):
                 some = jax.tree.map(lambda leaf: leaf[lanes], searches)
                 later = refine(some, jnp.where(is_trial, solver.trial, solver.max_steps))
                 searches = jax.tree.map(lambda old, new: old.at[lanes].set(new), searches, later)
-                # Move the searches that the last turn refines to the front, where they are read.
+                # Copy the searches that the last turn refines to the first entries, read below.
                 moved = jax.tree.map(lambda old, new: old.at[:_WIDTH].set(new), searches, later)
                 return jax.tree.map(lambda a, b: jnp.where(is_trial, a, b), searches, moved)
 
@@ -398,8 +398,8 @@ class OnlineBlock(Planner):
         """
         moves, first, duration = self.decode(case, point)
         joints = joint_terms(case, moves, first, duration, self.weights, 1.0 - self.slack).excess
-        # The start and all samples but the first one after it are checked: with one more time, a
-        # GPU would be a third slower.
+        # The start and all samples except the first after it are checked. On a GPU, the check of
+        # one more sample would take a third longer.
         shares = (0.0, *(np.arange(min(2, self.checked), self.checked + 1) / self.checked))
         angles = angles_at(case.angles, first, moves, shares)
         gaps = least_clearances(case.arm, case.scene, angles)

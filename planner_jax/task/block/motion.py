@@ -95,7 +95,6 @@ def joint_terms(
     def row(
         value: Array, by_steps: Array, by_time: Array, slope: float | Array
     ) -> tuple[Array, Array]:
-        """Multiply derivatives by `slope`, and move the axis of the six joints to the front."""
         slopes = jnp.concatenate([by_steps, by_time.T[:, :, None]], axis=2)
         return value.T, slopes * jnp.broadcast_to(slope, value.shape).T[:, :, None]
 

@@ -45,7 +45,7 @@ def targets_at(targets: TargetPath, times: Array) -> BallState:
 
 
 def facing_cosine(axis: Array, vel: Array) -> tuple[Array, Array]:
-    """Return cosines (N,) of angles of net axis and -vel of N targets, and which targets move."""
+    """Return the cosine (N,) of the angle between net axis and -`vel`, and which targets move."""
     speed_squared = jnp.sum(vel**2, axis=1)
     moving = speed_squared > 1e-12
     speed = jnp.sqrt(jnp.where(moving, speed_squared, 1.0))

@@ -174,7 +174,7 @@ class ReplanCatch(OptimisedPlanner):
         return planner.encode(context, durations, tails, offsets)
 
     def guesses(self, context: ReplanContext, num: int) -> Array:
-        """Return `num` starting points: the previous plan, then those of planning from scratch."""
+        """Return `num` starting points: from the previous plan, then for planning from scratch."""
         first = context.start[None]
         if num == 1:
             return first

@@ -23,7 +23,7 @@ from planner_jax.task.intercept.case import InterceptCase
 from planner_jax.task.intercept.default_planner import SpacetimeIntercept
 from planner_jax.task.intercept.plan import InterceptPlan
 
-# Search for a leg from 12 random paths, instead of 32 for a single target: there are many legs.
+# Search for a leg (drive to one target): from 12 random paths instead of 32, as legs are many.
 _EARLY = dataclasses.replace(SpacetimeIntercept("early").attempts[0], paths=12)
 
 
@@ -37,7 +37,7 @@ class GroupIntercept(Planner):
 
     case_type: ClassVar[type] = InterceptGroup
     attempts: ClassVar[tuple[Attempt, ...]] = (Attempt(),)  # pyright: ignore[reportIncompatibleMethodOverride]
-    # Plans every leg, with one search only, because the further searches of this planner take long.
+    # Planner of every leg (drive to one target), with a single search to save time.
     planner: SpacetimeIntercept = SpacetimeIntercept("early", searches=(_EARLY,))
     patient: SpacetimeIntercept = SpacetimeIntercept("least")  # for legs that `planner` fails
 
@@ -88,7 +88,7 @@ class GroupIntercept(Planner):
 
 
 def _is_open(status: Array) -> Array:
-    """Return whether a drive with this status is unsolved and worth a second try, by `patient`."""
+    """Return which drives with these statuses are unsolved and planned again, by `patient`."""
     return is_unsolved(status) | (status == Status.NO_PATH)
 
 

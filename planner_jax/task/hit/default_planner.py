@@ -254,7 +254,7 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
         return natural.at[3:5].set(jnp.stack([jnp.sum(vel * each) for each in across]))
 
     def convert_point(self, point: Array, before: OptimisedPlanner) -> Array:
-        """Add zero velocity offsets to decision variables `point` of a search without these."""
+        """Add zero velocity offsets to `point` if the search `before` has no such variables."""
         if self.velocities == cast(ExactHit, before).velocities:
             return point
         places, own = point[: self._num_places], point[self._num_places :]

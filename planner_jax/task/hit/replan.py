@@ -105,7 +105,7 @@ class ReplanHit(OptimisedPlanner):
         return planner.join(jnp.zeros((1, planner.num_offsets // 3, 3), sizes.dtype), natural[None])
 
     def guesses(self, context: ReplanHitContext, num: int) -> Array:
-        """Return `num` starting points: the previous impact, then those for planning anew."""
+        """Return `num` starting points: the previous impact, then for planning from scratch."""
         first = context.start[None]
         if num == 1:
             return first

@@ -112,7 +112,7 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
         cases: InterceptCase,
         plan_of: Callable[[Planner, InterceptCase], InterceptPlan] | None = None,
     ) -> tuple[SmoothIntercept, StartedCase]:
-        """Plan the cases by `plan_of`, or else by the first search; then call `smooth_near`."""
+        """Plan cases by `plan_of`, or else by the first search; return `smooth_near` of these."""
         if plan_of is None:
             plans = self.solve(lax.stop_gradient(cases), self.attempts[0])
         else:

@@ -271,7 +271,8 @@ def clearance(case: InterceptCase, drive: Motion) -> Array:
 def is_blocked(case: InterceptCase) -> tuple[Array, Array]:
     """Return whether the car overlaps an obstacle at the start, and whether the target is blocked.
 
-    It is blocked if it is then off the map, or nearer to an obstacle than half the car's width.
+    The target is blocked if at the meeting time it is off the map, or nearer to an obstacle than
+    half the car's width.
     """
     goal = case.target.at(case.time).pos
     both = join_obstacles(case.walls, case.movers)

@@ -40,8 +40,8 @@ _HIGHEST = lax.Precision.HIGHEST
 # Weights of the squared changes of six joints by a warp. The wrist joints have low weights, since
 # they carry little mass; the last joint keeps its stored angles.
 _WEIGHTS = np.array([1.0, 1.0, 1.0, 0.3, 0.3, 0.0])
-# [rad^2], penalty weight of a ball's squared distance, in cell sizes, from the centres of the cells
-# for which a motion was stored.
+# [rad^2], penalty weight of the squared distance between the ball and the cells (rectangles on two
+# boxes around the arm) for which a motion was stored, in cell sizes.
 _AWAY = 0.02
 _LATE = 10.0  # [rad^2], penalty of a relative excess of 1 over a joint limit
 _NEAR = 30.0  # [rad^2/m], penalty per metre that the distance from the pole is too small
@@ -49,7 +49,7 @@ _NEAR = 30.0  # [rad^2/m], penalty per metre that the distance from the pole is 
 
 @dataclasses.dataclass(frozen=True)
 class Effort(Attempt):
-    """An attempt: how many stored motions are warped, checked and refined by least squares."""
+    """Settings of one search: how many stored motions are warped, checked and optimised."""
 
     neighbours: int = 8  # number of stored motions that are warped, up to 16
     points: int = 6  # number of points of the ball's trajectory to which each motion is warped
@@ -65,7 +65,7 @@ class Effort(Attempt):
 
 @struct.dataclass
 class Warped:
-    """C warped motions, sorted by penalty, the smallest penalty first."""
+    """C stored motions, warped to meet the given ball; sorted by penalty, the smallest first."""
 
     # (C, 6 K + 1): rates of 6 joints at K knots, times the duration [rad]; then contact time [s].
     points: Array

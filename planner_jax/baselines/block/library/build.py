@@ -47,8 +47,8 @@ from planner_jax.task.block.motion import angles_at
 from planner_jax.task.block.scene import Scene
 
 # Indices of stored initial guesses (starts) of the least squares. A build tries `STARTS` for pairs
-# of cells that have a motion already, and all stored guesses for pairs without a motion. A repair
-# starts from the old motion and from `REPAIR_STARTS`.
+# of cells that have a motion already, and all stored guesses for pairs without a motion. Planning
+# again after an obstacle has moved (`repair`) starts from the old motion and from `REPAIR_STARTS`.
 STARTS, REPAIR_STARTS = (2, 0, 1, 3, 4, 5), (2,)
 _WORTH = 0.03  # [s], a motion is improved only if the ball might come at least this much earlier
 _CHECKED_AT_ONCE = 1024  # number of stored motions whose distances are computed in one batch
@@ -261,12 +261,12 @@ def _groups(starts: Sequence[int]) -> list[Sequence[int]]:
 
 
 def _plan_batch(planner: PairPlanner, cases: PairCase) -> PairPlan:
-    """Plan a batch in calls of two sizes (small, large), so that two programs are compiled."""
+    """Plan a batch in calls of two sizes (small, large), so that only two programs are compiled."""
     num, devices = len(cases.best), jax.local_device_count()
     few, many = portions().lanes
     lanes = few if num <= _FEW * few * devices else many
     whole = -(-num // (lanes * devices)) * lanes * devices
-    # Copies of the last case pad the batch; on a CPU they are not solved.
+    # Copies of the last case fill the batch to a size that is compiled already.
     filled = jax.tree.map(lambda leaf: leaf[np.minimum(np.arange(whole), num - 1)], cases)
     plans = plan(planner, filled, chunk=lanes)
     return jax.tree.map(lambda leaf: leaf[:num], plans)

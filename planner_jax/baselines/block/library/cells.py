@@ -134,7 +134,7 @@ def cells_around(
 
     Returns:
         cells: (4,) int32, numbers of the cells; repeated if a face has one cell in a direction.
-        away: (4,), squared distances from the point to the cells' centres; a cell has size 1.
+        away: (4,), squared distances from the point to the cells' centres, in cell sizes.
         found: () bool, whether the point's face has cells.
     """
     own, found = cell_of(faces, box, point)

@@ -86,7 +86,7 @@ def build_library(
 
 
 def show_library(path: str, *, map: str | None = None) -> None:
-    """Print which share of pairs of cells has motions; draw it in the file `map`, if given."""
+    """Print the share of cell pairs that have a motion; draw it, too, if `map` is a path."""
     library = load_library(path)
     covered = coverage(library)
     _print(path, library, covered)
@@ -96,7 +96,7 @@ def show_library(path: str, *, map: str | None = None) -> None:
 
 
 def check_library(path: str, *, num: int = 2000, seed: int = 0) -> None:
-    """Check motions by the referee, independently, for `num` random balls of each start pose."""
+    """Let the independent referee judge stored motions for `num` random balls per start pose."""
     require_size("num", num)
     require_seed(seed)
     require_memory("num", num, _CASE_BYTES)
@@ -173,7 +173,7 @@ def _print(path: str, library: Library, covered: Coverage) -> None:
 
 
 def coverage_map(figure: Figure, library: Library, covered: Coverage) -> None:
-    """Draw for each cell which share of its pairs that a ball can pass has stored motions."""
+    """Draw the cells of both boxes, coloured by the share of their possible pairs with a motion."""
     layout, scene = library.table.layout, library.setting.scene
     shape = (layout.num_outer, layout.num_inner)
     found = covered.found.any(axis=0).reshape(shape)

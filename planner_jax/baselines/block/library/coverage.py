@@ -39,7 +39,7 @@ class Coverage:
     is_sure: np.ndarray
 
     def share(self, of: np.ndarray) -> np.ndarray:
-        """Return for each start pose the fraction (H,) of pairs in the mask `of` with a motion."""
+        """Return the fraction (H,) of the pairs in mask `of` with a motion, by start pose."""
         return (self.found & of).sum(axis=1) / of.sum()
 
 
@@ -61,7 +61,7 @@ def coverage(library: Library) -> Coverage:
 
 @jax.jit
 def _farthest(outer: Array, inner: Array, row: Row) -> Array:
-    """Return how far from the shield's centre balls cross its plane, by start pose and pair."""
+    """Return the greatest distance [m] from shield centre to ball in the shield's plane, (H, P)."""
 
     def one(outer: Array, inner: Array, row: Row) -> Array:
         sides = [row.normal, row.edge, jnp.cross(row.normal, row.edge)]

@@ -302,7 +302,7 @@ class BentPair(PairPlanner):
         return (self.search,)
 
     def solve(self, pair: PairCase, attempt: Bends) -> PairPlan:
-        """Return the plan of one pair of cells: the last successful search's result."""
+        """Return the plan of one pair of cells: the motion of the last successful search."""
         online, dtype = self.online, pair.best.dtype
         poses = self.poses(pair)
         order = jnp.argsort(poses.effort)
@@ -317,7 +317,7 @@ class BentPair(PairPlanner):
         learned = online.encode_straight(case, poses, place).at[:-1].add(bump.astype(dtype))
         is_given = pair.start < 0
         start = jnp.where(is_given, pair.given, learned)
-        # A given motion meets the ball approximately in the middle between the two cells.
+        # The motion `given` meets the ball approximately in the middle between the two cells.
         span = nominal_ball(pair.outer, pair.inner)[1]
         entry = jnp.where(is_given, pair.given[-1] - 0.5 * span, of_place)
         none = jnp.isinf(pair.best)
