@@ -38,7 +38,7 @@ class Program:
 
 @contextlib.contextmanager
 def record_programs() -> Iterator[dict[str, Program]]:
-    """Record the programs that JAX compiles in a `with` block; the record is whole at its end."""
+    """Record the programs that JAX compiles in a `with` block; the record is complete after it."""
     import jax
 
     programs: dict[str, Program] = collections.defaultdict(Program)

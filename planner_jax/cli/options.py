@@ -107,7 +107,6 @@ def add_settings(parser: Parser, kind: Any, task: Task | None = None) -> None:
 
 
 def _form_of(field: dataclasses.Field) -> Options:
-    """Return the arguments of argparse's `add_argument` that follow from a field of settings."""
     names = field.metadata["metavar"].split()
     how: Options = {"required": True} if field.default is dataclasses.MISSING else {}
     if len(names) == 1:

@@ -41,7 +41,7 @@ def packets(plan: QuadrotorPlan, rate: float) -> Iterator[tuple[int, bytes]]:
 
 
 def write_tlog(plan: QuadrotorPlan, rate: float, file: BinaryIO) -> None:
-    """Write a telemetry log of a plan at `rate` [Hz]: each packet after its time [us]."""
+    """Write a telemetry log of a plan at `rate` [Hz]: each packet follows its time [us]."""
     for stamp, packet in packets(plan, rate):
         file.write(struct.pack(">Q", stamp) + packet)
 

@@ -30,7 +30,7 @@ class Arrivals:
         self._senders: dict[Hashable, tuple[float, int]] = {}
 
     def check(self, packet: Packet, sender: Hashable, now: float) -> tuple[Fault, bool]:
-        """Check a packet that arrives at `now` [s]; return its fault, and if it has a new clock."""
+        """Check a packet that arrives at `now` [s]; return its fault, and if its clock is new."""
         self.was_late = False
         if packet.fault:
             return packet.fault, False

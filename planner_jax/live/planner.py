@@ -168,7 +168,7 @@ class LivePlanner(Generic[CaseT, PlanT]):
             return self._pack(packet, fault, due)
 
     def record_sent(self, data: bytes, received: float) -> None:
-        """Record the time of an answer that was sent; then plan the current plan's recovery."""
+        """Record the time of a sent answer; then plan the standstill after the current plan."""
         taken = time.perf_counter() - received
         self.report.counts["answered"] += 1
         self.report.counts["missed"] += taken > self.deadline
@@ -231,7 +231,7 @@ class LivePlanner(Generic[CaseT, PlanT]):
     def _search(
         self, ball: BallState, flight: _Flight[PlanT], number: int, due: float
     ) -> _Flight[PlanT] | None:
-        """Plan for ball `number` from the time `due` [s]; improve its plan in `flight`, if any."""
+        """Plan for ball `number` from `due` [s] on: improve its plan in `flight`, or plan anew."""
         elapsed, stages = due - flight.start, self.report.stages
         if flight.plan is not None and flight.ball == number:
             with stages["again"].measure():

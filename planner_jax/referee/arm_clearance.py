@@ -64,7 +64,6 @@ class _Capsule:
         return apart - self.radius - other.radius
 
     def at(self, lane: np.ndarray, sample: np.ndarray) -> "_Capsule":
-        """Return the capsule at P samples, each the sample `sample[k]` of the motion `lane[k]`."""
         first, second = (_pick_samples(end, lane, sample) for end in (self.first, self.second))
         return _Capsule(self.name, self.link, first, second, self.radius[lane, 0])
 
@@ -296,7 +295,6 @@ def _least(pairs: list[_Pair], sampled: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def _pick_samples(values: np.ndarray, lane: np.ndarray, sample: np.ndarray) -> np.ndarray:
-    """Return `values` at sample `sample[k]` of motion `lane[k]`; constants have one sample."""
     return values[..., lane, sample if values.shape[-1] > 1 else 0]
 
 

@@ -181,7 +181,6 @@ def _read(cases, plans) -> dict[str, np.ndarray]:
 
 
 def _ends(durations: np.ndarray, num: int) -> np.ndarray:
-    """Return times [s] of catches: ends of `num` equal groups of pieces, one for each catch."""
     each = durations.shape[1] // num
     return np.cumsum(durations, axis=1)[:, each - 1 :: each]
 
@@ -382,7 +381,6 @@ def _judge_catches(case, pieces, held, ends, net_test: str, tolerances: dict) ->
 
 
 def _catch_time(case: dict, held: np.ndarray, ends: np.ndarray) -> tuple:
-    """Test that catch times rise from 0, equal `ends` (of pieces), and keep the case's horizon."""
     each = case["durations"].shape[1] // held.shape[1]
     shortest = case["durations"].reshape(*held.shape, each).min(axis=2)
     after = np.where(held, 0.0, shortest).min(axis=1, keepdims=True)

@@ -48,7 +48,6 @@ def clearances(group: dict, half: np.ndarray, times: np.ndarray, poses: np.ndarr
         return np.concatenate(parts)
 
     def closest(bound: np.ndarray, of: np.ndarray) -> np.ndarray:
-        """Return for each plan the index of its least `bound`; of[k] is the plan of bound[k]."""
         lowest = np.full(num_lanes, np.inf)
         np.minimum.at(lowest, of, bound)
         hits = np.flatnonzero(bound == lowest[of])

@@ -28,11 +28,9 @@ class ExtraLimit(Protocol):
 # Number of intervals between samples that are searched more finely, and number of their
 # refinements. Each refinement reduces an interval to a quarter of its length.
 _REFINED, _REFINEMENTS = 6, 4
-# Assumed rise of the excess per interval before a piece's first sample; after the last sample it is
-# minus this number. Lines through samples bound the excess v in an interval (0, 1) by
-# v_0 + b (r - a) / (b - a), where v rises by b before, r inside and a after the interval. A piece
-# has no sample before its first interval. For a large b the bound there is v_0 + r - a = v_1 - a,
-# which is the line through the two samples after the interval. The last interval is treated alike.
+# Assumed rise of the excess per interval before a piece's first sample; after the last sample the
+# rise is minus this number. For so large a number, the bound on the excess in the first or last
+# interval is the straight line through the next two samples inside the piece.
 _STEEP = 1e9
 
 

@@ -29,7 +29,7 @@ class Verdict:
     # `{time}`, `{excess}` and any field of the verdict. The limits are tested in this order, and
     # `failed_limit` is the first limit whose test fails.
     SENTENCES: ClassVar[dict[str, str]]
-    # For some limits by name, the sentence that is used instead if the excess is infinite.
+    # For some limits by name, a sentence that describes an infinite excess, instead of the above.
     UNBOUNDED: ClassVar[dict[str, str]] = {}
 
     success: np.ndarray  # (B,) bool, whether the plan keeps every limit
@@ -82,8 +82,7 @@ CONTACT_TIME_TOLERANCE = 1e-4
 # is divided by this number.
 SMALLEST_LIMIT = 1e-3
 _FEWEST_LANES = 256  # least number of plans that one thread judges
-# Processes instead of threads judge a batch with at least this number of plans, on this number of
-# cores.
+# Processes instead of threads judge batches of at least this size, if there are this many cores.
 _MANY_LANES, _MANY_CORES = 16384, 4
 
 

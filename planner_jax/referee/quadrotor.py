@@ -108,7 +108,7 @@ _PRODUCT, _SEARCHED = 250_000, 1024
 
 
 def intervals_of(num_pieces: int) -> int:
-    """Return into how many intervals a piece is divided, for `num_pieces` between two contacts."""
+    """Return the number of sampled intervals in each of `num_pieces` pieces before a contact."""
     return max(math.ceil(_INTERVALS / num_pieces), _FEWEST_INTERVALS)
 
 
@@ -265,7 +265,6 @@ def _time(pieces: Pieces, index: np.ndarray, u: np.ndarray) -> np.ndarray:
 
 
 def _search(name: str, pieces: Pieces, gravity, likeliest, u: np.ndarray) -> tuple:
-    """Find each plan's maximum of the quantity `name`, and its time, near sample `likeliest`."""
     orders, measure = _MEASURES[name]
     piece, sample = np.divmod(likeliest, len(u))
     lanes = np.arange(len(piece))

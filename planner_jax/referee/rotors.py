@@ -92,7 +92,7 @@ def _pull_and_rate(
     size = np.linalg.norm(pull, axis=-1)
     across = np.cross(pull, jerk)
     # The angular velocity is tau x jerk / |tau|^2 + r tau / |tau|, with the thrust per unit mass
-    # tau. Of all rates r about the thrust, the Hopf fibration at zero heading has this one.
+    # tau. The Hopf fibration at zero heading determines the rate r about the thrust.
     about = -across[..., 2] / (size * (size + pull[..., 2]))
     return pull, (across / size[..., None] + about[..., None] * pull) / size[..., None]
 

@@ -26,7 +26,7 @@ _NAME = re.compile(r"part-([0-9]{6,12})-([0-9a-f]{8})\.parquet")
 
 
 class DamagedPart(ValueError):
-    """A file of rows is damaged or is not part of a run; the message states the reason."""
+    """Error: a file of rows is damaged or not part of a run; the message states the reason."""
 
 
 def encode(rows: pa.Table, record: Mapping[str, object]) -> bytes:

@@ -18,7 +18,7 @@ Row: TypeAlias = Mapping[str, Any]  # values of a row by column
 
 
 class JsonError(PlannerJaxError, ValueError):
-    """A text is not JSON of the expected format, or was changed; the message states the reason."""
+    """Error: a text is not JSON of the expected format, or was changed; the message says why."""
 
 
 def digest_of(entries: Mapping[str, object]) -> str:

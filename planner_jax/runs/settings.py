@@ -22,7 +22,7 @@ Options = dict[str, Any]  # keyword arguments: values by name
 
 
 class WorkersFailed(PlannerJaxError, RuntimeError):
-    """Worker processes could not plan a chunk of cases; the run can be resumed."""
+    """Error: worker processes could not plan a chunk of cases; the run can be resumed."""
 
 
 def option(default: object, metavar: str, text: str) -> Any:

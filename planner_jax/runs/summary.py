@@ -61,7 +61,7 @@ class Tally:
                 self._example_rank, self.example = rank, int(index[there][0])
 
     def examples(self, rows: pa.Table, success: np.ndarray) -> list[np.ndarray]:
-        """Return masks of rows that may be the example in figures, the preferred mask first."""
+        """Return masks of rows that qualify as example case of figures, the best mask first."""
         return [success, np.ones_like(success)]
 
     def summary(self) -> Entries:

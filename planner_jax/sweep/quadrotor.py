@@ -52,7 +52,7 @@ _RESTS = {
 
 
 def recovery_remark(parameters: Row) -> list[str]:
-    """Return a sentence on the setting `recovery`: how the robots stop; [] if they do not."""
+    """Return a sentence on the setting `recovery`: how the robots stop; [] for "none"."""
     words = _RESTS.get(parameters.get("recovery", ""))
     if words is None:
         return []

@@ -41,7 +41,7 @@ def resolve_robot(given: object, tool: str) -> "QuadrotorModel | None":
 
 
 def robot_remark(parameters: Row) -> list[str]:
-    """Return a sentence on the robot that a run's settings name; [] if they name none."""
+    """Return a sentence on the robot that a run's settings name; [] without a robot."""
     robot = parameters.get("robot")
     if robot is None:
         return []

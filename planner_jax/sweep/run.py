@@ -30,7 +30,7 @@ from planner_jax.sweep.sweep import Sweep, settings_of, sweep_of
 
 
 class SweepInterrupted(KeyboardInterrupt):
-    """A sweep was interrupted by Ctrl-C; the message is the path of its folder, to resume it."""
+    """Error: Ctrl-C interrupted a sweep; the message is the path of its folder, to resume it."""
 
 
 def start_sweep(

@@ -232,7 +232,6 @@ def _optimise(
         return jnp.concatenate([start[None], start[None], moved[:-1], before[None], end[None]])
 
     def squares_of(points: Array) -> Array:
-        """Return, for each bound, the square of the least duration [s] that keeps this bound."""
         rates = (product(first, points) / bounds.velocity) ** 2
         rises = jnp.abs(product(second, points)) / bounds.acceleration
         return jnp.maximum(jnp.concatenate([rates, rises]), LEAST_TIME**2)

@@ -211,7 +211,6 @@ class MppCatch(Planner):
         return jnp.stack([pos, jnp.stack([vx, vy, vz], axis=1), acc], axis=1)
 
     def _excess(self, segment: PiecewisePolynomial, case: CatchCase) -> Array:
-        """Return a segment's largest excess over a limit: relative, or [m] for the ground."""
         limits = case.limits
         motion = sample_pieces(segment, self.nodes)
         weak, strong = thrust_excess(motion.acc, case.gravity, *limits.thrust_bounds)

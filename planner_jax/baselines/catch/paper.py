@@ -239,7 +239,6 @@ class PaperCatch(OptimisedPlanner):
         return Chain(rows=rows, offsets=offsets, piece_durations=piece_durations), catch
 
     def _at_ends(self, chain: Chain, catch: Catch, context: CatchContext) -> Array:
-        """Return the cost () of snap, missed catches and total time; `chain` has all segments."""
         at_catch = self.miss_weight * steep_hinge(catch.miss, context.case.net.radius)
         at_catch += self.angle_weight * steep_hinge(catch.angle_excess, self.hinge_width)
         energy = jax.vmap(lambda *segment: trajectory_energy(self.maps, *segment))(

@@ -252,7 +252,6 @@ class BatHit(OptimisedPlanner):
         )
 
     def _unpack(self, point: Array, context: HitContext):
-        """Return deviations of waypoints, end states, piece duration [s], impact and defect."""
         natural = point * jnp.asarray(self.scale, point.dtype)
         waypoints = natural[: self.num_offsets].reshape(-1, 3)
         impact, defect = self.impact(natural[self.num_offsets :], context)

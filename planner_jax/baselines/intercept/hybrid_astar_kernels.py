@@ -169,7 +169,6 @@ def _is_free_at(pose, scene, field):
 
 @njit(cache=True)
 def _compute_field(scene, cell):
-    """Compute the distance field of a scene, with two grid steps per cell."""
     shape = (2 * scene.shape[0] + 1, 2 * scene.shape[1] + 1)
     cap = scene.clear + cell
     far = distance_field(scene.polygons, scene.present, scene.corner, 0.5 * cell, shape, cap)
@@ -291,7 +290,6 @@ def _shoot(pose, goal, bound, rules, scene, field, lengths):
 
 @njit(cache=True)
 def _empty_tree(node_of, max_expansions):
-    """Allocate a tree without nodes, large enough for `max_expansions` expansions."""
     most = min(PRIMITIVES * max_expansions, node_of.size) + 1
     return _Tree(
         np.empty((most, 3)),

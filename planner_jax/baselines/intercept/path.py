@@ -61,7 +61,8 @@ def path_of_drive(
     fine = jnp.arange((speed.shape[0] - 1) * samples + 1)
     v, c = (jnp.interp(fine, knots, each) for each in (speed, curvature))
     step = time / (fine.shape[0] - 1)
-    # Interpolation needs increasing stations, so that at standstill a step counts as 1e-6 m.
+    # Interpolation needs increasing stations (distances along the path): at standstill a step
+    # counts as 1e-6 m.
     moved = jnp.maximum(0.5 * (v[1:] + v[:-1]) * step, 1e-6)
     station = jnp.concatenate([jnp.zeros_like(moved[:1]), jnp.cumsum(moved)])
     even = jnp.linspace(0.0, 1.0, num) * station[-1]

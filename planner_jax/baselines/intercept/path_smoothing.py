@@ -34,7 +34,8 @@ from planner_jax.core.errors import ArgumentError
 from planner_jax.plane.obstacles import Obstacles, distances, separation
 
 _FINE = 8  # number of samples per piece of the spline, for the computation of its length
-# Fractions of the shift from given to smooth points that are tried, until a path keeps all limits.
+# Fractions of the shift from the given to the smoothed points, tried in turn until a path keeps all
+# limits.
 _SHARES = (1.0, 0.5, 0.25, 0.0)
 # Relative excess over the curvature limit that is allowed, because of rounding errors.
 _CURVATURE_TOLERANCE = 1e-3

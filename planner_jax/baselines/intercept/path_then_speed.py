@@ -26,7 +26,7 @@ from planner_jax.task.intercept.searches import Search, make_grid
 
 @dataclasses.dataclass(frozen=True)
 class SpeedStep:
-    """Settings of the second step, which plans a speed along a given path."""
+    """Settings of speed planning, the second step after the search for a path."""
 
     # The speed planner. With None the car drives at constant speed and ignores moving obstacles.
     speed: SpeedPlanner | None = dataclasses.replace(SPEED_PLANNERS["trapezoid"], pieces=20)

@@ -145,7 +145,6 @@ def overlap(
     finish = -begin
 
     def narrow(interval: tuple, x: Array, y: Array, is_axis: Array) -> tuple:
-        """Intersect intervals with the times when both projections onto the axis (x, y) overlap."""
         mine = [x * corner[None, :, 0] + y * corner[None, :, 1] for corner in own]
         other = [x * theirs[:, k, :1] + y * theirs[:, k, 1:] for k in range(theirs.shape[1])]
         rate = x * movers.velocity[:, :1] + y * movers.velocity[:, 1:]

@@ -132,7 +132,7 @@ def speed_matrices(planner: SpeedPlanner) -> dict[str, np.ndarray]:
 
 @functools.cache
 def speed_template(planner: SpeedPlanner) -> QpTemplate:
-    """Return the arrays of the quadratic program that all problems of a planner share."""
+    """Return the arrays of the quadratic program that all problems of a speed planner share."""
     return qp_template(**speed_matrices(planner))
 
 

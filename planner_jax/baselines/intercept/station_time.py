@@ -93,7 +93,6 @@ def reference_line(
     speed = jnp.arange(grid.jumps + 1) * (station_step / step)
 
     def charge(before: Array) -> Array:
-        """Return the costs of changing from speeds `before` to each speed of the grid."""
         change = (jnp.expand_dims(speed, range(1, 1 + before.ndim)) - before[None]) / step
         is_allowed = jnp.abs(change) <= problem.acceleration_limit * (1.0 + 1e-5)
         return jnp.where(is_allowed, change**2 * step, jnp.inf)
@@ -124,7 +123,6 @@ def reference_line(
     )
 
     def step_back(node: tuple[Array, Array], cost: Array) -> tuple[tuple[Array, Array], Array]:
-        """Return the node before `node` on the best line, given the costs of all previous nodes."""
         jump, place = node
         place = place - jump
         jump = lax.argmin(cost[:, place] + change[jump], 0, jnp.int32)
@@ -283,7 +281,6 @@ def corridor(
         elif lines == "flat":
             chosen = jnp.zeros_like(own)
         else:
-            # If the edge reaches one end of the piece, the bound may only turn away from the edge.
             turned = side * slope[:, None]
             turned = jnp.where(at_begin, jnp.minimum(turned, side * own), turned)
             turned = jnp.where(at_end, jnp.maximum(turned, side * own), turned)
@@ -319,7 +316,7 @@ def _speed_limits(problem: StationTimeProblem, joints: Array) -> tuple[Array, Ar
     first, last = joints[:-1, None], joints[1:, None]
     is_passed = (left < last - slack) & (right > first + slack)
     speed = jnp.min(jnp.where(is_passed, limit, jnp.inf), axis=1)
-    # A line that stands still on the border of two path parts passes no part.
+    # A line that stands still on the border of two path parts passes no part: take the least limit.
     speed = jnp.where(jnp.isfinite(speed), speed, jnp.min(limit))
     is_slower = (limit[None] < speed[:, None]) & ~is_passed
     below, above = is_slower & (right <= first + slack), is_slower & (left >= last - slack)

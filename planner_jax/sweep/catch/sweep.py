@@ -62,7 +62,7 @@ class CatchTally(Tally):
         self._num_ratios += int(known.sum())
 
     def summary(self) -> Entries:
-        """Return success rates, mean catch time [s] and optimal time ratio; None for no values."""
+        """Return success rates, mean catch time [s] and optimal time ratio; None without values."""
         return {
             **super().summary(),
             "caught": self._shares / self.num,

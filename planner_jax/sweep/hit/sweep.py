@@ -85,7 +85,7 @@ class HitTally(Tally):
         self._scenarios.add(rows)
 
     def examples(self, rows: pa.Table, success: np.ndarray) -> list[np.ndarray]:
-        """Return masks of rows that may be the example in figures, the preferred mask first."""
+        """Return masks of rows that qualify as example case of figures, the best mask first."""
         scenario = rows["scenario"].to_numpy()
         left_to_far = success & np.array([name[0] + name[2] == "LF" for name in scenario])
         return [left_to_far, *super().examples(rows, success)]

@@ -104,7 +104,7 @@ def _sample(
 
 
 _SAMPLES = 241  # number of times at which a plan is sampled
-# Number of a figure's panels, each with one case; of panels in a row; and of panels with failures.
+# Numbers of panels of a figure, each for one case; of panels in a row; and of panels for failures.
 _PANELS, _COLUMNS, _FAILURES = 6, 3, 2
 # Greatest numbers of times at which a panel shows the car, and of polygons of moving obstacles.
 _MOST_BODIES, _MOST_MOVERS = 6, 16

@@ -83,11 +83,11 @@ class Search(Attempt):
     tries: int = 15  # number of starting points from which least squares are tried
     first: int = 0  # index of the first stored starting point to try
     kept: int = 5  # number of starting points that continue after the solver's trial steps
-    # Whether each start is refined to its end before the next one, if a single case is planned.
-    # Otherwise all starts first take a few trial steps, and only the `kept` best ones continue.
+    # Whether each starting point is refined to its end before the next, if a single case is
+    # planned. Otherwise all take a few trial steps first, and only the `kept` best ones continue.
     in_turn: bool = True
-    # After the trial steps a start continues only if its cost is below the bound `hope`, which
-    # nearly all successful starts meet.
+    # After its trial steps a starting point is used further only if its cost is below `hope`, as it
+    # is for nearly all successful ones.
     solver: LevenbergConfig = LevenbergConfig(
         *(26, 1e-2, 0.25, 6.0), settled=1, tolerance=1.0, trial=3, hope=1000.0, fade=0.7
     )
@@ -109,19 +109,17 @@ _BRISK = (Search(tries=0), *_LEAST_SQUARES)
 
 @functools.cache
 def read_learned_starts() -> tuple[np.ndarray, np.ndarray]:
-    """Read N stored starts: ranks (N,) of end poses by effort, and detours (N, 6) [rad] to them."""
+    """Read N starting points: ranks (N,) of their end poses, and detours (N, 6) [rad] to these."""
     starts = json.loads((Path(__file__).parent / "learned_starts.json").read_text())
     ranks = np.array([start["rank"] for start in starts], np.int32)
     return ranks, np.array([start["bump"] for start in starts], np.float32)
 
 
 def _combine_excess(joints: Array, contact: Array, too_near: Array) -> Array:
-    """Return the largest relative excess; 1 cm of missing distance `too_near` [m] counts as 1."""
     return jnp.maximum(jnp.maximum(joints, contact), 100.0 * too_near)
 
 
 def _trial_cost(tried: LevenbergState, solver: LevenbergConfig) -> Array:
-    """Return the cost that ranks searches after their trial steps; -1 if a search is finished."""
     return jnp.where(tried.stalled >= solver.settled, -1.0, tried.model.cost)
 
 
@@ -239,8 +237,8 @@ class OnlineBlock(Planner):
     def _solve_in_step(self, case: BlockCase, attempt: Search) -> BlockPlan:
         """Return the plan of one case, in the same order of steps for every case.
 
-        Of each group of `_GROUP` starts, the `_WIDTH` with the least cost after the solver's trial
-        steps are refined to their end.
+        Of each group of `_GROUP` starting points, the `_WIDTH` with the least cost after the
+        solver's trial steps are refined to their end.
         """
         flight, poses, order = self._rank(case)
         straight = self._count_straight(flight, poses, attempt)
@@ -265,7 +263,7 @@ class OnlineBlock(Planner):
                 some = jax.tree.map(lambda leaf: leaf[lanes], searches)
                 later = refine(some, jnp.where(is_trial, solver.trial, solver.max_steps))
                 searches = jax.tree.map(lambda old, new: old.at[lanes].set(new), searches, later)
-                # Copy the searches that the last turn refines to the first entries, read below.
+                # Copy the searches that the last turn refines to the first `_WIDTH` entries.
                 moved = jax.tree.map(lambda old, new: old.at[:_WIDTH].set(new), searches, later)
                 return jax.tree.map(lambda a, b: jnp.where(is_trial, a, b), searches, moved)
 

@@ -156,9 +156,9 @@ def beam(case: CatchCase, table: Timetable, width: int) -> CatchChoice:
 
 
 def _choice(position: Array, times: Array) -> CatchChoice:
-    """Return the choice for N targets with indices `position` (N,) in a sequence of catches.
+    """Return the order of N targets with positions `position` (N,) in a sequence of catches.
 
-    Targets that are not caught have the index N. `times` (N,) [s] are the times of the catches.
+    Targets that are not caught have the position N. `times` (N,) [s] are the times of the catches.
     """
     num = position.size
     order = jnp.argsort(position, stable=True)
@@ -239,7 +239,7 @@ class Greedy(CatchDecision):
     """Decision that always catches next the target with the earliest estimated catch."""
 
     def propose(self, case: CatchCase) -> CatchChoice:
-        """Return the greedy order of one case; with optional targets, also without last catches."""
+        """Return the greedy order of one case; with optional targets, also shorter orders."""
         table = timetable(case)
         choice = estimate.earliest_next(case, table, self._handicap(case, table))
         return in_several_lengths(case, jax.tree.map(lambda leaf: leaf[None], choice))

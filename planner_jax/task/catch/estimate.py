@@ -55,7 +55,6 @@ def timetable(case: CatchCase) -> Timetable:
 
 
 def _to_catch(case: CatchCase, states: BallState, speed: Array) -> tuple[Array, Array]:
-    """Return the fields `places` and `penalty` of `Timetable` for targets in `states` (N, 3, K)."""
     net, limits = case.net, case.limits
     from_below = jnp.maximum(states.vel[:, 2] / speed - _STEEPEST, 0.0)
     places = states.pos - net.height * jnp.asarray([[[0.0], [0.0], [1.0]]], states.pos.dtype)

@@ -38,7 +38,7 @@ _LATEST = 0.05  # [s], greatest shift of a catch's time in the starting point
 _SHORTEST = 0.01  # [s], least duration of a segment in the starting point
 _CLOSING = 0.1  # [m/s], least speed towards the net's plane at which a catch's time is shifted
 _BINOMIALS, _SHIFTS = shift_basis(2 * _ORDERS)
-# Step lengths that a search tries; its first direction is too long, because it ignores curvature.
+# Step lengths that a search tries. Its first direction ignores curvature, and is too long.
 _TRIALS = (1.0, 0.2, 0.04)
 
 
@@ -174,7 +174,7 @@ class ReplanCatch(OptimisedPlanner):
         return planner.encode(context, durations, tails, offsets)
 
     def guesses(self, context: ReplanContext, num: int) -> Array:
-        """Return `num` starting points: from the previous plan, then for planning from scratch."""
+        """Return `num` starting points: the previous plan, then guesses as for a new case."""
         first = context.start[None]
         if num == 1:
             return first
@@ -208,7 +208,6 @@ def _states_along(trajectory: PiecewisePolynomial, times: Numbers) -> Array:
 
 
 def _segments(task: Replanning) -> tuple[Array, Array]:
-    """Return indices of segments, and times [s], of N remaining catches of the previous plan."""
     times = task.previous.times
     segments = jnp.minimum(jnp.sum(times <= task.elapsed) + np.arange(times.size), times.size - 1)
     return segments, times[segments] - task.elapsed

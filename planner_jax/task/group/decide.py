@@ -124,8 +124,8 @@ class Best(Decision):
         is_proposed = is_last & ~jnp.any(falls, axis=1)
         ranking = jnp.argsort(jnp.where(is_proposed, rank, jnp.inf))
         chosen = ranking[: min(self.finalists, len(orders))]
-        # If there are fewer orders than `finalists`, the best one fills the remaining rows. This
-        # takes no time, because `GroupIntercept` plans equal drives only once.
+        # If there are fewer than `finalists` orders, the best one is repeated. This takes no time,
+        # because `GroupIntercept` plans equal drives only once.
         chosen = jnp.where(is_proposed[chosen], chosen, chosen[0])
         return GroupChoice(order=orders[chosen])
 

@@ -277,7 +277,10 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
         )
 
     def relative_excess(self, excess: Array) -> Array:
-        """Return the excess (5,) of `meet`, with squared ratios of speeds converted to ratios."""
+        """Return the relative excess (5,) over limits from the result of `meet`.
+
+        In `meet` the excess of hitting speeds is a squared ratio; here it is the ratio.
+        """
         return jnp.concatenate([excess[:2], Measure.ABOVE.relative(excess[2:])])
 
     def impact(self, natural: Array, context: HitContext) -> Impact:

@@ -27,7 +27,7 @@ from planner_jax.task.hit.plan import HitPlan
 from planner_jax.trajectory.polynomial import evaluate, states_at, total_duration
 
 _SHORTEST = 0.01  # [s] least time to the impact in a starting point
-# Step lengths that a search tries; its first direction is too long, because it ignores curvature.
+# Step lengths that a search tries. Its first direction ignores curvature, and is too long.
 _TRIALS = (1.0, 0.2, 0.04)
 
 
@@ -105,16 +105,16 @@ class ReplanHit(OptimisedPlanner):
         return planner.join(jnp.zeros((1, planner.num_offsets // 3, 3), sizes.dtype), natural[None])
 
     def guesses(self, context: ReplanHitContext, num: int) -> Array:
-        """Return `num` starting points: the previous impact, then for planning from scratch."""
+        """Return `num` starting points: the previous impact, then guesses as for a new case."""
         first = context.start[None]
         if num == 1:
             return first
         return jnp.concatenate([first, self.planner.guesses(context.hit, num - 1)])
 
     def objective(self, point: Array, context: ReplanHitContext) -> Evaluation:
-        """Return cost and violation of `planner` for n decision variables, (n,)."""
+        """Return cost and violation that `planner` computes at n decision variables, (n,)."""
         return self.planner.objective(point, context.hit)
 
     def decode(self, point: Array, context: ReplanHitContext) -> HitPlan:
-        """Return the plan of `planner` for n decision variables, (n,)."""
+        """Return the plan that `planner` makes of n decision variables, (n,)."""
         return self.planner.decode(point, context.hit)

@@ -146,7 +146,8 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
     def solve_at_once(self, cases: InterceptCase, attempt: Search) -> InterceptPlan:
         """Return the plans of a batch: try all paths together, select the best of each case."""
         search = self.load_attempt(attempt, cases)
-        # `layers` is the number of times of the reach set. It is equal for all cases of the batch.
+        # `layers` is the number of times of the reach set (the cells that the car can reach at a
+        # time). It is equal for all cases of the batch.
         layers = jnp.max(jax.vmap(lambda case: make_grid(case, search.lattice).num)(cases))
         return jax.vmap(lambda case: self._solve_all_paths(case, search, layers))(cases)
 

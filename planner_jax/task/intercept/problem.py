@@ -74,7 +74,7 @@ class Guess:
 
 @dataclasses.dataclass(frozen=True)
 class MotionProblem:
-    """The least-squares problem of `SpacetimeIntercept`, from which it copies its fields."""
+    """The least-squares problem that `SpacetimeIntercept` solves, whose fields it copies."""
 
     meet: Literal["given", "early", "least"] = "given"
     pieces: int = 32
@@ -125,11 +125,10 @@ class MotionProblem:
         width = 2.0 * np.pi / grid.lattice.headings
         pace = case.limits.speed / (grid.lattice.levels - 1)
         steps = layer.astype(pace.dtype) + 0.5
-        # Times of the knots 1..K, in units of the time between two layers.
+        # Times of the knots 1 to K, in units of the grid's time step.
         at = jnp.arange(1, self.pieces + 1, dtype=steps.dtype) * (steps / self.pieces)
 
         def interpolate(values: Array, first: Array, at: Array) -> Array:
-            """Interpolate linearly at times `at`: `first` at time 0, then a value at each layer."""
             at = jnp.clip(at - 1.0, -1.0, layer.astype(at.dtype) - 1.0)
             below = jnp.floor(at).astype(jnp.int32)
             share, is_first = (
@@ -141,8 +140,8 @@ class MotionProblem:
 
         speed = interpolate(pace * path.level.astype(grid.cell.dtype), case.speed, at)
         bins = width * path.bin.astype(grid.cell.dtype)
-        # Headings of the path are relative to the car's initial heading, but may include full
-        # turns. In them the initial heading is the multiple of 2 pi that is nearest to the first.
+        # Headings of the path count from the car's initial heading, up to full turns. In this count
+        # the initial heading is `straight`, the multiple of 2 pi nearest to the first heading.
         straight = jnp.round(bins[0] / (2.0 * np.pi)) * 2.0 * np.pi
         after, before = (interpolate(bins, straight, at + half) for half in (0.5, -0.5))
         rate = (after - before) / grid.step

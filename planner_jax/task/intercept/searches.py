@@ -21,8 +21,8 @@ from planner_jax.plane.distance_field import DistanceField, distance_field
 from planner_jax.task.intercept.case import InterceptCase
 from planner_jax.task.intercept.terms import discs_of, wrap
 
-# Memory that a search needs for one path, and for one 32-bit word of a reach set, in units of the
-# memory of one starting point of a planner with few unknowns; used for the field `starts`.
+# Memory of a search for one path, and for one 32-bit word of its set of reachable cells, in units
+# of the memory of one starting point of a planner with few unknowns.
 _PATH_STARTS = 8
 _WORD_STARTS = 1 / 32768
 _PADDED = ("paths", "candidates")
@@ -31,7 +31,7 @@ _FIELD = 128  # number of nodes of the grid of distances from walls, along each 
 
 @dataclasses.dataclass(frozen=True)
 class Search(Attempt):
-    """An attempt to plan a case by least squares from random paths through the reach set."""
+    """An attempt to plan a case by least squares from random paths of reachable cells."""
 
     starts: int = dataclasses.field(init=False, default=1)
     paths: int = 16  # number of paths from which least squares run
@@ -45,8 +45,9 @@ class Search(Attempt):
     candidates: int = 4  # number of random paths of which the smoothest is used as one path
     directness: float = 2.0  # preference for straight paths; see `cell_paths.draw_path`
     lattice: reach.Lattice = reach.Lattice()
-    # Factor on the body's radius in the reach set. The set is conservative, because obstacles are
-    # rounded to whole cells. A factor below 1 admits narrow passages that are open in truth.
+    # Factor on the body's radius when the reach set (the cells that the car can reach) is computed.
+    # The set is conservative, as obstacles are rounded to whole cells. A factor below 1 admits
+    # narrow passages that are open in truth.
     body_scale: float = 1.0
 
     def __post_init__(self) -> None:
@@ -64,7 +65,7 @@ class Search(Attempt):
 )
 @dataclasses.dataclass(frozen=True)
 class LoadedSearch(Search):
-    """A search as arguments of one compiled program, which all searches of a planner share."""
+    """A `Search` converted to arguments of the compiled program that a planner's searches share."""
 
     _: dataclasses.KW_ONLY
     noise: cell_paths.PathNoise  # random numbers that select each path
@@ -76,11 +77,11 @@ class LoadedSearch(Search):
 
 @cached_by_precision
 def load_search(search: Search, searches: tuple[Search, ...], is_apart: bool) -> LoadedSearch:
-    """Return one of a planner's searches as arguments of a compiled program.
+    """Return one of a planner's searches as arguments of its compiled program.
 
-    All searches share the program. Its arrays of random numbers therefore have the sizes of the
-    search with most paths, and most candidates for a path. With `is_apart` the search has a program
-    of its own, with the sizes of this search: a GPU tries all paths at once.
+    All searches share one program, so that its arrays of random numbers have the sizes of the
+    search with most paths, and with most candidates for a path. If `is_apart` is true, the search
+    has its own program with arrays of its own sizes, because a GPU tries all paths at once.
     """
     sizes = (search,) if is_apart else searches
     paths, candidates = (max(getattr(each, name) for each in sizes) for name in _PADDED)
@@ -146,7 +147,7 @@ SEARCHES = {"given": _GIVEN, "early": (_EARLY, *_LATER), "least": (_LEAST, *_LAT
 
 @struct.dataclass
 class Reachability:
-    """Grid, distances from walls, and reach set of a case: the data from which paths are drawn."""
+    """Grid, distances from walls, and reachable cells (reach set): the data to draw paths from."""
 
     grid: reach.Grid
     field: DistanceField  # distances from the walls
@@ -155,7 +156,7 @@ class Reachability:
 
     @property
     def is_reached(self) -> Array:
-        """Whether a path through the reach set meets the target, () bool."""
+        """Whether a path of reachable cells meets the target, () bool."""
         return jnp.any(self.layers)
 
 

@@ -392,7 +392,7 @@ CAUSES = tuple(_APPLIES)
 
 
 def first_cause(suite: Suite, draws: Draws) -> np.ndarray:
-    """Return for B candidates the index in CAUSES of the first that applies, or len(CAUSES)."""
+    """Return for B candidates the index in CAUSES of the first cause that holds, or len(CAUSES)."""
     cause = np.full(len(draws["start"]), len(CAUSES))
     alive = np.arange(len(cause))
     for index, applies in enumerate(_APPLIES.values()):

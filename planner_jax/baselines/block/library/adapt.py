@@ -49,7 +49,7 @@ _NEAR = 30.0  # [rad^2/m], penalty per metre that the distance from the pole is 
 
 @dataclasses.dataclass(frozen=True)
 class Effort(Attempt):
-    """Settings of one search: how many stored motions are warped, checked and optimised."""
+    """Settings of one search: how many stored motions are changed (warped), checked, optimised."""
 
     neighbours: int = 8  # number of stored motions that are warped, up to 16
     points: int = 6  # number of points of the ball's trajectory to which each motion is warped
@@ -75,7 +75,7 @@ class Warped:
 
 @struct.dataclass
 class AdaptBlock(Planner):
-    """A planner that meets the ball with a warped stored motion; the cost is its duration [s].
+    """A planner that warps a stored motion so that it meets the ball; the cost is its duration [s].
 
     Arm, limits and scene must equal the library's, and the arm must stand at one of the library's
     start poses. Otherwise the status is BLOCKED, and the method `check` raises an error. The status
@@ -102,11 +102,11 @@ class AdaptBlock(Planner):
         return self.efforts
 
     def check(self, cases: BlockCase) -> None:
-        """Raise `ArgumentError` unless the first case's arm, limits, scene and start are stored."""
+        """Raise `ArgumentError` unless arm, limits, scene and start of a case are the library's."""
         self.stored.check(cases)
 
     def solve(self, case: BlockCase, attempt: Effort) -> BlockPlan:
-        """Return the plan of one case: the first warped motion that is collision-free."""
+        """Return the plan of one case: the first changed (warped) motion that is collision-free."""
         flight = flight_of(case)
         home, fits = self.stored.home_of(case)
         poses = end_poses(case, flight, attempt.points, self.online.pieces)

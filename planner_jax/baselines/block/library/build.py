@@ -76,7 +76,7 @@ class _Motions:
 
     # (P, 6 K + 1): rates of 6 joints at K knots, times the duration [rad]; then the duration [s].
     point: np.ndarray
-    # (P,) [s], earliest entry of a ball into the outer box; infinite without a motion.
+    # (P,) [s], earliest time at which a ball may enter the outer box; infinite without a motion.
     entry: np.ndarray
     quickest: np.ndarray  # (P,) [s], earliest entry if there were no obstacles
 
@@ -255,7 +255,6 @@ def plan_pairs(
 
 
 def _groups(starts: Sequence[int]) -> list[Sequence[int]]:
-    """Split indices of initial guesses into groups; one planner call tries one group."""
     num = portions().starts
     return [starts[begin : begin + num] for begin in range(0, len(starts), num)]
 
@@ -273,7 +272,6 @@ def _plan_batch(planner: PairPlanner, cases: PairCase) -> PairPlan:
 
 
 def _rows_of(planner: PairPlanner, found: _Motions) -> np.ndarray:
-    """Convert motions to rows of the library's table; durations are infinite without a motion."""
     stored = np.isfinite(found.entry)
     pieces = planner.online.pieces
     steps = found.point[:, :-1].reshape(-1, pieces, 6).copy()
@@ -322,7 +320,6 @@ def _is_free(setting: Setting, home: np.ndarray, rows: np.ndarray) -> np.ndarray
 
 @functools.partial(jax.jit, static_argnames="shares")
 def _nearest_on_motion(setting: Setting, home: Array, steps: Array, shares: tuple) -> Array:
-    """Return N motions' least obstacle distance (N,) [m], at fractions `shares` of the duration."""
     at = lambda steps: angles_at(home, jnp.zeros_like(home), steps, shares)  # noqa: E731
     return _nearest(setting, jax.vmap(at)(steps))
 

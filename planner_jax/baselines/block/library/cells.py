@@ -182,7 +182,6 @@ def tunnels(layout: Layout, inner: Box, outer: Box) -> Tunnels:
     rows = np.arange(len(begin))
     plane = end[rows, 0, axis]  # coordinate of the inner cell's face
     middle = begin.mean(axis=1)[rows, axis]
-    # A corner of the outer cell behind the plane is moved to the plane.
     near, far = np.where(side > 0, 0, 1), np.where(side > 0, 1, 0)
     begin[rows, near, axis] = side * np.maximum(side * begin[rows, near, axis], side * plane)
     feasible = side * (begin[rows, far, axis] - plane) > 1e-6
@@ -209,7 +208,7 @@ def _corners(faces: tuple[Face, ...], box: Box) -> tuple[np.ndarray, np.ndarray]
 
 
 def nominal_ball(outer: Array, inner: Array) -> tuple[BallState, Array]:
-    """Return a ball that flies from the centre of an outer cell to the centre of an inner cell.
+    """Return a ball that flies between the centres of a cell of the outer and of the inner box.
 
     Args:
         outer: (2, 3) [m], corners of the outer cell, lowest and highest.

@@ -173,7 +173,7 @@ def _print(path: str, library: Library, covered: Coverage) -> None:
 
 
 def coverage_map(figure: Figure, library: Library, covered: Coverage) -> None:
-    """Draw the cells of both boxes, coloured by the share of their possible pairs with a motion."""
+    """Draw the cells of both boxes, coloured by the share of their pairs that have a motion."""
     layout, scene = library.table.layout, library.setting.scene
     shape = (layout.num_outer, layout.num_inner)
     found = covered.found.any(axis=0).reshape(shape)

@@ -39,7 +39,7 @@ class Coverage:
     is_sure: np.ndarray
 
     def share(self, of: np.ndarray) -> np.ndarray:
-        """Return the fraction (H,) of the pairs in mask `of` with a motion, by start pose."""
+        """Return the fraction (H,) of cell pairs in mask `of` with a motion, by start pose."""
         return (self.found & of).sum(axis=1) / of.sum()
 
 

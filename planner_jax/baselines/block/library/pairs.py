@@ -41,7 +41,8 @@ from planner_jax.task.block.motion import angles_at, bump_steps, step_weights
 # direction and shield normal, at the end of a stored motion. COARSE applies if no motion keeps
 # FINE, since a shield that blocks some balls of a pair of cells is better than no shield.
 FINE, COARSE = STRICT, (0.08, np.deg2rad(20.0))
-# [s], a ball may enter the outer box at most this time later than if there were no obstacles.
+# [s], a ball may enter the outer box around the arm at most this time later than if there were no
+# obstacles.
 _PATIENCE = 0.8
 # [rad], greatest angle of the shield's edge from horizontal, if it must block all possible balls.
 _ROLL = np.deg2rad(1.0)
@@ -270,7 +271,6 @@ class StraightPair(PairPlanner):
 
 
 def _entry(effort: Array) -> Array:
-    """Return an entry time () [s] without the penalty `_TOUCHING` of poses that collide."""
     return jnp.where(effort > 0.5 * _TOUCHING, effort - _TOUCHING, effort)
 
 
@@ -298,7 +298,7 @@ class BentPair(PairPlanner):
 
     @property
     def attempts(self) -> tuple[Bends, ...]:
-        """The only attempt: the bisection with the settings of `search`."""
+        """The only attempt: a bisection of the ball's entry time, with the settings of `search`."""
         return (self.search,)
 
     def solve(self, pair: PairCase, attempt: Bends) -> PairPlan:
@@ -325,7 +325,6 @@ class BentPair(PairPlanner):
         first = jnp.where(none, high, 0.5 * (quickest + high))
 
         def shift(point: Array, old: Array, new: Array) -> Array:
-            """Change the duration of a motion by the change of the ball's entry time."""
             return point.at[-1].set(jnp.maximum(point[-1] + new - old, 0.02))
 
         def one_round(k: Array, state: tuple) -> tuple:
