@@ -39,7 +39,7 @@ class Source(abc.ABC):
 
     @property
     def num_chunks(self) -> int:
-        """Number of chunks of the sweep; the last chunk may be smaller."""
+        """Number of chunks of cases in the sweep; the last chunk may be smaller."""
         return -(-self.num // self.batch)
 
     def chunk(self, number: int) -> Chunk:

@@ -57,9 +57,9 @@ class Record(TypedDict):
 
 
 Made = tuple[bytes, Record]  # the bytes of a Parquet file of rows, and its record
-# A function that sends chunks to worker processes, which plan them. Its arguments are the `Maker`
-# and the numbers of the chunks. For each chunk, in order, it yields a function that waits for the
-# chunk's file of rows and returns it.
+# A function that sends chunks of cases to worker processes, which plan them. Its arguments are the
+# `Maker` and the numbers of the chunks. For each chunk, in order, it yields a function that waits
+# for the chunk's file of rows and returns it.
 Workers = Callable[["Maker", Iterable[int]], Generator[Callable[[], Made], None, None]]
 
 
@@ -105,7 +105,7 @@ class Maker:
             return self.judge(chunk, *self.plan(chunk, clock))
 
     def judge(self, chunk: Chunk, plans: PyTree, record: Record) -> Made:
-        """Judge the plans of a chunk; return the bytes of its Parquet file and its record."""
+        """Judge the plans of a chunk of cases; return its Parquet file as bytes, and its record."""
         watch = Stopwatch()
         verdict = self.sweep.judge(chunk.cases, plans, self.source.settings)
         record = {
@@ -132,7 +132,7 @@ def _files_of(parameters: Entries) -> dict[str, int]:
 def make_parts(
     maker: Maker, rows: Dataset, there: dict[int, Record], workers: Workers | None, progress: bool
 ) -> dict[int, Record]:
-    """Plan every chunk whose file of rows is missing; return the records of all files by number.
+    """Plan every chunk of cases whose file is missing; return the records of all files by number.
 
     While one chunk is planned, the next chunk is drawn, and previous chunks are judged and written.
     `there` has the records of existing files. Unless `workers` is None, other processes plan.
@@ -173,7 +173,7 @@ def make_parts(
 def _make_here(
     maker: Maker, numbers: Iterable[int], pool: ThreadPoolExecutor
 ) -> Generator[Callable[[], Made], None, None]:
-    """Plan chunks in this process; yield for each a function that judges and encodes its plans."""
+    """Plan chunks of cases in this process; yield for each a function that judges and encodes."""
     with CompileClock() as clock:
         draws = (pool.submit(as_here(maker.source.chunk), number) for number in numbers)
         following = next(draws, None)
@@ -183,7 +183,7 @@ def _make_here(
 
 
 def times_of(maker: Maker, records: dict[int, Record]) -> Entries:
-    """Return planning, compile and referee times; may plan a chunk again to exclude compilation."""
+    """Return planning, compile and referee times; may plan some cases again without compilation."""
     parts = [records[number] for number in sorted(records)]
     warm = [part for part in parts if part["warm"]]
     num, seconds = (sum(part[name] for part in warm) for name in ("num", "plan_seconds"))

@@ -101,7 +101,7 @@ def _start(ray: ModuleType, folder: str) -> None:
 def _make_parts(
     ray: ModuleType, on_gpus: bool, maker: Maker, numbers: Iterable[int]
 ) -> Generator[Callable[[], Made], None, None]:
-    """Submit chunks to Ray, a few per worker at a time; yield functions that wait for each."""
+    """Submit chunks of cases to Ray, a few per worker; yield functions that wait for each."""
     cores, gpus = (int(ray.cluster_resources().get(name, 0)) for name in ("CPU", "GPU"))
     num, threads = max(cores, 1), threads_of_a_computation()
     environ, config, how = {}, {"jax_platforms": "cpu"}, {}
@@ -111,7 +111,8 @@ def _make_parts(
         num, threads = gpus * shared, max(2 * cores // (gpus * shared), 1)
         memory = {"XLA_CLIENT_MEM_FRACTION": f"{_MEMORY / shared:.4f}"}
         environ, config = {"XLA_PYTHON_CLIENT_PREALLOCATE": "false", **memory}, {}
-        # With `max_calls` 0 a worker process plans any number of chunks, always on the same GPU.
+        # With `max_calls` 0 a worker process plans any number of blocks of cases, always on the
+        # same GPU.
         how = {"num_gpus": 1.0 / shared, "max_calls": 0}
     environ |= dict.fromkeys(("NPROC", "PJRT_NPROC"), str(threads))
     config |= {"jax_enable_x64": jnp.result_type(float) == jnp.float64}

@@ -194,7 +194,7 @@ def _finish(
     workers: Workers | None,
     progress: bool,
 ) -> Entries:
-    """Plan all chunks that have no record in `there`, then write summary, report and manifest."""
+    """Plan the chunks of cases without a record in `there`; write summary, report, manifest."""
     source, watch = maker.source, Stopwatch()
     *earlier, session = manifest["sessions"]
     try:

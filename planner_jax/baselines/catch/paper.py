@@ -154,7 +154,7 @@ class PaperCatch(OptimisedPlanner):
 
     @property
     def maps(self) -> ProportionalMinco:
-        """The constant matrices that compute one segment from end states and waypoint variables."""
+        """Constant matrices that map end states and waypoints to the trajectory to one catch."""
         return proportional_minco(_ORDER, (1.0,) * self.num_pieces)
 
     @property

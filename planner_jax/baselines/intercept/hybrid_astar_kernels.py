@@ -76,13 +76,13 @@ class _Primitives(NamedTuple):
 
 
 class _Tree(NamedTuple):
-    """The nodes that a search has reached, at most one per cell."""
+    """The nodes that a search has reached, at most one per cell of position and heading."""
 
     place: np.ndarray  # (nodes, 3), x [m], y [m], and cost from the start [m]
     bin: np.ndarray  # (nodes,) int32, heading bin relative to the start's heading
     parent: np.ndarray  # (nodes,) int32, index of the previous node; -1 for the start
     primitive: np.ndarray  # (nodes,) int32, index of the arc from the parent
-    # (cells,) int32: 0 for an unreached cell, n + 1 for node n, -n - 1 once node n is expanded.
+    # (cells,) int32, of each grid cell: 0 if unreached, n + 1 for node n, -n - 1 if n is expanded.
     node: np.ndarray
 
 

@@ -20,14 +20,15 @@ from planner_jax.baselines.intercept.station_time import Blocked, StationTimePro
 from planner_jax.plane.obstacles import Obstacles
 from planner_jax.robot.car import CarBody, CarLimits
 
-# Slopes that are tried for the edges of a quadrangle, in units of (range of stations) / (duration).
+# Slopes that are tried for the edges of a quadrangle, in units of (range of path lengths) /
+# (duration).
 _SLOPES = np.linspace(-2.0, 2.0, 17)
 _BEFORE = 0.05  # fraction of the horizon by which the projected time is extended at both ends
 
 
 @dataclasses.dataclass(frozen=True)
 class Projection:
-    """Settings: how finely quadrangles cover the stations and times that obstacles block."""
+    """Settings: how finely quadrangles cover the path positions and times that obstacles block."""
 
     runs: int = 2  # number of sequences of blocked points per obstacle; later ones join the last
     slabs: int = 4  # number of quadrangles of equal duration for one sequence

@@ -81,7 +81,7 @@ SPEED_PLANNERS = {
 
 
 def plan_speed(problem: StationTimeProblem, planner: SpeedPlanner = SpeedPlanner()) -> SpeedPlan:
-    """Return the curve of station over time with the least acceleration [Qu2022, eqs 17-24].
+    """Return the distance along the path over time with the least acceleration [Qu2022, eqs 17-24].
 
     The status is NO_PATH if dynamic programming finds no collision-free line, and INFEASIBLE if no
     curve keeps the bounds around the line.

@@ -17,7 +17,7 @@ from jax import Array, lax
 
 @struct.dataclass
 class Blocked:
-    """Up to P quadrangles in the plane of time and station that obstacles block.
+    """Up to P quadrangles in the plane of time and path length that obstacles block.
 
     A quadrangle has vertical sides at two times. An obstacle has several quadrangles if the path is
     curved.
@@ -84,9 +84,9 @@ def reference_line(
 ) -> ReferenceLine:
     """Return the line of least acceleration between the blocked polygons [Qu2022, eq. 17].
 
-    A state of the search is a station at a time, together with the edge that leads to this station,
-    so that the squared change of speed between two edges is a cost. An edge that enters a polygon
-    is forbidden.
+    A state of the search is a path length (station) at a time, together with the edge that leads to
+    this station, so that the squared change of speed between two edges is a cost. An edge that
+    enters a polygon is forbidden.
     """
     num, steps, jumps = grid.stations, grid.steps, range(grid.jumps + 1)
     station_step, step = problem.end_station / num, problem.horizon / steps
@@ -101,10 +101,6 @@ def reference_line(
     penalty = jnp.where(_find_forbidden_edges(problem, grid), jnp.inf, 0.0)  # (N, J + 1, S + 1)
 
     def shift_to_end(leaving: Array) -> Array:
-        """Index the costs of edges by the stations where they end, not where they start.
-
-        `leaving` has one row per speed and one column per station.
-        """
         padded = jnp.pad(leaving, ((0, 0), (grid.jumps, 0)), constant_values=jnp.inf)
         return jnp.stack([padded[k, grid.jumps - k : grid.jumps - k + num + 1] for k in jumps])
 
@@ -190,7 +186,7 @@ def _parts_of_cells(num: int, parts: int) -> np.ndarray:
 
 
 def is_passed_above(problem: StationTimeProblem, station: Array) -> Array:
-    """Return whether a line passes above each of P polygons, (P,) bool.
+    """Return whether a line of path length over time passes above each of P polygons, (P,) bool.
 
     Above a polygon means that the car passes before the obstacle. The line has the stations
     `station` (N + 1,) [m] at equally spaced times.
@@ -214,7 +210,7 @@ def stations_at_joints(station: Array, pieces: int) -> Array:
 
 @struct.dataclass
 class Corridor:
-    """Bounds on a curve of station over time, in each of K equal time intervals (pieces).
+    """Bounds on path length (station) over time, in each of K equal time intervals (pieces).
 
     A curve within the bounds enters none of P polygons. If it also keeps `speed`, it keeps the
     speed limit of every part of the path. Each polygon is a straight lower or upper bound in each
@@ -246,7 +242,7 @@ def corridor(
     pieces: int,
     lines: Literal["tilted", "edges", "flat"] = "tilted",
 ) -> Corridor:
-    """Return bounds on stations beside a line that enters no polygon [Qu2022, Section IV-C].
+    """Return bounds on path lengths beside a line that enters no polygon [Qu2022, Section IV-C].
 
     Time is divided into equal pieces. If a polygon covers the whole duration of a piece, the
     polygon's edge is the bound. If a polygon starts or ends within the piece, the bound is a line

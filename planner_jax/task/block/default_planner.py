@@ -305,7 +305,7 @@ class OnlineBlock(Planner):
         return jnp.where(flight.comes, jnp.minimum(in_time, attempt.straight), 0)
 
     def _encode_start(self, case: BlockCase, poses: EndPoses, order: Array, k: Array) -> Array:
-        """Return the unknowns of the k-th stored start: a straight motion with a bump (detour)."""
+        """Return the unknowns of the k-th starting point: a straight motion with a detour."""
         ranks, bumps = (jnp.asarray(each) for each in read_learned_starts())
         k = jnp.minimum(k, len(ranks) - 1)
         point = self.encode_straight(case, poses, order[ranks[k]])

@@ -73,8 +73,8 @@ class GroupIntercept(Planner):
             plans, _ = drive(self.planner, case)
             return drive.plan_again(patiently, case, plans, needed & _is_open(plans.status))
         case, needed = jax.tree.map(np.asarray, (case, needed))
-        # Equal legs are planned once, because orders with the same first targets have equal legs.
-        # If no leg is needed, one leg is planned, so that the arrays are not empty.
+        # Equal legs (drives) are planned once, because orders with the same first targets have
+        # equal legs. If no leg is needed, one leg is planned, so that the arrays are not empty.
         some = np.flatnonzero(needed) if np.any(needed) else np.zeros(1, int)
         leaves = [leaf[some].reshape(some.size, -1) for leaf in jax.tree.leaves(case)]
         rows = np.concatenate(leaves, axis=1)
@@ -137,7 +137,7 @@ def _clear_unneeded(cases: InterceptCase, plans: InterceptPlan, needed: Array) -
 def _advance(
     plans: InterceptPlan, begin: Array, solved: Array, needed: Array
 ) -> tuple[CarState, Array, Array]:
-    """Return B cars' states and times [s] after a leg, and whether all legs so far are solved."""
+    """Return B cars' states and times [s] after a drive, and which groups are solved so far."""
 
     def end(plan: InterceptPlan) -> CarState:
         duration = jnp.where(plan.time > 0.0, plan.time, 1.0)
@@ -149,9 +149,9 @@ def _advance(
 
 @jax.jit
 def _join(cases: InterceptGroup, begins: Array, legs: InterceptPlan) -> GroupPlan:
-    """Join the N legs of B groups, which start at the times `begins` (N, B) [s], to B plans."""
+    """Join the N drives (legs) of B groups, which start at `begins` (N, B) [s], to B plans."""
     begins, legs = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), (begins, legs))
-    # The status of a plan is the status of its first unsolved leg.
+    # The status of a plan is the status of its first unsolved leg (drive to one target).
     first = jnp.argmax(~is_solved(legs.status), axis=1)
     lanes = jnp.arange(first.size)
     solved = jnp.all(is_solved(legs.status), axis=1)

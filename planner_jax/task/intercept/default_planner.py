@@ -59,7 +59,7 @@ _SPREAD = 2  # early paths end in one of the first two time layers that reach th
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
-    """Planner of interceptions by a reach set and least squares.
+    """Planner of interceptions by least squares from random paths of reachable grid cells.
 
     `meet` selects the time of the meeting: "given" is the time of the case, "early" is as early as
     possible before it, and "least" is the time until then that needs the least effort, which is the

@@ -42,8 +42,8 @@ from planner_jax.task.intercept.terms import (
 
 _SOONEST = 0.01  # earliest time of a meeting, divided by the case's time
 
-# Weights of the cost in the three stages: follow the path of cells, keep all limits, and reduce the
-# effort, which is the integral of the squared acceleration.
+# Weights of the cost in the three stages: follow the path of grid cells, keep all limits, and
+# reduce the effort, which is the integral of the squared acceleration.
 _FOLLOWING = Weights(follow=10.0, obstacle=0.0, early=0.0)
 _KEEPING = Weights()
 _SETTLING = Weights(effort=10.0)
@@ -113,7 +113,7 @@ class MotionProblem:
         return dataclasses.replace(plan, cost=time) if self.meet == "early" else plan
 
     def guess_at(self, point: Array) -> Guess:
-        """Return a starting point with given unknowns, for stages that follow no path of cells."""
+        """Return a starting point with given unknowns, for stages without a path of grid cells."""
         return Guess(point=point, positions=jnp.zeros((self.pieces, 2), point.dtype))
 
     def guess_along(self, case: InterceptCase, grid: Grid, path: CellPath, layer: Array) -> Guess:
@@ -206,7 +206,7 @@ class MotionProblem:
         )
 
     def list_stages(self, attempt: Search) -> list[Stage]:
-        """Return the stages of least squares from a starting point that follows a path of cells."""
+        """Return the stages of least squares from a starting point along a path of grid cells."""
         return [Stage(_FOLLOWING, attempt.following), *self.list_last_stages(attempt)]
 
     def list_last_stages(self, attempt: Search | Warm) -> list[Stage]:
@@ -306,7 +306,7 @@ class SmoothIntercept(OptimisedPlanner):
     adjoint: ClassVar[str] = "whole"
     problem: MotionProblem = MotionProblem()
     solver: LevenbergConfig = LevenbergConfig(2000, settled=12, tolerance=1e-9)
-    # A single round without steps of L-BFGS: `guesses` already returns the minimum.
+    # A single attempt (round) without steps of L-BFGS: `guesses` already returns the minimum.
     rounds: tuple[Round, ...] = (Round(solver=LbfgsConfig(max_steps=0)),)
 
     def prepare(self, case: StartedCase) -> _Context:

@@ -31,7 +31,7 @@ _FIELD = 128  # number of nodes of the grid of distances from walls, along each 
 
 @dataclasses.dataclass(frozen=True)
 class Search(Attempt):
-    """An attempt to plan a case by least squares from random paths of reachable cells."""
+    """An attempt to plan a case by least squares from random paths of reachable grid cells."""
 
     starts: int = dataclasses.field(init=False, default=1)
     paths: int = 16  # number of paths from which least squares run
@@ -156,7 +156,7 @@ class Reachability:
 
     @property
     def is_reached(self) -> Array:
-        """Whether a path of reachable cells meets the target, () bool."""
+        """Whether a path of reachable grid cells meets the target, () bool."""
         return jnp.any(self.layers)
 
 
@@ -226,7 +226,7 @@ def draw_cell_path(
     noise: cell_paths.PathNoise,
     directness: Array | float,
 ) -> cell_paths.CellPath:
-    """Draw a random path of cells that meets the target at time number `layer` () int32."""
+    """Draw a random path of grid cells that meets the target at time number `layer` () int32."""
     cells, is_reached = _meeting_cells(case, found.grid, found.reach, layer)
     draw = cell_paths.draw_path
     return draw(found.grid, found.reach, layer, cells, is_reached, noise, directness)

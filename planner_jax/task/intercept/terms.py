@@ -240,7 +240,7 @@ def obstacle_terms(
 
 
 def join_obstacles(walls: Obstacles, movers: Obstacles) -> Obstacles:
-    """Join walls and movers; repeat corners until all polygons have the same number of them."""
+    """Join walls and moving obstacles; repeat corners so that all polygons have equally many."""
     size = max(walls.corners.shape[1], movers.corners.shape[1])
 
     def pad(corners: Array) -> Array:

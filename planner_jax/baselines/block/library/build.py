@@ -47,8 +47,9 @@ from planner_jax.task.block.motion import angles_at
 from planner_jax.task.block.scene import Scene
 
 # Indices of stored initial guesses (starts) of the least squares. A build tries `STARTS` for pairs
-# of cells that have a motion already, and all stored guesses for pairs without a motion. Planning
-# again after an obstacle has moved (`repair`) starts from the old motion and from `REPAIR_STARTS`.
+# of cells (one on each of two boxes) that have a motion already, and all stored guesses for pairs
+# without a motion. Planning again after an obstacle has moved (`repair`) starts from the old motion
+# and from `REPAIR_STARTS`.
 STARTS, REPAIR_STARTS = (2, 0, 1, 3, 4, 5), (2,)
 _WORTH = 0.03  # [s], a motion is improved only if the ball might come at least this much earlier
 _CHECKED_AT_ONCE = 1024  # number of stored motions whose distances are computed in one batch
@@ -72,7 +73,7 @@ _FEW = 6  # number of planner calls of the small size that take as long as one o
 
 @dataclasses.dataclass(frozen=True)
 class _Motions:
-    """The best motions found so far for P pairs of cells."""
+    """The best motions found so far for P pairs of cells, one on each of two boxes."""
 
     # (P, 6 K + 1): rates of 6 joints at K knots, times the duration [rad]; then the duration [s].
     point: np.ndarray
@@ -173,7 +174,7 @@ def repair(
 
 
 def portions() -> Portions:
-    """Return how many pairs of cells are planned at a time, on a CPU or on a GPU."""
+    """Return how many pairs of cells on two boxes are planned at a time, by a CPU or a GPU."""
     return _ON_CPU if jax.default_backend() == "cpu" else _ON_GPU
 
 
@@ -193,9 +194,10 @@ def plan_pairs(
 ) -> np.ndarray:
     """Plan motions from one start pose for N pairs of cells; return rows of the library's table.
 
-    Motions with all joints in proportion are tried first. For pairs without a motion, or whose ball
-    might enter earlier, the least squares of `BentPair` then start from one initial guess after
-    another. If a pair still has no motion, both steps are repeated with a coarse tolerance.
+    A pair is one cell on each of the two boxes around the arm. Motions with all joints in
+    proportion are tried first. For pairs without a motion, or whose ball might enter earlier, the
+    least squares of `BentPair` then start from one initial guess after another. If a pair still has
+    no motion, both steps are repeated with a coarse tolerance.
 
     Args:
         setting: arm, limits and scene, with NumPy leaves.
@@ -345,8 +347,6 @@ def _bar(total: int, unit: str, progress: bool) -> tqdm:
 
 
 class _Parts:
-    """The files of a library during its build; each has the motions for some pairs of cells."""
-
     def __init__(self, folder: Path, setting: Setting, homes: np.ndarray, layout: Layout):
         self._folder = folder
         header = {

@@ -86,7 +86,7 @@ def build_library(
 
 
 def show_library(path: str, *, map: str | None = None) -> None:
-    """Print the share of cell pairs that have a motion; draw it, too, if `map` is a path."""
+    """Print the share of pairs of cells on two boxes with a motion; draw it if `map` is a path."""
     library = load_library(path)
     covered = coverage(library)
     _print(path, library, covered)
@@ -118,7 +118,7 @@ def check_library(path: str, *, num: int = 2000, seed: int = 0) -> None:
 def repair_library(path: str, *, pole: Sequence[float], out: str, retry: bool = False) -> None:
     """Plan the motions again that touch a pole at a new position (x, y) [m]; write the file `out`.
 
-    With `retry`, pairs of cells without a motion are planned again, too.
+    With `retry`, motions are also planned where the library has none.
     """
     library = load_library(path)
     require(len(pole) == 2, "pole", "two numbers [m]", shown=f"{len(pole)} numbers")
@@ -138,7 +138,6 @@ def repair_library(path: str, *, pole: Sequence[float], out: str, retry: bool = 
 
 
 def _print(path: str, library: Library, covered: Coverage) -> None:
-    """Print a library's cells, size, joint limits, pole, and share of cell pairs with a motion."""
     table, setting = library.table, library.setting
     faces = [
         " ".join(f"{face.name} {face.cells[0]}x{face.cells[1]}" for face in side)

@@ -24,13 +24,14 @@ from planner_jax.referee.block import BlockVerdict, referee_blocks
 from planner_jax.task.block.case import ANYWHERE, BlockCase
 
 _SPEEDS = (7.0, 10.0)  # [m/s], range of random balls' mean speed from outer to inner box
-# [s], time between the end of the stored motion and the entry of a random ball into the outer box.
+# [s], time from the end of the stored motion to a random ball's entry into the outer box around the
+# arm.
 _SPARE = 2e-3
 
 
 @dataclasses.dataclass(frozen=True)
 class Coverage:
-    """Which motions a library has, from H start poses, for P pairs of cells that a ball passes."""
+    """Which motions a library has, from H start poses, for P pairs of cells on two boxes."""
 
     is_feasible: np.ndarray  # (P,) bool, whether a ball can pass through both cells
     is_centred: np.ndarray  # (P,) bool, whether a ball can pass from the outer cell's centre
@@ -44,7 +45,7 @@ class Coverage:
 
 
 def coverage(library: Library) -> Coverage:
-    """Compute which pairs of cells have motions, and which motions block all balls through both."""
+    """Compute for which pairs of cells on two boxes a motion blocks some, or all, balls."""
     scene, found = library.setting.scene, library.found
     tunnel = tunnels(library.table.layout, scene.inner, scene.outer)
     row = unpack_rows(np.asarray(library.table.rows))
@@ -73,7 +74,7 @@ def _farthest(outer: Array, inner: Array, row: Row) -> Array:
 
 @dataclasses.dataclass(frozen=True)
 class Check:
-    """B random balls through cells with a stored motion, and the referee's verdict."""
+    """B random balls through pairs of cells with a stored motion, and the referee's verdict."""
 
     cases: BlockCase
     pairs: np.ndarray  # (B,) int, index of the pair of cells that each ball passes
@@ -84,8 +85,8 @@ class Check:
 def check(library: Library, num: int, seed: int = 0, home: int = 0) -> Check:
     """Let the referee judge whether stored motions block random balls.
 
-    Each ball passes a random pair of cells with a stored motion, and leaves just enough time for
-    this motion.
+    Each ball passes a random pair of cells, on two boxes, with a stored motion, and leaves just
+    enough time for this motion.
 
     Args:
         library: the library, with NumPy leaves.

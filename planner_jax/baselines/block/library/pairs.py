@@ -49,14 +49,14 @@ _ROLL = np.deg2rad(1.0)
 # [s] Penalty of end poses that collide. It is added to a time in seconds by which end poses are
 # sorted, so that these poses are tried last.
 _TOUCHING = 10.0
-# Least distances of a shield from the two cells that the ball passes, as fractions of the distance
-# between these cells, for the tolerances FINE and COARSE.
+# Least distances of a shield from the two cells (on two boxes) that the ball passes, as fractions
+# of the distance between these cells, for the tolerances FINE and COARSE.
 _NEAREST = (0.1, 0.02)
 
 
 @struct.dataclass
 class PairCase:
-    """Two cells that a ball passes, to plan a motion for, and an initial guess of the motion."""
+    """Two cells, on two boxes, that a ball passes, and an initial guess of a motion to block it."""
 
     outer: Array  # (2, 3) [m], corners of the outer cell's part in front of the inner cell
     inner: Array  # (2, 3) [m], corners of the inner cell
@@ -76,7 +76,7 @@ class PairCase:
 class PairPlan(Plan):
     """A motion that blocks a ball; its cost is the earliest time [s] at which the ball may enter.
 
-    The time counts from the start of the motion to the ball's entry into the outer box.
+    The time counts from the motion's start to the ball's entry into the outer box around the arm.
     """
 
     # (6 K + 1,): rates of 6 joints at K knots, times the duration [rad]; then the duration [s].
@@ -86,7 +86,7 @@ class PairPlan(Plan):
 
 @struct.dataclass
 class PairPlanner(Planner):
-    """Base class of the two planners whose motions block the balls through a pair of cells.
+    """Base class of the two planners whose motions block balls that pass two cells.
 
     The shield ends with a horizontal edge. Quarter turns of a square shield make no difference; the
     planner selects the one that turns the last joint least from the start pose `home`.

@@ -55,7 +55,7 @@ def fingerprint(setting: Setting) -> str:
 
 @struct.dataclass
 class Table:
-    """The stored motions from H start poses, for P pairs of cells that a ball passes."""
+    """The stored motions from H start poses, for P pairs of cells on two boxes."""
 
     rows: Array | np.ndarray  # (H, P, 6 K + 10) float32, fields of `Row` for motions of K pieces
     homes: Array | np.ndarray  # (H, 6) [rad], joint angles at which the motions start
@@ -184,7 +184,7 @@ class Library:
 
     @property
     def found(self) -> np.ndarray:
-        """Which of P pairs of cells have a stored motion from H start poses, (H, P) bool."""
+        """For which of P pairs of cells on two boxes H poses have a motion, (H, P) bool."""
         return np.isfinite(np.asarray(unpack_rows(self.table.rows).duration))
 
     @property
