@@ -88,7 +88,7 @@ def _cell_of(angles: np.ndarray) -> tuple[int, ...]:
 
 @dataclasses.dataclass(frozen=True)
 class EpaseBlock(PathThenTime):
-    """The planner `epase`: weighted A* to end poses, one by one; needs the extra `arm-peers`."""
+    """The planner `epase`: weighted A* to end poses, one by one; it needs the extra `arm-peers`."""
 
     # [s], longest search for one end pose. Few searches that take longer succeed.
     longest: float = 0.05

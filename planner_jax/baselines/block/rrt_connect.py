@@ -32,7 +32,7 @@ def _ompl() -> tuple[ModuleType, ModuleType]:
 
 @dataclasses.dataclass(frozen=True)
 class RrtConnectBlock(PathThenTime):
-    """The planner `rrt-connect`: RRT-Connect to end poses, one by one; extra `arm-peers`."""
+    """The planner `rrt-connect`: RRT-Connect to end poses; it needs the extra `arm-peers`."""
 
     packages: ClassVar[tuple[str, ...]] = ("toppra", "ompl")
     reach: float = 1.0  # [rad], greatest length of a tree's edge in joint space

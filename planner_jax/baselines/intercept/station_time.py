@@ -82,7 +82,7 @@ class ReferenceLine:
 def reference_line(
     problem: StationTimeProblem, grid: StationTimeGrid = StationTimeGrid()
 ) -> ReferenceLine:
-    """Return the line of least acceleration between the blocked polygons [Qu2022, eq. 17].
+    """Return the line of least acceleration that enters no blocked polygon [Qu2022, eq. 17].
 
     A state of the search is a path length (station) at a time, together with the edge that leads to
     this station, so that the squared change of speed between two edges is a cost. An edge that

@@ -263,7 +263,6 @@ class OnlineBlock(Planner):
                 some = jax.tree.map(lambda leaf: leaf[lanes], searches)
                 later = refine(some, jnp.where(is_trial, solver.trial, solver.max_steps))
                 searches = jax.tree.map(lambda old, new: old.at[lanes].set(new), searches, later)
-                # Copy the searches that the last turn refines to the first `_WIDTH` entries.
                 moved = jax.tree.map(lambda old, new: old.at[:_WIDTH].set(new), searches, later)
                 return jax.tree.map(lambda a, b: jnp.where(is_trial, a, b), searches, moved)
 

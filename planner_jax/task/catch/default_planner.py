@@ -164,7 +164,7 @@ class ExactCatch(ChainPlanner[CatchCase, CatchPlan]):
         return jax.vmap(lambda guess: self._guess(context, guess))(rows)
 
     def load_attempt(self, attempt: Round, cases: CatchCase) -> PyTree:
-        """Return a round (attempt), with the iterations that the cases need, as a pytree."""
+        """Return an attempt as a pytree, with the number of iterations that the cases need."""
         return super().load_attempt(self._for_start(attempt, cases), cases)
 
     def starts_long(self, cases: CatchCase) -> bool:

@@ -140,8 +140,8 @@ class MotionProblem:
 
         speed = interpolate(pace * path.level.astype(grid.cell.dtype), case.speed, at)
         bins = width * path.bin.astype(grid.cell.dtype)
-        # Headings of the path count from the car's initial heading, up to full turns. In this count
-        # the initial heading is `straight`, the multiple of 2 pi nearest to the first heading.
+        # Headings of the path are relative to the car's initial heading, but may include full
+        # turns: `straight` is the sum [rad] of the full turns in the first heading.
         straight = jnp.round(bins[0] / (2.0 * np.pi)) * 2.0 * np.pi
         after, before = (interpolate(bins, straight, at + half) for half in (0.5, -0.5))
         rate = (after - before) / grid.step

@@ -112,7 +112,7 @@ class ReplanIntercept(Planner[Replanning, InterceptPlan]):
         return Replanning(case=remainder, previous=previous, elapsed=elapsed)
 
     def load_attempt(self, attempt: Search | Warm, tasks: Replanning) -> PyTree:
-        """Return an attempt as arguments of a compiled program; each type has its own."""
+        """Return an attempt as arguments of the compiled program for attempts of its type."""
         if isinstance(attempt, Search):
             return self.planner.load_attempt(attempt, tasks.case)
         return super().load_attempt(attempt, tasks)
