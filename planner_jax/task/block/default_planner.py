@@ -176,11 +176,11 @@ class OnlineBlock(Planner):
         return place_numbers(StraightSearch(**vars(attempt)) if is_small else attempt)
 
     def solve(self, case: BlockCase, attempt: Search) -> BlockPlan:
-        """Return the plan of one case: a straight motion, else least squares from the starts.
+        """Return the plan of one case: a straight motion, else least squares from starting points.
 
         Each turn of one loop checks a straight motion, or makes the solver's trial steps from a
-        start, or refines a start to its end. Starts with trial steps are refined in order of their
-        cost after these steps.
+        starting point, or refines a starting point to its end, in order of the cost after the trial
+        steps.
         """
         flight, poses, order = self._rank(case)
         straight = self._count_straight(flight, poses, attempt)

@@ -39,7 +39,7 @@ def step_weights(pieces: int, shares: tuple[float, ...]) -> tuple[np.ndarray, np
 
     Returns:
         first: (N,), weights of the initial rate multiplied by the duration.
-        steps: (N, K), weights of the steps.
+        steps: (N, K), weights of the rates after the K pieces, multiplied by the duration.
     """
     position = np.asarray(shares)[:, None] * pieces
     knots = np.arange(pieces + 1)

@@ -172,7 +172,6 @@ class ExactCatch(ChainPlanner[CatchCase, CatchPlan]):
         return self.rounds == _ROUNDS and cases.num_targets > _FEW and not cases.optional
 
     def _for_start(self, attempt: Round, case: CatchCase) -> Round:
-        """Return a round (attempt) with the number of iterations that its starting point needs."""
         if self.starts_long(case) and attempt in _ROUNDS[:2]:
             steps = _STEPS_A_TARGET * case.num_targets if attempt == _FIRST else _OF_MANY.max_steps
             return Round(starts=1, solver=dataclasses.replace(_OF_MANY, max_steps=steps))

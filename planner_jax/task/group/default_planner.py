@@ -88,7 +88,6 @@ class GroupIntercept(Planner):
 
 
 def _is_open(status: Array) -> Array:
-    """Return which drives with these statuses are unsolved and planned again, by `patient`."""
     return is_unsolved(status) | (status == Status.NO_PATH)
 
 

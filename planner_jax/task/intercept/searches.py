@@ -128,7 +128,7 @@ _NARROW = tuple(
 BEST = (dataclasses.replace(_GIVEN[0], paths=8, settling=48), *_GIVEN[1:], *_NARROW)
 # First search if the meeting shall be as early as possible: least squares run from every path until
 # the cost falls by less than 0.05 % a step, and the best plan is selected. There is no first stage
-# (`following`), because following a path of cells delays the meeting.
+# (`following`), because following a path of grid cells delays the meeting.
 _EARLY = Search(
     32,
     LevenbergConfig(60, tolerance=5e-4),

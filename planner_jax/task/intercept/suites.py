@@ -183,7 +183,7 @@ def target_to(meeting: np.ndarray, time: float, turning: np.ndarray, uniform: np
 
 
 def _shorten_time(suite: Suite, draws: Draws) -> Draws:
-    """Move the meetings to `suite.spare` [s] after the cars' estimated earliest arrivals."""
+    """Set each meeting `suite.spare` [s] after the car's estimated earliest arrival."""
     with jax.enable_x64(True):
         cases = jax.tree.map(np.asarray, cases_of(draws, jnp.float64))
         num = len(draws["time"])
