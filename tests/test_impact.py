@@ -21,43 +21,27 @@ required = jax.jit(solve_impact)
 
 
 def split(vel):
-    """Return the speed along the normal and the velocity across it."""
     along = vel @ NORMAL
     return along, vel - along * NORMAL
 
 
 @float64
-def test_a_still_racket_sends_a_ball_back_at_the_restitution_times_its_normal_speed():
-    """A ball that falls on a level racket at 2 m/s leaves it at 1.4 m/s."""
-    after = bounce(np.array([3.0, 0.0, -2.0]), STILL, np.array([0.0, 0.0, 1.0]), RESTITUTION)
-    np.testing.assert_allclose(after, [3.0, 0.0, 1.4], rtol=1e-15)
-    before, after = split(BALL_VEL), split(bounce(BALL_VEL, STILL, NORMAL, RESTITUTION))
-    np.testing.assert_allclose(after[0], -RESTITUTION * before[0], rtol=1e-14)
+@pytest.mark.parametrize("restitution", [0.0, 0.7, 1.0])
+def test_a_still_racket_sends_a_ball_back_at_the_restitution_times_its_normal_speed(restitution):
+    after = bounce(np.array([3.0, 0.0, -2.0]), STILL, np.array([0.0, 0.0, 1.0]), restitution)
+    np.testing.assert_allclose(after, [3.0, 0.0, 2.0 * restitution], atol=1e-15)
+    before, after = split(BALL_VEL), split(bounce(BALL_VEL, STILL, NORMAL, restitution))
+    np.testing.assert_allclose(after[0], -restitution * before[0], atol=1e-14)
     np.testing.assert_allclose(after[1], before[1], atol=1e-14)
 
 
 @float64
-def test_a_bounce_looks_the_same_from_a_moving_frame():
+def test_a_bounce_looks_the_same_from_a_moving_frame_and_with_the_normal_reversed():
     after = bounce(BALL_VEL, STILL, NORMAL, RESTITUTION) + RACKET_VEL
     moving = bounce(BALL_VEL + RACKET_VEL, RACKET_VEL, NORMAL, RESTITUTION)
     np.testing.assert_allclose(moving, after, atol=1e-14)
-
-
-@float64
-def test_only_the_normal_speed_of_the_racket_counts_and_not_which_side_is_the_front():
-    after = bounce(BALL_VEL, RACKET_VEL, NORMAL, RESTITUTION)
-    across = np.cross(NORMAL, [0.3, -4.0, 1.0])
-    sliding = bounce(BALL_VEL, RACKET_VEL + across, NORMAL, RESTITUTION)
-    np.testing.assert_allclose(sliding, after, atol=1e-14)
-    np.testing.assert_array_equal(bounce(BALL_VEL, RACKET_VEL, -NORMAL, RESTITUTION), after)
-
-
-@float64
-def test_an_elastic_bounce_keeps_the_energy_and_a_plastic_one_leaves_ball_and_racket_together():
-    elastic = bounce(BALL_VEL, STILL, NORMAL, 1.0)
-    np.testing.assert_allclose(np.linalg.norm(elastic), np.linalg.norm(BALL_VEL), rtol=1e-14)
-    plastic = bounce(BALL_VEL, RACKET_VEL, NORMAL, 0.0)
-    np.testing.assert_allclose(split(plastic)[0], split(RACKET_VEL)[0], rtol=1e-14)
+    turned = bounce(BALL_VEL + RACKET_VEL, RACKET_VEL, -NORMAL, RESTITUTION)
+    np.testing.assert_array_equal(turned, moving)
 
 
 @float64
@@ -73,17 +57,7 @@ def test_the_solved_impact_inverts_the_bounce(restitution):
 
 
 @float64
-def test_the_bounce_determines_normal_and_normal_speed():
-    after = bounce(BALL_VEL, RACKET_VEL, NORMAL, RESTITUTION)
-    normal, normal_speed = required(BALL_VEL, after, RESTITUTION)
-    np.testing.assert_allclose(normal, NORMAL, atol=1e-14)
-    np.testing.assert_allclose(normal_speed, RACKET_VEL @ NORMAL, rtol=1e-13)
-
-
-@float64
 def test_impact_gradients_match_finite_differences():
-    """With respect to both velocities, the normal and the restitution, both ways."""
-
     def everything(args):
         ball_vel, racket_vel, normal, restitution = args
         after = racket_impact(ball_vel, racket_vel, normal, restitution)
@@ -110,11 +84,10 @@ def test_batch_equals_loop_in_float32():
     after_hit = np.array([[4.0, 1.5, 6.0], [0.0, 0.0, 1.4], [3.0, -3.0, 7.0]], np.float32)
     restitutions = np.array([0.7, 0.5, 0.9], np.float32)
     many = jax.jit(jax.vmap(solve_impact))(balls, after_hit, restitutions)
-    normals, speeds = map(np.asarray, many)
-    assert normals.dtype == speeds.dtype == np.float32
     for k in range(3):
-        normal, speed = required(balls[k], after_hit[k], restitutions[k])
-        np.testing.assert_allclose(normals[k], normal, atol=1e-6)
-        np.testing.assert_allclose(speeds[k], speed, rtol=1e-6)
-        after = bounce(balls[k], speed * normal, normal, restitutions[k])
+        one = required(balls[k], after_hit[k], restitutions[k])
+        for ours, theirs in zip(many, one, strict=True):
+            assert ours.dtype == np.float32
+            np.testing.assert_allclose(ours[k], theirs, rtol=1e-6, atol=1e-6)
+        after = bounce(balls[k], one[1] * one[0], one[0], restitutions[k])
         np.testing.assert_allclose(after, after_hit[k], atol=5e-6)

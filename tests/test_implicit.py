@@ -74,20 +74,14 @@ def test_only_an_active_limit_has_a_price(study):
     assert active < 0.0 and inactive == 0.0
 
 
-def test_newton_finds_the_minimum_of_a_curved_valley(float64):
-    def rosenbrock(x):
+def test_newton_finds_the_minimum_of_a_curved_valley_and_stands_still_at_a_minimum(float64):
+    def objective(x):
         cost = 100.0 * (x[1] - x[0] ** 2) ** 2 + (1.0 - x[0]) ** 2
         return Evaluation(cost=cost, violation=-jnp.ones(()))
 
-    point, slope = newton_refine(
-        rosenbrock, jnp.array([0.7, 0.5]), max_steps=60, stationarity=1e-12
-    )
+    refine = jax.jit(lambda x: newton_refine(objective, x, max_steps=60, stationarity=1e-12))
+    point, slope = refine(np.array([0.7, 0.5]))
     np.testing.assert_allclose(point, 1.0, rtol=1e-9)
     assert slope <= 1e-12
-
-
-def test_newton_stands_still_at_a_minimum(float64):
-    bowl = lambda x: Evaluation(jnp.sum(x**4), -jnp.ones(()))  # noqa: E731
-    point, slope = newton_refine(bowl, jnp.zeros(3), max_steps=5, stationarity=1e-12)
-    assert jnp.all(point == 0.0)
-    assert slope == 0.0
+    point, slope = refine(np.ones(2))
+    assert (point == 1.0).all() and slope == 0.0

@@ -43,12 +43,10 @@ def duration(plan):
 
 @functools.cache
 def settle(planner):
-    """Return a compiled function from a case to the unknowns of least cost."""
     return jax.jit(lambda case: planner.guesses(planner.prepare(case), 1)[0])
 
 
 def move_to_optimum(smooth, case):
-    """Return the case with the unknowns of least cost as its starting point."""
     return dataclasses.replace(case, start_point=settle(smooth)(case))
 
 
@@ -60,7 +58,6 @@ def optimum_near_straight(planner, case):
 
 @functools.cache
 def differentiate(planner, quantity, by, steps):
-    """Return a compiled function from a case at its optimum to a gradient."""
     options = {"steps": steps, "curvature": "whole"}
     return jax.jit(
         lambda case: gradient_at(planner, case, case.start_point, quantity, by, **options)
@@ -77,7 +74,6 @@ def move(case, name, by):
 @pytest.mark.slow
 @pytest.mark.parametrize(("meet", "binding"), [("early", "movers"), ("given", "walls")])
 def test_gradients_match_differences_of_new_plans(meet, binding, float64):
-    """A changed case is planned again from the plan that is differentiated."""
     planner = pj.intercept.planner(meet=meet, **SMALL)
     smooth, case = optimum_near_straight(planner, crossing(jnp.float64))
     quantity = duration if meet == "early" else "cost"
@@ -112,7 +108,6 @@ def test_the_gradient_by_a_distant_obstacle_is_zero(float64):
 
 @pytest.mark.slow
 def test_a_batch_has_gradients_of_its_plans():
-    """Drawn cases in float32: a greater acceleration makes the meeting earlier."""
     planner = pj.intercept.planner(meet="early", **SMALL)
     cases = pj.intercept.draw(8, "easy", 0)
     found = pj.gradient(planner, cases, of="time", by=["limits.acceleration", "movers.centre"])

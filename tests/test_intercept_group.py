@@ -39,14 +39,12 @@ def numpy(tree):
 
 
 def draw(num, seed, count):
-    """Draw groups with `count` targets each."""
     groups = numpy(pj.group.draw(num, seed=seed))
     present = np.broadcast_to(np.arange(4) < count, (num, 4))
     return dataclasses.replace(groups, present=present)
 
 
 def line(*xs, present=True, **settings):
-    """Make a group of targets at rest on a line ahead of the car."""
     pos = jnp.array([[x, 4.0] for x in xs])
     path = pj.TurningPath(pos, jnp.zeros_like(pos), jnp.zeros(len(xs)))
     return pj.group.case(path, present=present, **settings)
@@ -192,7 +190,6 @@ def test_one_target_is_planned_as_an_interception(planned):
 
 
 def change_legs(plans, **changes):
-    """Replace leaves of the legs of plans."""
     return dataclasses.replace(plans, legs=dataclasses.replace(plans.legs, **changes))
 
 

@@ -21,7 +21,6 @@ both = pytest.mark.parametrize("rules", [MINIMAL, STRICT], ids=["minimal", "stri
 
 @pytest.fixture(scope="module")
 def drawn():
-    """Draw three cases with many movers."""
     return scenes(pj.intercept.draw(3, "storm", 4))
 
 
@@ -63,7 +62,6 @@ def distance(scene, points, times):
 @both
 @pytest.mark.parametrize("away", [0.1, 0.45])
 def test_on_an_open_map_a_chase_takes_the_time_of_its_closed_form(rules, away):
-    """The target flees straight ahead, and the car approaches at the difference of speeds."""
     ahead, times = 1.0, np.linspace(0.0, 6.0, 60001)
     rising = np.minimum(times, (TOP - SPEED) / ACCELERATION)
     driven = SPEED * rising + 0.5 * ACCELERATION * rising**2 + TOP * (times - rising)
@@ -76,7 +74,6 @@ def test_on_an_open_map_a_chase_takes_the_time_of_its_closed_form(rules, away):
 
 @both
 def test_a_drive_to_the_side_is_no_shorter_than_an_arc_and_a_tangent(rules):
-    """At top speed the lateral acceleration bounds the curvature; braking takes as long."""
     found = Lattice(scene((START[0] + MIDDLE, START[1] + 2.0)), rules).reach()
     straight = earliest_bound(scene((START[0] + MIDDLE, START[1] + 2.0)))[1]
     quarter = 0.5 * np.pi / np.sqrt(0.8 * 2.0)  # [s], at the greatest yaw rate there is
@@ -111,7 +108,6 @@ def test_no_body_passes_a_narrow_gap_and_only_the_inner_disc_passes_a_tight_gap(
 
 
 def test_a_target_that_is_near_too_early_is_not_met_at_the_end():
-    """The target can be met on its path, but is out of reach when the case ends."""
     passing = scene((1.8, 4.0), (1.6, 0.0), time=3.5)
     for rules in (MINIMAL, STRICT):
         assert not Lattice(passing, rules).reach().at_end
@@ -122,7 +118,6 @@ def test_a_target_that_is_near_too_early_is_not_met_at_the_end():
 
 @both
 def test_free_cells_are_free_by_the_referee(drawn, rules):
-    """Compare discs with exact distances for random cells, headings and times."""
     random, one = np.random.default_rng(0), drawn[0]
     lattice = Lattice(one, rules)
     half = random.integers(0, 2 * lattice.layers + 1, 300)

@@ -35,7 +35,6 @@ def numpy(tree):
 
 @pytest.fixture(scope="module")
 def batches():
-    """Draw a batch of every suite, in double precision."""
     with jax.enable_x64(True):
         batches = {name: draw_with_counts(name, NUM, SEED, dtype=jnp.float64) for name in SUITES}
         return {name: replace(each, cases=numpy(each.cases)) for name, each in batches.items()}
@@ -255,7 +254,6 @@ def mover(x, y, velocity):
 
 
 def causes_of(draws):
-    """Return the names of the first causes of rejection of draws, "" if none applies."""
     stacked = {k: np.concatenate([each[k] for each in draws]) for k in draws[0]}
     return [(*CAUSES, "")[index] for index in first_cause(SUITES["hard"], stacked)]
 
@@ -309,20 +307,13 @@ def test_observations_are_positions_of_the_target_with_noise():
 
 
 @pytest.mark.parametrize(
-    ("call", "message"),
+    ("options", "message"),
     [
-        (lambda: draw(3, "storms"), "suite must be one of easy, medium, .*, rush, got 'storms'"),
-        (lambda: draw(0, "easy"), "num must be >= 1, got 0"),
-        (lambda: draw(3, "easy", -1), "seed must be >= 0, got -1"),
-        (lambda: draw(3, "easy", first=-1), "first must be >= 0, got -1"),
-        (lambda: observe(draw(1), 0, count=0), "count must be >= 1, got 0"),
-        (lambda: observe(draw(1), 0, noise=-0.1), "noise must be >= 0, got -0.1"),
-        (lambda: observe(draw(1), 0, interval=0.0), "interval must be > 0, got 0"),
-        (lambda: observe(draw(1), 0, first=-2), "first must be >= 0, got -2"),
-        (lambda: observe(draw(1), 0, until=-1.0), "until must be >= 0, got -1"),
+        ({"count": 0}, "count must be >= 1, got 0"),
+        ({"interval": 0.0}, "interval must be > 0, got 0"),
+        ({"until": -1.0}, "until must be >= 0, got -1"),
     ],
 )
-def test_bad_arguments_are_named_in_one_line(call, message):
-    with pytest.raises(ValueError, match=message) as caught:
-        call()
-    assert "\n" not in str(caught.value)
+def test_bad_arguments_of_observations_are_named_in_one_line(options, message):
+    with pytest.raises(ValueError, match=f"^{message}$"):
+        observe(draw(1), 0, **options)

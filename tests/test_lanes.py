@@ -51,7 +51,6 @@ FUNCTIONS = {
 
 
 def lanes():
-    """Return the arguments of the functions."""
     random = np.random.default_rng(1)
     x = jnp.asarray(random.standard_normal((4, 3, LANES)))
     return x, jnp.asarray(random.integers(-1, 5, LANES))
@@ -59,7 +58,6 @@ def lanes():
 
 @functools.cache
 def by_vmap(name):
-    """Return the result of a function by `jax.vmap`, in float64."""
     return jax.jit(jax.vmap(FUNCTIONS[name], in_axes=-1, out_axes=-1))(*lanes())
 
 
@@ -73,7 +71,6 @@ def test_it_equals_vmap_with_the_lanes_last(name, float64):
 
 
 def test_a_shared_matrix_makes_one_product_and_no_gather():
-    """This is the purpose of the layout: the lanes are columns of one large product."""
     function = over_lanes(lambda x: jnp.sum((MATRIX @ x) ** 2))
     jaxpr = jax.make_jaxpr(function)(jnp.ones((4, 3, LANES)))
     (product,) = [eqn for eqn in jaxpr.eqns if eqn.primitive.name == "dot_general"]
@@ -91,7 +88,6 @@ def test_lanes_do_not_mix():
 
 
 def test_a_program_for_several_devices_calls_the_kernel_and_gives_the_results_of_one(monkeypatch):
-    """There `jnp.where` also marks arrays as local to a device."""
     calls = []
 
     def chosen(x, y):

@@ -10,8 +10,6 @@ from planner_jax.optimise.levenberg import LevenbergConfig, Model, least_squares
 
 
 def of_residuals(residuals, violation=lambda x: jnp.array(-1.0)):
-    """Return the model of residuals, with the Jacobian by tangents."""
-
     def evaluate(x):
         r, slopes = residuals(x), jax.jacfwd(residuals)(x)
         product = lambda a, b: jnp.matmul(a, b, precision="highest")  # noqa: E731

@@ -30,7 +30,6 @@ every_size = pytest.mark.parametrize(
 
 
 def durations_of(pieces):
-    """Return unequal durations with the mean `PIECE_DURATION`."""
     shares = 1.0 + 0.7 * np.sin(3.0 * np.arange(pieces))
     return PIECE_DURATION * shares / shares.mean()
 
@@ -41,7 +40,6 @@ def maps_of(order, pieces, velocities=False):
 
 @functools.partial(jax.jit, static_argnums=(0, 1))
 def solve_for(order, pieces, rows, offsets, duration):
-    """Return the trajectory, its samples and its energy."""
     args = maps_of(order, pieces), rows, offsets, duration
     return (
         proportional_trajectory(*args),
@@ -54,7 +52,6 @@ trajectory_of = jax.jit(proportional_trajectory, static_argnums=0)
 
 
 def interpolate(head, tail, waypoints, durations):
-    """Return the trajectory through waypoints."""
     maps = proportional_minco(len(head), tuple(np.asarray(durations, np.float64).tolist()))
     rows = np.asarray(rows_of(head, tail, durations.mean()), head.dtype)
     offsets = (maps.offsets @ np.concatenate([rows, waypoints])).astype(head.dtype)
@@ -71,13 +68,11 @@ def draw_problem(order, pieces, seed=0, dtype=np.float64):
 
 
 def rows_of(head, tail, duration=PIECE_DURATION):
-    """Return the boundary rows in the unit time of a piece."""
     powers = duration ** np.arange(len(head))[:, None]
     return np.concatenate([head * powers, tail * powers])
 
 
 def draw_rows(order, pieces):
-    """Draw boundary rows and offsets."""
     head, tail, offsets, _ = draw_problem(order, pieces, seed=1)
     return rows_of(head, tail), 0.3 * offsets
 
@@ -155,10 +150,6 @@ def energy(coeffs, durations):
 
 @every_size
 def test_the_trajectory_solves_the_dense_quadratic_program_and_its_pieces_join(order, pieces):
-    """Pieces join up to the derivative 2s - 2; the program demands only derivatives below s.
-
-    The energy is a convex form, so the solution of the program has the least energy.
-    """
     head, tail, waypoints, durations = problem = draw_problem(order, pieces)
     trajectory = interpolate(*problem)
     coeffs, expected = np.asarray(trajectory.coeffs), dense_solution(*problem)
@@ -175,30 +166,7 @@ def test_the_trajectory_solves_the_dense_quadratic_program_and_its_pieces_join(o
             np.testing.assert_allclose(end[:-1], waypoints, atol=1e-11)
 
 
-@every_order
-def test_a_polynomial_of_degree_s_minus_1_costs_nothing_and_is_reproduced(order):
-    durations = draw_problem(order, 3)[-1]
-    coeffs = np.random.default_rng(1).normal(size=(order, 3))
-    at = lambda time, d=0: derivative_row(time, d, order) @ coeffs  # noqa: E731
-    times = np.concatenate([[0.0], np.cumsum(durations)])
-    head, tail = (np.array([at(t, d) for d in range(order)]) for t in times[[0, -1]])
-    trajectory = interpolate(head, tail, np.array([at(t) for t in times[1:-1]]), durations)
-    np.testing.assert_allclose(trajectory.coeffs[0, :order], coeffs, atol=1e-9)
-    np.testing.assert_allclose(trajectory.coeffs[:, order:], 0.0, atol=1e-8)
-
-
-@every_order
-def test_stretched_time_divides_the_derivatives_by_its_powers(order):
-    head, tail, waypoints, durations = draw_problem(order, 3)
-    powers = 2.5 ** np.arange(order)[:, None]
-    slow = interpolate(head / powers, tail / powers, waypoints, 2.5 * durations)
-    expected = np.asarray(interpolate(head, tail, waypoints, durations).coeffs)
-    expected = expected / 2.5 ** np.arange(2 * order)[:, None]
-    np.testing.assert_allclose(slow.coeffs, expected, atol=1e-11 * np.abs(expected).max())
-
-
 def test_a_trajectory_in_float32_is_right_to_a_tenth_of_a_millimetre():
-    """Six pieces of 0.3 s to 1.2 s, waypoints a metre apart."""
     single = interpolate(*draw_problem(4, 6, dtype=np.float32))
     assert single.coeffs.dtype == np.float32
     double = interpolate(*(x.astype(np.float64) for x in draw_problem(4, 6, dtype=np.float32)))
@@ -221,16 +189,6 @@ def test_the_gradient_in_boundary_offsets_and_duration_matches_finite_difference
     point = *draw_rows(order, pieces), PIECE_DURATION, 1.0
     function = functools.partial(weigh_energy_and_coefficients, maps_of(order, pieces))
     assert_gradient_matches_differences(function, point, rtol=1e-6)
-
-
-def test_the_energy_gradient_in_a_waypoint_is_twice_the_jump_of_the_derivative_2s_minus_1():
-    """Integrate by parts; the other derivatives at the joint are optimal and do not contribute."""
-    maps, (rows, offsets) = maps_of(4, 4), draw_rows(4, 4)
-    args = maps, rows, offsets, PIECE_DURATION
-    by_offsets = jax.jit(jax.grad(trajectory_energy, argnums=2), static_argnums=0)(*args)
-    start, end = ends(np.asarray(trajectory_of(*args).coeffs), durations_of(4), 7)
-    gradient = maps.offsets[:, 8:].T @ by_offsets
-    np.testing.assert_allclose(gradient, 2.0 * (start[1:] - end[:-1]), rtol=1e-8)
 
 
 def test_boundary_rows_are_derivatives_in_the_mean_time_of_a_piece():
@@ -259,7 +217,6 @@ def test_the_least_energy_is_the_same_in_a_frame_in_uniform_motion_far_away(orde
 
 @every_order
 def test_zero_offsets_have_the_least_energy_over_all_waypoints(order):
-    """The trajectory is then the one polynomial of degree 2s - 1 between the ends."""
     rows, offsets = draw_rows(order, 3)
     smooth, _, least = solve_for(order, 3, rows, np.zeros_like(offsets), PIECE_DURATION)
     powers = PIECE_DURATION ** np.arange(order)[:, None]
@@ -353,7 +310,6 @@ def test_a_batch_of_trajectories_equals_a_loop():
 
 
 def test_samples_and_energy_in_float32_are_right_to_a_millionth():
-    """Relative to the largest value of each kind."""
     single, double = (solve_drawn(4, 5, dtype) for dtype in (np.float32, np.float64))
     for leaf, exact in zip(*(jax.tree.leaves(x[1:]) for x in (single, double)), strict=True):
         assert leaf.dtype == np.float32

@@ -35,7 +35,6 @@ def jerk_cost(axes):
 
 
 def states(axes):
-    """Return position, velocity and acceleration at both ends, (2, 3, 3)."""
     rows = [[axis.deriv(d) if d else axis for axis in axes] for d in range(3)]
     return np.array([[[p(time) for p in row] for row in rows] for time in (0.0, DURATION)])
 
@@ -61,17 +60,7 @@ def test_from_hover_to_hover_it_is_the_classical_quintic():
 
 
 @float64
-def test_coasting_costs_nothing():
-    powers = np.array([1.0, DURATION, DURATION**2 / 2.0])
-    tail = np.array([powers @ HEAD, powers[:2] @ HEAD[1:], HEAD[2]])
-    primitive, cost = solve(HEAD, tail, DURATION)
-    np.testing.assert_allclose(primitive.coeffs[0, 3:], 0.0, atol=1e-11)
-    assert cost < 1e-20
-
-
-@float64
 def test_the_cost_is_the_mean_squared_jerk_and_every_change_raises_it():
-    """Changes keep both states; the first variation of the cost is zero (Pontryagin)."""
     primitive, cost = solve(HEAD, TAIL, DURATION)
     axes = axes_of(primitive.coeffs[0])
     np.testing.assert_allclose(cost, jerk_cost(axes), rtol=1e-12)
@@ -103,13 +92,9 @@ def test_batch_equals_loop_in_float32():
     durations = np.array([0.9, 0.4, 1.7], np.float32)
     primitives, costs = jax.tree.map(np.asarray, jax.jit(jax.vmap(solve))(heads, tails, durations))
     assert primitives.coeffs.dtype == costs.dtype == np.float32
+    _, end = states(axes_of(primitives.coeffs[0, 0]))
+    np.testing.assert_allclose(end[0], TAIL[0], atol=1e-5)
     for k in range(3):
         primitive, cost = solve(heads[k], tails[k], durations[k])
         np.testing.assert_allclose(primitives.coeffs[k], primitive.coeffs, rtol=1e-4, atol=1e-4)
         np.testing.assert_allclose(costs[k], cost, rtol=1e-4)
-
-
-def test_in_float32_the_end_is_met_to_ten_micrometres():
-    primitive, _ = solve(*(np.asarray(x, np.float32) for x in (HEAD, TAIL, DURATION)))
-    _, tail = states(axes_of(primitive.coeffs[0]))
-    np.testing.assert_allclose(tail[0], TAIL[0], atol=1e-5)

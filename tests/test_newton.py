@@ -1,6 +1,7 @@
 """Newton's method in a subspace: closed forms, limit cases, and a batch against its lanes."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +16,7 @@ from planner_jax.optimise.settings import Curvature, Evaluation, NewtonConfig
 CURVED = np.array([[3.0, 1.0, 0.2], [1.0, 2.0, 0.0], [0.2, 0.0, 1.0]])
 SLOPE = np.array([1.0, -2.0, 0.5])
 WHOLE = NewtonConfig(subspace=3, step_cap=100.0)
+search = jax.jit(minimise, static_argnums=(0, 2, 3))
 
 
 def bowl(x):
@@ -27,6 +29,7 @@ def rosenbrock(x, steepness=100.0):
     return Evaluation(cost, jnp.asarray(-1.0, x.dtype))
 
 
+@functools.partial(jax.jit, static_argnames="config")
 def steps_of(matrix, slope, damping, config=WHOLE, kept=None):
     """Return steps and predicted decrease, preconditioned by the part `kept` of the Hessian."""
     matrix = jnp.asarray(matrix, jnp.float32)
@@ -51,7 +54,6 @@ DIAGONAL = np.diag(np.diag(CURVED))
 
 @pytest.mark.parametrize("kept", [None, DIAGONAL], ids=["nothing", "diagonal"])
 def test_a_step_in_the_whole_space_is_newtons(kept):
-    """Damped by the lane's own damping, and by multiples of the preconditioner's curvature."""
     damping, trials = 0.4, (0.0, 0.7)
     config = NewtonConfig(subspace=3, step_cap=100.0, trial_dampings=trials)
     steps, predicted = steps_of(CURVED, SLOPE, damping, config, kept)
@@ -87,7 +89,9 @@ def test_an_indefinite_hessian_is_shifted_by_its_least_eigenvalue():
 def test_a_positive_eigenvalue_of_a_millionth_of_the_greatest_causes_no_shift():
     steep = np.diag([1.0, 0.3, 1e-6])
     config = NewtonConfig(subspace=3, step_cap=1e9, trial_dampings=(0.0,))
-    steps, _ = steps_of(steep, [1.0, -1.0, 1e-4], 1e-9, config, kept=np.diag([0.9, 0.3, 2e-6]))
+    steps, _ = steps_of(
+        steep, np.array([1.0, -1.0, 1e-4]), 1e-9, config, kept=np.diag([0.9, 0.3, 2e-6])
+    )
     np.testing.assert_allclose(steps[0], [-1.0, 1.0 / 0.3, -1e2], rtol=5e-3)
 
 
@@ -105,23 +109,25 @@ def test_a_subspace_that_ends_early_gives_finite_steps(slope):
 
 def test_a_bowl_takes_one_iteration():
     config = NewtonConfig(max_steps=1, subspace=3, damping=1e-7, step_cap=100.0)
-    found = minimise(bowl, jnp.array([4.0, -3.0, 2.0]), config)
+    found = search(bowl, np.float32([4.0, -3.0, 2.0]), config)
     np.testing.assert_allclose(found.point, -np.linalg.solve(CURVED, SLOPE), atol=1e-4)
 
 
 def test_the_products_of_an_objective_are_its_hessians():
-    x = jnp.array([0.3, -0.4, 1.1])
-    evaluation, gradient, products, preconditioner = by_products(rosenbrock)(x)
     cost = lambda x: rosenbrock(x).cost  # noqa: E731
-    np.testing.assert_allclose(evaluation.cost, cost(x))
-    np.testing.assert_allclose(gradient, jax.grad(cost)(x), rtol=1e-6)
-    for unit, row in zip(jnp.eye(3), jax.hessian(cost)(x), strict=True):
-        np.testing.assert_allclose(products()(unit), row, rtol=1e-5, atol=1e-4)
-        np.testing.assert_array_equal(preconditioner(4.0)(unit), unit / 4.0)
+
+    @jax.jit
+    def expand(x):
+        evaluation, gradient, products, preconditioner = by_products(rosenbrock)(x)
+        found = evaluation.cost, gradient, jax.vmap(products())(jnp.eye(3)), preconditioner(4.0)(x)
+        return found, (cost(x), jax.grad(cost)(x), jax.hessian(cost)(x), x / 4.0)
+
+    for found, expected in zip(*expand(np.float32([0.3, -0.4, 1.1])), strict=True):
+        np.testing.assert_allclose(found, expected, rtol=2e-6, atol=1e-6)
 
 
 def test_a_curved_valley_is_followed_to_its_end():
-    found = minimise(rosenbrock, jnp.array([-1.2, 1.0]), NewtonConfig(max_steps=60, subspace=2))
+    found = search(rosenbrock, np.float32([-1.2, 1.0]), NewtonConfig(max_steps=60, subspace=2))
     np.testing.assert_allclose(found.point, 1.0, atol=2e-3)
     assert found.stationary
 
@@ -135,9 +141,10 @@ def test_a_batch_equals_its_lanes_and_stragglers_continue():
         return jax.jit(lambda s, c: minimise_lanes(rosenbrock, s, c, config))(starts.T, steepness)
 
     lanes, config = solve(), NewtonConfig(max_steps=3, subspace=2)
+    alone = jax.jit(lambda start, c: minimise(lambda x: rosenbrock(x, c), start, config).point)
     for k in range(len(starts)):
-        alone = minimise(lambda x, k=k: rosenbrock(x, steepness[k]), starts[k], config)
-        np.testing.assert_allclose(lanes.point[:, k], alone.point, rtol=1e-4, atol=1e-5)
+        one = alone(starts[k], steepness[k])
+        np.testing.assert_allclose(lanes.point[:, k], one, rtol=1e-4, atol=1e-5)
     late = solve((0.5, 40, 1))
     continued = np.asarray(late.iterations) > np.asarray(lanes.iterations)
     assert 1 <= continued.sum() <= 2
@@ -180,13 +187,14 @@ def test_the_search_does_not_end_just_before_a_limit():
     config = NewtonConfig(
         max_steps=60, subspace=0, damping=1e-9, tolerance=1e-3, trusted=1e-9, patience=6
     )
-    start, curved = jnp.zeros(1), by_hessian(cost)
-    found = minimise(of_cost(cost), start, config, curved)
+    start, curved, objective = jnp.zeros(1), by_hessian(cost), of_cost(cost)
+    slope = jax.jit(jax.grad(cost))
+    found = search(objective, start, config, curved)
     assert found.stationary
     assert found.point[0] > 0.02
-    assert abs(float(jax.grad(cost)(found.point)[0])) < 0.1 * abs(float(jax.grad(cost)(start)[0]))
+    assert abs(slope(found.point)[0]) < 0.1 * abs(slope(start)[0])
     # The short steps alone would look like convergence.
-    hasty = minimise(of_cost(cost), start, dataclasses.replace(config, trusted=1e4), curved)
+    hasty = search(objective, start, dataclasses.replace(config, trusted=1e4), curved)
     assert hasty.stationary and hasty.point[0] < 0.02
 
 
@@ -197,7 +205,7 @@ def test_steps_continue_by_the_slope_where_costs_are_equal():
         return 1.0 + 1e-9 * jnp.sum((x - 3.0) ** 2)
 
     def solve(config):
-        return minimise(of_cost(cost), jnp.zeros(2), config, by_hessian(cost))
+        return search(of_cost(cost), jnp.zeros(2), config, by_hessian(cost))
 
     config = NewtonConfig(max_steps=8, subspace=0, damping=1e-13, tolerance=1e-12, step_cap=9.0)
     np.testing.assert_array_equal(solve(config).point, 0.0)

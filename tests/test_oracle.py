@@ -31,7 +31,6 @@ def test_an_easy_serve_is_proven_feasible_by_a_trajectory_that_the_referee_passe
 
 
 def test_a_hopeless_serve_is_infeasible():
-    """At a fifth of the limits no trajectory arrives in time."""
     finding = find_hit(serve(0.2), starting_points(4, 0))
     assert finding.verdict == "infeasible"
     assert finding.least_excess > 0.1

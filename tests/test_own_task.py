@@ -17,7 +17,6 @@ import planner_jax as pj
 from planner_jax.cli.main import main
 from planner_jax.core.registry import all_tasks
 from tests.sweeps import rows_of
-from tests.trees import assert_same
 
 OWN_TASK = Path(__file__).parent / "own_task"
 BROKEN = {
@@ -54,7 +53,6 @@ def process(folder, *arguments, path=()):
 
 
 def command(folder, *arguments, path=()):
-    """Return exit code and output of a command."""
     running = process(folder, *arguments, path=path)
     out, err = running.communicate()
     return SimpleNamespace(code=running.returncode, out=out, err=err)
@@ -66,7 +64,6 @@ def manifest_of(folder):
 
 @pytest.fixture(scope="module")
 def swept(tmp_path_factory):
-    """Return the folder of a sweep and the output of the command."""
     folder = tmp_path_factory.mktemp("own")
     done = command(folder, "sweep", "meet", "--num", "24", "--batch", "16", "--out", "run")
     assert done.code == 0, done.err
@@ -138,7 +135,6 @@ def test_a_sweep_that_ctrl_c_stops_is_resumed_to_the_same_rows(swept, tmp_path):
 
 @pytest.mark.parametrize(("planner", "num"), [("smooth", 16), ("scipy", 2)])
 def test_throughput_is_measured_with_success_and_cost_beside(meet, tmp_path, planner, num):
-    """A planner that minimises nothing has no cost gap."""
     settings = ["--task", "meet", "--planner", planner, "--batch", str(num), "--repeat", "1"]
     assert main(["bench", "throughput", *settings, "--out", str(tmp_path / "run")]) == 0
     manifest = manifest_of(tmp_path / "run")
@@ -173,40 +169,11 @@ def test_a_broken_package_beside_it_is_named_in_one_line_and_the_rest_works(tmp_
         assert words in done.out
 
 
-@pytest.fixture
-def exact(meet, float64):
-    """Return the task's planner with a search to the limits of float64, and six cases."""
+@pytest.mark.slow
+def test_the_gradient_is_that_of_plans_made_anew(meet, float64):
     search = pj.LbfgsConfig(400, tolerance=1e-12, patience=20)
     cases = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), meet.draw(6, seed=1))
-    return meet.planner("smooth", rounds=(pj.Round(1, search),)), cases
-
-
-@pytest.mark.parametrize("name", ["smooth", "scipy"])
-def test_a_lane_that_is_not_finite_says_so_and_leaves_its_neighbours_alone(meet, name):
-    cases, planner = jax.tree.map(np.array, meet.draw(6, seed=1)), meet.planner(name)
-    plans = pj.plan(planner, cases)
-    assert pj.are_solved(plans).all() and meet.judge(cases, plans).success.all()
-    cases.pos[2] = np.nan
-    broken = pj.plan(planner, cases)
-    assert broken.status[2] == pj.Status.NON_FINITE
-    verdict = meet.judge(cases, broken)
-    assert verdict.success.tolist() == [True, True, False, True, True, True]
-    assert verdict.sentence(2) == "not finite: the plan or its case is not finite"
-    assert_same(broken, plans, np.arange(6) != 2)
-
-
-def test_a_batch_has_the_plans_of_its_cases_one_by_one(exact):
-    planner, cases = exact
-    plans = pj.plan(planner, cases)
-    assert len(set(plans.iterations.tolist())) > 1  # unequal lanes
-    for k in range(6):
-        alone = pj.plan(planner, pj.take(cases, k))
-        np.testing.assert_allclose(alone.time, plans.time[k], rtol=1e-8)
-        np.testing.assert_allclose(alone.acc, plans.acc[k], atol=1e-6)
-
-
-def test_the_gradient_is_that_of_plans_made_anew(exact):
-    planner, cases = exact
+    planner = meet.planner("smooth", rounds=(pj.Round(1, search),))
     found = pj.gradient(planner, cases, of="time", by="most", steps=3)
     apart = 1e-4 * cases.most
     later, sooner = (pj.plan(planner, cases.replace(most=cases.most + d)) for d in (apart, -apart))

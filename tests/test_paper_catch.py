@@ -20,12 +20,6 @@ from planner_jax.ball.target import BallPath
 from planner_jax.baselines.catch.paper import PaperCatch
 from planner_jax.planning.plan import plan
 from planner_jax.referee.catch import referee_catches
-from planner_jax.trajectory.polynomial import derivative_factors
-from planner_jax.trajectory.proportional_minco import (
-    proportional_minco,
-    proportional_trajectory,
-    trajectory_energy,
-)
 from tests.derivatives import assert_gradient_matches_differences, value_and_gradient
 
 PLANNER = PaperCatch()
@@ -107,7 +101,6 @@ def test_objective_gradient_agrees_with_finite_differences():
     case = jax.tree.map(lambda leaf: leaf[0], rows("hard", 1)[0])
 
     def cost(shift):
-        """Return the cost at a point next to the guess."""
         context = PLANNER.prepare(case)
         return PLANNER.objective(PLANNER.guesses(context, 1)[0] + shift, context).cost
 
@@ -115,32 +108,6 @@ def test_objective_gradient_agrees_with_finite_differences():
     assert_gradient_matches_differences(cost, shift, step=1e-6, rtol=1e-6)
     # The guess has a miss of zero, where the net's distance is not differentiable.
     assert np.isfinite(value_and_gradient(cost)(np.zeros_like(shift))[1]).all()
-
-
-def test_the_energy_gradient_at_the_catch_matches_the_paper():
-    """Eqs 19b-c, with the fourth derivatives of minimum snap, agree with the closed form.
-
-    The gradients by coefficients and durations are pulled back to the catching state, the waypoints
-    and the duration.
-    """
-    maps = proportional_minco(4, (1.0,) * 4)
-    rng = np.random.default_rng(1)
-    given = rng.normal(size=(8, 3)), rng.normal(size=(3, 3)), np.asarray(0.31)
-    pieces, pull = jax.jit(lambda *x: jax.vjp(lambda *y: proportional_trajectory(maps, *y), *x))(
-        *given
-    )
-    factors, powers = derivative_factors(7, 4)[4:], np.arange(4)
-    snap = factors[:, None] * pieces.coeffs[:, 4:]  # coefficients of the snap, (M, 4, 3)
-    length = np.asarray(pieces.durations)[:, None, None]
-    exponents = powers[:, None] + powers + 1
-    gram = length**exponents / exponents  # integral of beta beta^T
-    by_coeffs = np.zeros(pieces.coeffs.shape)
-    by_coeffs[:, 4:] = 2.0 * factors[:, None] * np.einsum("mkl,mli->mki", gram, snap)
-    at_end = np.einsum("mki,mk->mi", snap, length[:, 0] ** powers)
-    cotangent = pieces.replace(coeffs=jnp.asarray(by_coeffs), durations=(at_end**2).sum(axis=1))
-    slopes = jax.jit(jax.grad(lambda *x: trajectory_energy(maps, *x), argnums=(0, 1, 2)))(*given)
-    for analytic, automatic in zip(pull(cotangent), slopes, strict=True):
-        np.testing.assert_allclose(analytic, automatic, rtol=1e-9, atol=1e-9 * np.abs(slopes[2]))
 
 
 def test_invalid_sizes_are_rejected():

@@ -58,20 +58,12 @@ def test_every_piece_is_evaluated_in_its_own_time(order):
 
 
 @float64
-def test_a_piece_starts_when_the_previous_piece_ends():
+def test_a_piece_starts_when_the_previous_one_ends_and_the_outer_ones_continue():
     for time, piece in ((0.0, 0), (0.4, 1), (1.5, 2)):
         found = values_at(trajectory(), time)[0]
         np.testing.assert_array_equal(found, trajectory().coeffs[piece, 0])
-
-
-@float64
-def test_the_nearest_piece_continues_before_the_start_and_past_the_end():
     np.testing.assert_allclose(values_at(trajectory(), -0.5)[0], exact(0, -0.5), rtol=1e-12)
     np.testing.assert_allclose(values_at(trajectory(), 3.0)[0], exact(2, 1.5), rtol=1e-12)
-
-
-@float64
-def test_derivatives_above_the_degree_are_zero():
     assert not np.any(values_at(trajectory(), 0.3)[DEGREE + 1])
     assert energies_of(trajectory())[DEGREE + 1] == 0.0
 
@@ -94,7 +86,6 @@ def test_the_durations_add_up_in_one_trajectory_and_in_many():
 @float64
 @pytest.mark.parametrize("order", range(5))
 def test_the_energy_is_the_quadrature_of_the_squared_derivative(order):
-    """Six nodes integrate the squares exactly: their degree is ten."""
     nodes, weights = np.polynomial.legendre.leggauss(6)
     energy = 0.0
     for piece, duration in enumerate(DURATIONS):
@@ -105,8 +96,6 @@ def test_the_energy_is_the_quadrature_of_the_squared_derivative(order):
 
 @float64
 def test_the_gradients_match_finite_differences():
-    """Differentiate an energy plus a value by coefficients and durations."""
-
     def total(trajectory):
         value = evaluate(trajectory, 1.8, 1)
         return snap_energy(trajectory, 3) + jnp.sum(value * jnp.arange(1.0, 4.0))

@@ -121,21 +121,8 @@ def test_value_and_slope_are_continuous_across_every_node(node):
 
 
 @float64
-@pytest.mark.parametrize("position", [-1.0, 0.3, 1.0, 4.3, 5.0, 9.0, 9.9, 11.0])
-def test_the_slope_is_the_finite_difference_to_either_side(position):
-    table, step = path(), 1e-6
-    time = position * RESOLUTION
-    state, rate = target_and_rate(table, time)
-    for side in (-step, step):
-        ahead, _ = target_and_rate(table, time + side)
-        difference = jax.tree.map(lambda a, b, side=side: (a - b) / side, ahead, state)
-        assert_close(rate, difference, atol=1e-4)
-
-
-@float64
 @pytest.mark.parametrize(("end", "outwards"), [(0.0, -1.0), (HORIZON, 1.0)])
 def test_at_both_ends_the_value_is_continuous_and_the_target_keeps_its_velocity(end, outwards):
-    """Check also the slope of the position, up to an interpolation error of order two."""
     table = path()
     inside, at, outside = (target_and_rate(table, end + outwards * e) for e in (-1e-9, 0.0, 1e-9))
     assert_close(inside[0], at[0], atol=1e-7)
@@ -144,19 +131,6 @@ def test_at_both_ends_the_value_is_continuous_and_the_target_keeps_its_velocity(
         np.testing.assert_allclose(rate.pos, outside[1].pos, atol=0.05)
     np.testing.assert_array_equal(outside[1].pos, outside[0].vel)
     np.testing.assert_array_equal(outside[1].vel, 0.0)
-
-
-@float64
-def test_the_jump_of_slope_at_the_ends_falls_with_order_two():
-    resolutions = np.array([0.02, 0.01, 0.005])
-    for node, outwards in ((0.0, -1.0), (10.0, 1.0)):
-        jumps = []
-        for resolution in resolutions:
-            end = node * resolution
-            table = table_of(lambda t, end=end: swing(t - end), resolution)
-            inside, outside = (target_and_rate(table, end + outwards * e)[1] for e in (-1e-9, 1e-9))
-            jumps.append(np.linalg.norm(inside.pos - outside.pos))
-        assert float(observed_order(resolutions, jumps)) == pytest.approx(2.0, abs=0.1)
 
 
 @float64
@@ -225,7 +199,6 @@ def test_the_kernel_gives_the_same_table():
 
 @pytest.mark.slow
 def test_the_kernel_gives_the_same_derivatives_of_the_table():
-    """Check derivatives by velocity and drag, in that order, of moving balls."""
     args, nodes, moving = kernel_arguments(), 6, (1, 3)
     args[1] = args[1].at[:, 3].set(1.0)
     found = table_kernel(nodes, moving, interpret=True)(None, args)

@@ -77,7 +77,6 @@ def test_without_bounds_the_solution_needs_no_step():
 
 @float64
 def test_the_least_square_sum_on_a_line_beside_a_bound_and_a_row_that_the_line_decides():
-    """The least of x^2 / 2 + y^2 / 2 for x + y = 1 and x >= 2 has the slope 3 by that bound."""
     template = qp_template(np.eye(2), [[1.0, 1.0]], [[1.0, 0.0], [1.0, 1.0]])
     solve = jax.jit(
         jax.vmap(lambda low: solve_qp(template, jnp.ones(1), low, jnp.full(2, jnp.inf)))

@@ -87,22 +87,11 @@ def test_a_verdict_names_the_failure_its_time_and_its_size(task):
     assert set(verdict.SENTENCES) > {"head state", "not finite"}
 
 
-def test_only_cases_and_plans_of_the_task_are_judged(task):
-    cases, strangers = task.draw(2), pj.task_named(TASKS[1 - TASKS.index(task.name)]).draw(2)
-    plans = pj.plan(CHEAP[task.name](), cases)
-    with pytest.raises(TypeError, match=r"^cases must be a \w+Case, got a \w+Case$"):
-        task.judge(strangers, plans)
-    with pytest.raises(TypeError, match=r"^plans must be a \w+Plan, got a list$"):
-        task.judge(cases, [])
-    with pytest.raises(TypeError, match="samples must be a setting of the referee, got 400"):
-        task.judge(cases, plans, samples=400)
-
-
 @pytest.mark.parametrize(("task_name", "suite"), SUITES)
 def test_a_draw_from_further_on_is_the_tail_of_one_from_the_beginning(task_name, suite):
     draw = pj.task_named(task_name).draw
-    whole = draw(12, suite, 3)
-    for first, num in ((0, 4), (1, 11), (5, 3), (11, 1)):
+    whole = draw(8, suite, 3)
+    for first, num in ((0, 3), (5, 3)):
         assert_same(draw(num, suite, 3, first=first), pj.take(whole, slice(first, first + num)))
 
 
@@ -130,11 +119,6 @@ def test_a_real_scenario_has_its_two_of_the_court_in_equal_shares():
     )
     assert set(served) == {far} and set(aimed) == {near}
     assert (landed == near).sum() == (landed == far).sum() == 100
-
-
-def test_a_draw_cannot_begin_before_its_first_case(task):
-    with pytest.raises(ValueError, match="first must be >= 0, got -1"):
-        task.draw(1, first=-1)
 
 
 def test_weaker_limits_are_drawn_by_their_scale(task):

@@ -30,6 +30,7 @@ from planner_jax.sweep.hit.sweep import HitSweep
 from planner_jax.sweep.quadrotor import recovery_remark
 from planner_jax.sweep.rows import read_plan
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate, total_duration
+from tests.trees import assert_same
 
 NUM = 8
 
@@ -41,7 +42,6 @@ def hits():
 
 @pytest.fixture(scope="module")
 def hit(hits):
-    """Return a hit and its plan, which ends at the contact."""
     return pj.take(hits, 0), pj.take(pj.plan(pj.hit.planner(), hits), 0)
 
 
@@ -84,17 +84,13 @@ def test_the_contact_is_where_it_was_without_a_recovery(hits, braked):
     np.testing.assert_array_equal(braked.trajectory.durations, plain.trajectory.durations)
 
 
-def test_setpoints_continue_to_standstill(braked):
+def test_setpoints_continue_to_standstill_and_a_file_holds_the_recovery(tmp_path, braked):
     plan = pj.take(braked, 0)
-    setpoints = plan.sample(100.0)
-    assert setpoints.time[-1] > plan.stroke.time + 0.2
-    np.testing.assert_allclose(setpoints.vel[-1], 0.0, atol=0.1)
-
-
-def test_a_plan_with_a_recovery_is_saved_and_read(tmp_path, braked):
+    for setpoints in (plan.sample(100.0), sample_plan(plan)):
+        assert setpoints.time[-1] > plan.stroke.time + 0.2
+        np.testing.assert_allclose(setpoints.vel[-1], 0.0, atol=0.1)
     braked.save(tmp_path / "plans.npz")
-    read = pj.hit.HitPlan.load(tmp_path / "plans.npz")
-    jax.tree.map(np.testing.assert_array_equal, read, braked)
+    assert_same(pj.hit.HitPlan.load(tmp_path / "plans.npz"), braked)
 
 
 def test_a_recovery_that_does_not_rest_fails_by_name(hits, braked):
@@ -178,30 +174,13 @@ def test_rows_of_a_sweep_have_the_judged_recovery(swept, braked):
     assert not recovery_remark({}) and not recovery_remark({"recovery": "none"})
 
 
-def test_a_sweep_is_resumed_with_its_recovery_alone(swept):
-    out, _ = swept
-    rule = "^recovery must be brake as in the run that is resumed"
-    task = pj.task_named("hit")
-    assert_refused(rule, run.resume_sweep, task, out, progress=False, recovery="home")
-
-
-def test_the_samples_of_one_plan_include_its_recovery(braked):
-    plan = pj.take(braked, 0)
-    assert sample_plan(plan).time[-1] > plan.stroke.time + 0.2
-
-
-@pytest.mark.parametrize("settings", [HitSettings, CatchSettings])
-def test_settings_refuse_another_recovery_and_leave_none_to_the_planner(settings):
-    rule = "^recovery must be one of none, brake, home, got 'land'"
-    assert_refused(rule, settings, recovery="land")
-    assert "recovery" not in settings().planner_options()
-    assert settings(recovery="home").planner_options()["recovery"] == "home"
-
-
-def test_another_recovery_is_refused_in_one_line():
+def test_another_recovery_is_refused_in_one_line_and_settings_leave_none_to_the_planner():
     rule = "must be one of brake, home, got 'land'$"
     assert_refused(f"^recovery {rule}", pj.hit.planner, "exact", recovery="land")
     assert_refused(f"^to {rule}", RecoveryPlanner, to="land")
+    for settings in (HitSettings, CatchSettings):
+        assert "recovery" not in settings().planner_options()
+        assert settings(recovery="home").planner_options()["recovery"] == "home"
 
 
 export = functools.partial(pj.export, to="csv", out="a.csv")
@@ -228,21 +207,21 @@ def test_a_plan_is_exported_with_its_own_recovery_or_without_one(hit, here):
     assert bare[-1, 0] <= float(np.sum(plan.trajectory.durations))
 
 
-def test_without_its_case_a_plan_is_refused_in_one_line(here):
-    says = "^case must be given, .* or recovery=None to omit it, got neither$"
-    assert_refused(says, export, quadrotor())
-    rule = "^recovery must be one of brake, home, got 'land'$"
-    assert_refused(rule, export, quadrotor(), recovery="land")
-    assert not list(here.iterdir())
-
-
-def test_the_case_of_another_plan_and_a_batch_of_cases_are_refused(hit, here):
+def test_an_export_without_a_fitting_case_or_recovery_is_refused_and_writes_nothing(hit, here):
     case, plan = hit
-    rule = "^case must be the case of a quadrotor, got InterceptCase$"
-    assert_refused(rule, export, plan, case=driving()[0])
-    many = jax.tree.map(lambda leaf: leaf[None], case)
-    rule = r"^case must be one, .* got a batch of shape \(1,\)$"
-    assert_refused(rule, export, plan, case=many)
+    (drive_case, drive), many = driving(), jax.tree.map(lambda leaf: leaf[None], case)
+    for rule, given, options in (
+        ("case must be given, .* or recovery=None to omit it, got neither", plan, {}),
+        ("recovery must be one of brake, home, got 'land'", plan, {"recovery": "land"}),
+        ("case must be the case of a quadrotor, got InterceptCase", plan, {"case": drive_case}),
+        (r"case must be one, .* got a batch of shape \(1,\)", plan, {"case": many}),
+        (
+            "recovery must be brake, as only quadrotors go home, got .*",
+            *(drive, {"case": drive_case, "recovery": "home"}),
+        ),
+    ):
+        assert_refused(f"^{rule}$", export, given, **options)
+    assert not list(here.iterdir())
 
 
 def test_nothing_is_written_if_no_recovery_keeps_the_limits(hit, here):
@@ -337,15 +316,7 @@ def test_a_car_steers_past_a_wall_or_names_the_wall_that_it_hits():
         append_recovery(case, plan, "brake")
 
 
-def test_only_quadrotors_go_home(here):
-    case, plan = driving()
-    rule = "^recovery must be brake, as only quadrotors go home, got"
-    assert_refused(rule, export, plan, case=case, recovery="home")
-    assert not list(here.iterdir())
-
-
 def test_movers_move_during_the_recovery():
-    """Check a mover that leaves the car's path in time, and one that enters it."""
     gone = {"movers": [box(2.3, 3.9, 2.5, 4.1)], "mover_velocities": (0.0, 2.0)}
     case, plan = driving(**gone)
     straight = append_recovery(case, plan, "brake")

@@ -20,7 +20,6 @@ STEEPEST = 35.0 / 16.0  # slope of STEP, at 1/2
 
 
 def rest_to_rest(start, end, durations):
-    """Return the pieces of a trajectory between two hovers."""
     step = STEP(Polynomial([0.0, 1.0 / sum(durations)]))
     return cut([a + (b - a) * step for a, b in zip(start, end, strict=True)], durations)
 
@@ -37,7 +36,6 @@ def drop(time):
 
 
 def above_net(place, time):
-    """Return the position from which a ball falls into the net of a hovering quadrotor."""
     return np.array(place) + [0.0, 0.0, NET_HEIGHT + drop(time)]
 
 
@@ -103,21 +101,10 @@ def one_target(place=START, *, pos=None, vel=(0.0, 0.0, -3.0), time=1.1, drag=0.
     }
 
 
-def test_a_hover_under_a_falling_ball_catches_it():
-    leaves = one_target(drag=DRAG, gravity=GRAVITY)
-    leaves["targets.ball.pos"][0, 0] = above_net(START, 1.1)
-    leaves["targets.ball.vel"][:] = 0.0
-    verdict = assert_good(leaves)
-    assert verdict.failed_limit[0] == "" and np.isnan(verdict.failed_time[0])
-    assert verdict.caught.all() and verdict.num_caught[0] == 1
-    assert verdict.net_distance[0, 0] < 1e-12 and verdict.angle[0, 0] < 1e-12
-    assert verdict.min_thrust[0] == verdict.max_thrust[0] == pytest.approx(GRAVITY)
-    assert verdict.max_speed[0] == 0.0 and verdict.max_body_rate[0] == pytest.approx(0.0)
-    assert verdict.sentence(0).startswith("success: 1 caught, at most ")
-
-
 def test_two_targets_are_caught_in_sequence_and_an_absent_one_is_ignored():
     verdict = assert_good(good())
+    assert verdict.failed_limit[0] == "" and np.isnan(verdict.failed_time[0])
+    assert verdict.sentence(0).startswith("success: 2 caught, at most ")
     np.testing.assert_array_equal(verdict.caught, [[True, True, False]])
     np.testing.assert_allclose(verdict.catch_times, [[*TIMES, np.nan]])
     np.testing.assert_allclose(verdict.net_distance, [[0.0, 0.0, np.nan]], atol=1e-12)
@@ -245,13 +232,6 @@ def test_a_target_above_or_below_the_hoop_is_not_in_its_plane(above):
     np.testing.assert_array_equal(verdict.caught, [[True, False, False]])
     assert judge(leaves, contact_tolerance=0.021).success[0]
     assert judge(leaves, net_test="ball").success[0]
-
-
-def test_radius_and_plane_are_tested_each_on_its_own():
-    hoop = np.array(START) + [0.0, 0.0, NET_HEIGHT]
-    leaves = one_target(pos=hoop + [0.0, 0.999 * NET_RADIUS, 0.02])
-    assert judge(leaves, contact_tolerance=0.021).success[0]
-    assert_fails(leaves, "net", net_test="ball")
 
 
 @pytest.mark.parametrize("direction", [(1.0, 0.0, 0.0), (0.0, 0.6, 0.8), (0.0, 0.0, 1.0)])

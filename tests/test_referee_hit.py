@@ -136,13 +136,6 @@ def test_measured_quantities_agree_with_dense_sampling():
     np.testing.assert_allclose(verdict.landing_point[0], leaves["target"][0], atol=1e-7)
 
 
-def test_pieces_of_one_polynomial_are_judged_alike():
-    one, many = judge(volley(pieces=1)), judge(volley(pieces=9))
-    assert one.success[0] and many.success[0]
-    for name in ("max_speed", "max_acceleration", "max_body_rate", "min_height", "apex"):
-        assert getattr(one, name)[0] == pytest.approx(getattr(many, name)[0], rel=1e-6)
-
-
 @pytest.mark.parametrize(
     ("name", "values"),
     [

@@ -196,7 +196,6 @@ def test_a_car_that_stops_late_is_inside_the_wall():
 
 
 def test_corners_graze_at_the_distance_of_their_diagonals():
-    """Drive at 45 degrees past the corner of a square, and stop before the corner of another."""
     start = (2.0, 2.0, math.pi / 4.0)
     ahead, left = np.array([1.0, 1.0]) / math.sqrt(2.0), np.array([-1.0, 1.0]) / math.sqrt(2.0)
     beside = np.array(start[:2]) + 1.5 * ahead + (0.5 * WIDTH + 0.03) * left
@@ -211,7 +210,6 @@ def test_corners_graze_at_the_distance_of_their_diagonals():
 
 
 def test_a_mover_is_hit_at_its_position_and_time():
-    """Move a square of side 0.4 m along the side of a car at rest; it is abreast at 2 s."""
     still, way = {"speed": 0.0, "time": 4.0}, [(0.5, 0.0)]
     x, y = START[0] + MIDDLE - 1.0, START[1] + 0.5 * WIDTH + 0.2
     passing = good(**still, movers=([square(x, y + 0.05, 0.2)], way))
@@ -306,25 +304,6 @@ def test_a_plan_may_end_before_the_cases_time():
     leaves = good()
     leaves["time"][:] = 10.0
     assert assert_good(leaves).meeting_time[0] == TIME
-
-
-def test_targets_turn_or_follow_polynomials():
-    turn_rate, time, vel = -0.4, 3.7, np.array([0.3, -0.2])
-
-    def turning(t, state):
-        return [state[2], state[3], -turn_rate * state[3], turn_rate * state[2]]
-
-    path = solve_ivp(turning, (0.0, time), [1.0, 2.0, *vel], rtol=1e-11, atol=1e-11).y[:, -1]
-    leaves = good(time=time, end=path[:2], start=(*(path[:2] - [SPEED * time + MIDDLE, 0.0]), 0.0))
-    leaves["lower"][:] = -np.inf
-    target = {"pos": [1.0, 2.0], "vel": vel, "turn_rate": turn_rate}
-    leaves |= {f"target.{k}": np.asarray(v, float)[None] for k, v in target.items()}
-    assert assert_good(leaves).miss[0] < 1e-9
-    other = {k: v for k, v in leaves.items() if not k.startswith("target.")}
-    # (t - 1)^2 times the velocity, with the same final position.
-    coeffs = np.array([path[:2] - vel * (time - 1.0) ** 2, [0.0, 0.0], vel])
-    other |= {"target.coeffs": coeffs[None], "target.origin": np.ones(1)}
-    assert assert_good(other).miss[0] < 1e-12
 
 
 def test_the_true_path_replaces_the_expected_one():

@@ -21,7 +21,6 @@ VALUES = (1e300, -1e30, np.inf)
 
 @pytest.fixture(params=RUNS, ids=lambda run: f"{run[0].__name__[13:]}{'+' * len(run[1])}")
 def judged(request):
-    """Return the tests of one referee, and its `judge`."""
     module, options = request.param
     return module, lambda leaves, **more: module.judge(leaves, **options | more)
 

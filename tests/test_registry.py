@@ -11,7 +11,7 @@ import pytest
 import planner_jax as pj
 from planner_jax.core import errors
 from planner_jax.core.errors import UnknownName
-from planner_jax.core.registry import Task, all_tasks, task_named
+from planner_jax.core.registry import all_tasks, task_named
 from planner_jax.runs.settings import WorkersFailed
 from planner_jax.task.catch.suites import draw as draw_catches
 
@@ -94,25 +94,6 @@ def test_every_planner_of_a_task_can_be_made_and_the_first_is_the_default(name):
     assert task.planner().inner == task.make_planner(first, {})
 
 
-@pytest.mark.parametrize(
-    ("call", "rule"),
-    [
-        (lambda: task_named("juggle"), "^task must be one of hit, .*, group, block, got 'juggle'$"),
-        (lambda: pj.hit.planner("mpp"), "^planner must be one of exact, bat, .*, got 'mpp'$"),
-        (lambda: pj.catch.planner("bat"), "^planner must be one of exact, catch, mpp, got 'bat'$"),
-        (
-            lambda: pj.catch.planner(decide="late"),
-            "^decide must be one of best, greedy, random, given, policy, got 'late'$",
-        ),
-        (lambda: pj.hit.draw(1, "S.7"), r"^suite must be one of court, S\.1, .*, got 'S\.7'$"),
-        (lambda: pj.catch.draw(1, "rain"), "^suite must be one of throws, .*, got 'rain'$"),
-    ],
-)
-def test_the_error_for_an_unknown_name_lists_the_known_names_in_one_line(call, rule):
-    assert_one_line(call, rule)
-    assert issubclass(UnknownName, ValueError)
-
-
 def test_a_task_of_another_package_comes_after_the_librarys_own(others):
     others(tasks={"meet": "planner_jax_others:TASK"})
     assert list(all_tasks()) == [*TASKS, "meet"]
@@ -148,20 +129,6 @@ def test_a_task_and_a_planner_with_a_used_name_are_left_out(others):
         assert all_tasks()["hit"].home == "planner_jax.task.hit"
     with pytest.warns(UserWarning, match="planners 'hit.exact' .* left out, as the name is taken"):
         assert type(pj.hit.planner("exact")).__name__ == "ExactHit"
-
-
-def test_the_first_of_two_tasks_of_one_name_is_used(others, tmp_path, monkeypatch):
-    others(tasks={"meet": "planner_jax_others:TASK"})
-    second = tmp_path / "second"
-    folder = second / "more_others-1.0.dist-info"
-    folder.mkdir(parents=True)
-    (folder / "METADATA").write_text(METADATA.replace("planner-jax", "more"))
-    (folder / "entry_points.txt").write_text(
-        "[planner_jax.tasks]\nmeet = planner_jax_others:NOT_A_TASK\n"
-    )
-    monkeypatch.setattr(sys, "path", [*sys.path, str(second)])
-    with pytest.warns(UserWarning, match="'meet' .*the name is taken by planner_jax_others$"):
-        assert isinstance(all_tasks()["meet"], Task)
 
 
 def test_a_planner_of_another_package_is_made_by_its_name(others):

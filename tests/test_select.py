@@ -12,7 +12,6 @@ GOOD, BAD = Status.FEASIBLE, Status.MAX_STEPS
 
 
 def plans(*rows, xp=np):
-    """Return a batch of plans from rows of status, cost and violation."""
     status, cost, violation = zip(*rows, strict=True)
     return Plan(
         cost=xp.asarray(cost, xp.float32),

@@ -135,11 +135,9 @@ def test_an_absent_or_unsuitable_folder_is_named(tmp_path):
     [
         ("1,2", "row must have 8 columns between commas, got 2"),
         (row(position="2.5 nan 2"), "serve position must be 3 finite numbers, got '2.5 nan 2'"),
-        (row(velocity="-4 inf 7"), "serve velocity must be 3 finite numbers, got '-4 inf 7'"),
         (row(velocity="-4 7"), "serve velocity must be 3 finite numbers, got '-4 7'"),
         (row(hit="failed,1 2 3,failed"), "hitting position must be 3 finite numbers, got 'failed'"),
         (row(velocity="-1 0 3"), "serve must land in the hitting half, x < 0, got x = 1."),
-        (row(velocity="4.3 0 7"), "serve must land in the hitting half, x < 0, got x = 7."),
         (row(velocity="-4e200 0 7e200"), "serve must land in the hitting half, x < 0, got x = nan"),
         (row(position="2.5 0 -2"), "serve height must be > 0, got -2"),
     ],
@@ -152,21 +150,17 @@ def test_a_bad_row_is_named_by_file_line_rule_and_value(tmp_path, bad, says):
     assert "\n" not in str(caught.value) and len(caught.value.value) == 1
 
 
-def test_all_bad_rows_are_collected_and_the_first_few_spelled_out(tmp_path):
+def test_all_bad_rows_and_empty_files_are_collected_and_the_first_few_spelled_out(tmp_path):
     write(tmp_path, "1_1_1_p.csv", *["broken"] * 4, row())
     write(tmp_path, "1_1_2_p.csv", *["broken"] * 3)
     with pytest.raises(ArgumentError, match="1_1_2_p.csv:2: .*; and 2 more$") as caught:
         read_serves(tmp_path)
     assert len(caught.value.value) == 7
-
-
-@pytest.mark.parametrize("text", ["", HEADER + "\n"])
-def test_an_empty_file_is_named_once(tmp_path, text):
-    write(tmp_path, "1_1_1_p.csv", row())
-    (tmp_path / "1_1_1_l.csv").write_text(text)
-    with pytest.raises(ArgumentError, match="1_1_1_l.csv: file must have a row") as caught:
-        read_serves(tmp_path)
-    assert len(caught.value.value) == 1
+    for text in ("", HEADER + "\n"):
+        (tmp_path / "1_1_1_p.csv").write_text(text)
+        with pytest.raises(ArgumentError, match="1_1_1_p.csv: file must have a row") as caught:
+            read_serves(tmp_path)
+        assert len(caught.value.value) == 4
 
 
 def test_files_of_one_scenario_must_hold_the_same_serves(tmp_path):
@@ -263,7 +257,6 @@ def test_serves_keep_the_declared_law():
 
 
 def test_the_shortcut_of_the_generator_draws_uniform_serves():
-    """Compare with uniform serves that are rejected unless they land in the region."""
     random = np.random.default_rng(0)
     low, high = [0.5, 0.84, 2.0, -8.5, -5.5, 6.5], [4.5, 2.5, 2.0, -2.0, -0.5, 8.73]
     plain = random.uniform(low, high, (40000, 6))
@@ -326,6 +319,7 @@ def test_cases_carry_the_serves_and_the_setting_of_the_paper():
     np.testing.assert_array_equal(cases.limits.speed, np.full(5, 2.5))
     np.testing.assert_array_equal(cases.hit_limits.hitting_speed[0], [4.0, 3.0, 4.0])
     assert cases.drag.dtype == jnp.float32
+    check_cases(cases)
     plain = pj.hit.case(serves.position, serves.velocity, serves.target)
     np.testing.assert_array_equal(cases.drag, plain.drag)
     np.testing.assert_array_equal(cases.gravity, plain.gravity)
@@ -347,18 +341,12 @@ def test_uniform_starts_fill_the_half_court_and_belong_to_their_serve():
 @pytest.mark.parametrize(
     "arguments, says",
     [
-        ({"num": 0}, "num must be >= 1, got 0"),
-        ({"num": 1, "seed": -1}, "seed must be >= 0, got -1"),
-        ({"num": 1, "first": -5}, "first must be >= 0, got -5"),
         ({"num": 1, "scenarios": ["NNN", "NNR"]}, "scenarios must be names out of .*, got 'NNR'"),
         ({"num": 1, "scenarios": []}, "scenarios must be names out of .*, got none"),
-        ({"limit_scale": 0.0}, "limit_scale must be from 0.001 to 1000, got 0"),
-        ({"limit_scale": float("nan")}, "limit_scale must be from 0.001 to 1000, got nan"),
         ({"start": "random"}, "start must be three numbers or 'uniform', got 'random'"),
         ({"start": (1.0, 2.0)}, r"three finite numbers or 'uniform', got \(1.0, 2.0\)"),
         ({"start": "uniform", "seed": -1}, "seed must be >= 0, got -1"),
-        *(({"delay": x}, f"delay must be finite and >= 0, got {x:g}") for x in (-0.1, np.inf)),
-        ({"delay": np.nan}, "delay must be finite and >= 0, got nan"),
+        *(({"delay": x}, f"delay must be finite and >= 0, got {x:g}") for x in (-0.1, np.nan)),
     ],
 )
 def test_arguments_of_generator_and_cases_out_of_range_are_named(arguments, says):
@@ -368,36 +356,18 @@ def test_arguments_of_generator_and_cases_out_of_range_are_named(arguments, says
         to_cases(generate_serves(1, 0), **arguments)
 
 
-def test_generated_cases_pass_the_check_early_and_late_and_one_by_one():
-    serves = generate_serves(72, 0)
-    check_cases(to_cases(serves))
-    check_cases(to_cases(serves, delay=0.8, start="uniform", limit_scale=0.35))
-    check_cases(pj.hit.case(serves.position[0], serves.velocity[0], serves.target[0]))
-
-
 SERVE = ([2.0, 0.0, 2.0], [-4.0, 0.0, 7.0], [4.0, 0.0, 0.0])
 
 
 @pytest.mark.parametrize(
     "change, error, says",
     [
-        ({"speed": -5.0}, CaseError, "speed must be > 0, got -5"),
-        ({"acceleration": 0.0}, CaseError, "acceleration must be > 0, got 0"),
-        ({"body_rate": float("nan")}, CaseError, "body_rate must be finite, got nan"),
-        ({"min_height": -0.1}, CaseError, "min_height must be >= 0, got -0.1"),
         ({"hitting_speed": (4.0, -3.0, 4.0)}, CaseError, "hitting_speed must be > 0, got -3"),
-        ({"gravity": 0.0}, CaseError, "gravity must be > 0, got 0"),
         ({"drag": -0.1}, CaseError, "drag must be >= 0, got -0.1"),
-        ({"restitution": 1.2}, CaseError, "restitution must be in [0, 1], got 1.2"),
-        ({"min_apex": 7.0}, CaseError, "min_apex must be < max_apex, got 7"),
         ({"ball_pos": np.ones(2)}, ValueError, "ball_pos must have a shape that ends with (3,)"),
         ({"ball_vel": np.ones(2)}, ValueError, "ball_vel must have the shape (3,), got (2,)"),
         ({"drag": np.ones(4)}, ValueError, "drag must have the shape (), got (4,)"),
-        (
-            {"ball_pos": [2.0, 0.0, -1.0]},
-            CaseError,
-            "ball_pos must be at a height >= 0 m, got -1",
-        ),
+        ({"ball_pos": [2.0, 0.0, -1.0]}, CaseError, "ball_pos must be at a height >= 0 m, got -1"),
         ({"extras": pj.KeepOut(0.0, 1.0)}, TypeError, "extras must be a sequence of limits and"),
     ],
 )

@@ -45,7 +45,6 @@ def test_a_rendered_ball_is_measured_at_its_true_position(scene, place):
 
 
 def test_rendered_depths_match_the_scene(scene):
-    """Compare depths of the pole, and of the floor at the bottom of the image."""
     image, depth = scene.take(None)
     column, row = np.round(project(CAMERA, jnp.array([0.806, 0.0, 1.5]))[0]).astype(int)
     pole = np.array([0.806, 0.0]) - CAMERA.position[:2]

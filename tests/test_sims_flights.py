@@ -86,7 +86,6 @@ def test_a_passed_plan_is_flown(catches):
 
 
 def with_tool(world, **changes):
-    """Return the world with a changed tool of its robot."""
     tool = dataclasses.replace(world.robot.tool, **changes)
     model = dataclasses.replace(world.robot.model, tool=tool)
     return dataclasses.replace(world, robot=dataclasses.replace(world.robot, model=model))
@@ -146,8 +145,6 @@ def test_a_ball_is_planned_alone_where_no_plan_can_include_the_next_ball():
 
 @struct.dataclass
 class Outcome:
-    """The fields of a plan that `plan_ahead` reads."""
-
     status: np.ndarray
     violation: np.ndarray
 
@@ -167,12 +164,6 @@ class Outcome:
 def test_the_next_ball_is_given_up_only_where_no_limits_admit_both(
     monkeypatch, pair, alone, chosen
 ):
-    """Check that both balls are planned with wider limits before the first one is planned alone.
-
-    A plan for the first ball alone may leave the next one out of reach, or control too little
-    thrust.
-    """
-
     def fake_plan_all(_, cases):
         rate = round(float(cases.limits.body_rate[0]), 3)
         violation = (pair if cases.present.all() else alone)[rate]
@@ -213,7 +204,6 @@ def test_a_second_ball_is_caught_after_the_first():
 
 @pytest.mark.slow
 def test_balls_that_would_be_missed_are_caught_by_new_decisions():
-    """Check flights in which replanning from the current plan alone would miss a ball."""
     world = dataclasses.replace(CATCH_WORLD, num_balls=3)
     missed = throws(200, 3, seed=102, drag_error=0.15)[[58, 62, 71, 73, 92, 131, 143, 188]]
     flights = fly_catches(Loop(world, NOISES["lab"], replan=100.0), missed, seed=102)
@@ -234,7 +224,6 @@ def test_balls_that_would_be_missed_are_caught_by_new_decisions():
     ],
 )
 def test_a_plan_from_scratch_is_flown_if_it_violates_less_or_costs_less(fresh, warm, preferred):
-    """Check pairs of greatest relative violation and cost."""
     plan: Any = SimpleNamespace
     first, second = (plan(violation=v, cost=c) for v, c in (fresh, warm))
     assert bool(is_worth_flying(first, second)) == preferred
@@ -270,8 +259,6 @@ def test_a_heavy_robot_with_a_large_net_catches():
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class TracedPlanner(WellPlanner):
-    """A planner that counts how often it is traced."""
-
     def prepare(self, case):
         TRACES.append(case)
         return case

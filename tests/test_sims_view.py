@@ -46,7 +46,6 @@ needs_viser = pytest.mark.skipif(
 
 
 def drag_free(pos, vel, times):
-    """Return positions (K, 3) of a ball without drag."""
     return pos + np.outer(times, vel) - np.outer(0.5 * GRAVITY * times**2, [0.0, 0.0, 1.0])
 
 
@@ -71,7 +70,6 @@ def flight_with_return():
 
 
 def record_flight(flown, balls, begins, **more):
-    """Return the recording of one flight without drag."""
     drag = np.zeros((1, len(begins)))
     launches = Launches(balls, drag, np.array(begins), seen=0.3, **more)
     one = {"index": np.array([0]), "success": np.array([True])}
@@ -200,36 +198,24 @@ def run_folder(tmp_path):
 
 
 def read_error(capsys, *arguments):
-    """Return the error message of a rejected command."""
     assert main(["view", *map(str, arguments)]) == 2
     return capsys.readouterr().err.removeprefix("planner-jax: error: ")
 
 
 def test_a_folder_without_flights_is_refused_in_one_line(run_folder, tmp_path, capsys):
-    assert read_error(capsys, tmp_path / "no").startswith(
-        "RUN must be the folder of a run, with its m"
-    )
+    says = "RUN must be the folder of a run, with its m"
+    assert read_error(capsys, tmp_path / "no").startswith(says)
     manifest = run_folder.read_manifest()
-    run_folder.write_manifest({**manifest, "kind": "bench hit_rows"})
-    assert (
-        read_error(capsys, run_folder.path)
-        == "RUN must be a run of flights, got a bench hit_rows\n"
-    )
-    run_folder.write_manifest({**manifest, "state": "running"})
-    assert read_error(capsys, run_folder.path).startswith(
-        "RUN must be finished, with its flights, got"
-    )
-    run_folder.write_manifest(manifest)
-    settings = {**manifest["parameters"], "task": "catch"}
-    run_folder.write_manifest({**manifest, "parameters": settings})
-    assert read_error(capsys, run_folder.path).startswith(
-        "RUN must be a run with settings of this ver"
-    )
-    run_folder.write_manifest(manifest)
-    Dataset(run_folder.path / FLIGHTS).files()[0].write_bytes(b"half of it")
-    assert read_error(capsys, run_folder.path).startswith(
-        "RUN must be a run whose flights/part-000000-"
-    )
+    for change, says in (
+        ({"kind": "bench hit_rows"}, "a run of flights, got a bench hit_rows\n"),
+        ({"state": "running"}, "finished, with its flights, got"),
+        ({"parameters": manifest["parameters"] | {"task": "catch"}}, "a run with settings of this"),
+        ({}, "a run whose flights/part-000000-"),
+    ):
+        run_folder.write_manifest(manifest | change)
+        if not change:
+            Dataset(run_folder.path / FLIGHTS).files()[0].write_bytes(b"half of it")
+        assert read_error(capsys, run_folder.path).startswith(f"RUN must be {says}")
 
 
 def test_a_missing_viser_is_named_with_its_remedy(run_folder, capsys, monkeypatch):

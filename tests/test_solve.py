@@ -19,8 +19,6 @@ from tests.trees import assert_same
 
 @struct.dataclass
 class Well:
-    """A goal that may lie behind a ridge of the cost."""
-
     goal: Array  # ()
 
     @property
@@ -71,7 +69,6 @@ def test_lanes_unsolved_in_one_round_are_solved_in_the_next():
 
 
 def keep_starts(keep):
-    """Make a planner with a short search from both starts, and a long one from the best."""
     short, long = (LbfgsConfig(max_steps=num, step_cap=0.2) for num in (3, 40))
     return WellPlanner(rounds=(Round(2, long, stages=(Stage(short, keep=keep),)),))
 
@@ -140,22 +137,6 @@ def test_unsolvable_lanes_keep_the_least_violation_found():
     np.testing.assert_allclose(found.violation, 0.95, atol=0.02)
 
 
-def test_wrong_batches_are_refused():
-    with pytest.raises(ValueError, match="batch shape"):
-        plan(WellPlanner(), Well(np.zeros((2, 3), np.float32)))
-    with pytest.raises(ValueError, match="batch shape"):
-        plan(WellPlanner(), Well(np.zeros(0, np.float32)))
-    with pytest.raises(ValueError, match="chunk must be >= 1, got 0"):
-        plan(WellPlanner(), Well(GOALS), chunk=0)
-    with pytest.raises(ValueError, match="devices must be at least one"):
-        plan(WellPlanner(), Well(GOALS), devices=[])
-
-
-def test_a_round_needs_a_start():
-    with pytest.raises(ValueError, match="starts must be >= 1, got 0"):
-        Round(0, LbfgsConfig())
-
-
 @pytest.mark.parametrize("apart", [False, True], ids=["in host memory", "as on a GPU"])
 def test_arrays_on_a_device_stay_there_and_give_the_same_plans(apart, monkeypatch):
     if apart:
@@ -169,7 +150,6 @@ def test_arrays_on_a_device_stay_there_and_give_the_same_plans(apart, monkeypatc
 
 
 def test_a_later_round_takes_only_what_is_unsolved(monkeypatch):
-    """On a device other than the host, also where copies of a lane fill up the last chunk."""
     monkeypatch.setattr(batch, "is_one_cpu", lambda mesh: False)
     sizes, solve_on_devices = [], batch.solve_on_devices
 
@@ -185,7 +165,6 @@ def test_a_later_round_takes_only_what_is_unsolved(monkeypatch):
 
 
 def retry_within(within):
-    """Make a planner whose second round is for violations up to a bound."""
     first, second = WellPlanner().rounds
     return WellPlanner(rounds=(first, dataclasses.replace(second, within=within)))
 
@@ -234,7 +213,10 @@ def test_a_round_within_no_violation_is_refused(within, error):
         Round(within=within)
 
 
-def test_lanes_of_unequal_length_are_refused():
+def test_wrong_batches_are_refused():
+    with pytest.raises(ValueError, match="batch shape"):
+        plan(WellPlanner(), Well(np.zeros((2, 3), np.float32)))
+
     @struct.dataclass
     class Pair(Well):
         other: Array

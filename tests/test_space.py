@@ -62,7 +62,6 @@ def least_distances(name, bodies):
 
 
 def segments(rng, kind):
-    """Draw segments (NUM, 2, 3) [m] of one kind."""
     ends = rng.uniform(-1.0, 1.0, (NUM, 2, 3))
     if kind == "points":
         ends[:, 1] = ends[:, 0]
@@ -98,7 +97,6 @@ def pairs(name, kind, seed=0):
 
 @functools.cache
 def measure(name):
-    """Return a compiled function for distances of pairs and their gradients."""
     distance = DISTANCES[name]
     count = len(pairs(name, "any"))
     return jax.jit(jax.vmap(jax.value_and_grad(distance, argnums=tuple(range(count)))))
@@ -152,7 +150,6 @@ def test_a_second_derivative_includes_the_motion_of_the_nearest_points(name, flo
 
 @pytest.mark.parametrize("name", [*DISTANCES, "low segment", "low rectangle"])
 def test_an_approach_gives_the_derivative_by_a_rotation_and_a_translation(name, float64):
-    """The first body turns about an axis through the origin and moves; the second body rests."""
     if name == "low segment":
         distance, first, others = lowest_of_segment, smooth_pairs("segments")[:1], ()
     elif name == "low rectangle":

@@ -139,7 +139,6 @@ def test_no_other_solver_finds_a_cheaper_curve_in_the_same_corridor(plans):
 
 @pytest.mark.slow
 def test_the_planners_of_the_table_differ_in_cost():
-    """Bounds on control points hold everywhere; tilted lines have the least cost."""
     problems = speed_problems(64)
     planned = {}
     for name, planner in SPEED_PLANNERS.items():

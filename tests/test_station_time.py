@@ -112,14 +112,6 @@ def test_the_line_is_the_best_of_all_on_the_grid(lines):
     np.testing.assert_allclose(found.cost, expected, rtol=1e-9)
 
 
-def test_the_line_meets_no_polygon(lines):
-    problems, found = lines
-    times = np.linspace(0.0, 10.0, 2001)
-    for k in np.flatnonzero(found.found):
-        station = np.interp(times, np.arange(6) * 2.0, found.station[k])
-        assert depth(problems, k, times, station).max() < 1e-3
-
-
 @float64
 def test_an_empty_graph_has_the_straight_line_and_a_full_one_has_none():
     free = problem(initial_speed=0.6)

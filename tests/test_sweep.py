@@ -1,6 +1,5 @@
 """Sweeps of hits: run folder, resuming, tables, figures, clocks and rates."""
 
-import json
 from types import SimpleNamespace
 
 import jax
@@ -325,11 +324,6 @@ def test_the_truer_model_is_for_the_exact_planner_alone():
         HitSettings(planner="bat", drag_after_impact=True)
 
 
-def test_settings_survive_the_manifest():
-    settings = HitSettings(num=7, start=(-1, 0, 2), serves="somewhere")
-    assert HitSettings(**json.loads(json.dumps(settings.parameters()))) == settings
-
-
 def test_chunks_join_to_the_whole_without_a_seam():
     whole = open_source(HitSettings(num=50, batch=50).of(TASK), batch=1).chunk(0)
     source = open_source(HitSettings(num=50, batch=20).of(TASK), batch=1)
@@ -345,8 +339,3 @@ def test_a_real_scenario_is_served_by_its_own_two(suite):
     source = open_source(HitSettings(suite=suite, num=6).of(TASK), batch=6)
     served = {court.SCENARIOS[place] for place in source.chunk(0).origin.scenario}
     assert served == set(REAL_SCENARIOS[suite])
-
-
-def test_a_suite_without_serves_is_refused_before_anything_is_drawn():
-    with pytest.raises(ArgumentError, match=r"^suite must be one of court, S\.1, .* got 'gusts'$"):
-        open_source(HitSettings(suite="gusts"), batch=1)

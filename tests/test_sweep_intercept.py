@@ -45,8 +45,6 @@ LIMITS = [field.name for field in dataclasses.fields(CarLimits)]
 
 @struct.dataclass
 class SampledTarget:
-    """A target of any class, interpolated between evenly spaced times."""
-
     places: Array  # (M, 2) [m], the first at time 0
     end: Array  # () [s], the time of the last
 

@@ -19,8 +19,6 @@ from tests.trees import assert_same
 
 @struct.dataclass
 class Task:
-    """A case that the round of this number solves."""
-
     number: Array  # ()
 
     @property
@@ -60,8 +58,6 @@ class OnHost(pj.Planner):
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class TwoWays:
-    """A decision between two equal choices."""
-
     def check(self, cases):
         pass
 

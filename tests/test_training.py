@@ -56,13 +56,11 @@ def asked(hasty, tmp_path_factory) -> Any:
 
 @pytest.fixture(scope="module")
 def trained(asked, tmp_path_factory) -> Any:
-    """Return the trained policy and the folder of its training."""
     out = tmp_path_factory.mktemp("trained")
     return training.train(asked, out, progress=False), out
 
 
 def feasible(found: Policy) -> float:
-    """Return the share of decisions that are within reach by the estimate."""
     cases = draw_by_key(jax.random.key(9), 500, SUITE)
     far = jax.jit(jax.vmap(shortfall))(cases, first_choice(found, cases))
     return float((np.asarray(far) <= 0.0).mean())
@@ -74,7 +72,6 @@ def test_training_makes_feasible_decisions_common(hasty, trained):
 
 
 def test_a_training_leaves_its_curve(trained):
-    """As rows, as a picture and for TensorBoard; terms of solved cases are absent without any."""
     _, out = trained
     rows = read_rows(out)
     assert [row["decisions"] for row in rows] == [LANES * (k + 1) for k in range(ROWS)]
@@ -112,7 +109,6 @@ def test_a_run_of_other_settings_is_not_gone_on_with(asked, trained):
 
 @pytest.mark.slow
 def test_training_goes_on_bit_for_bit_where_it_was_interrupted(asked, tmp_path, monkeypatch):
-    """Interrupt the second part in its middle, and leave a torn checkpoint of it."""
     asked = dataclasses.replace(asked, parts=(PART, PART))
     whole, cut = tmp_path / "whole", tmp_path / "cut"
     one = training.train(asked, whole, progress=False)
@@ -160,12 +156,6 @@ def test_weights_of_another_network_or_size_are_refused(network, begun, says, ca
     assert main(["train", *given]) == 2
     assert f"--init-from must hold the {says}" in capsys.readouterr().err
     assert not out.exists()
-
-
-def test_a_shipped_policy_to_begin_with_is_known_by_its_name(capsys, tmp_path):
-    given = ["--suite", SUITE, "--network", "mlp", "--init-from", "rush6"]
-    assert main(["train", *given, "--out", str(tmp_path / "run")]) == 2
-    assert "weights of mlp (size 6, width 64), got attention (width 64" in capsys.readouterr().err
 
 
 def test_a_training_without_brax_names_the_extra(capsys, tmp_path, monkeypatch):

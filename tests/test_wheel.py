@@ -79,7 +79,6 @@ def installed(wheel, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def elsewhere(tmp_path_factory):
-    """Provide a folder that the commands share."""
     return tmp_path_factory.mktemp("elsewhere")
 
 
