@@ -14,7 +14,7 @@ from numpy.typing import DTypeLike
 
 
 def host_leaf(value: object, dtype: DTypeLike | None = None) -> Array:
-    """Return a value as a NumPy array that type checkers see as a jax array, the type of leaves."""
+    """Return a value as a NumPy array, declared as a jax array, the declared type of all leaves."""
     return np.asarray(value, dtype)  # type: ignore[return-value]
 
 
@@ -59,7 +59,7 @@ Components = Array | tuple[Array, Array, Array]  # (..., 3), or its three compon
 
 
 def components(x: Components) -> list[Array]:
-    """Return a list of the n components (...) of vectors (..., n), or of a tuple of components."""
+    """Return the n components of vectors (..., n) as arrays (...); a tuple has them already."""
     if isinstance(x, tuple):
         return [*x]
     return [jnp.squeeze(part, -1) for part in jnp.split(x, x.shape[-1], axis=-1)]

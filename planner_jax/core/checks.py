@@ -1,7 +1,8 @@
 """Checks of single arguments: numbers, switches, arrays, paths, instances of a class.
 
 Each check raises an error of one line, `NAME must be RULE, got VALUE`: `ArgumentTypeError` for a
-value of the wrong type, `ArgumentError` for a value that breaks the rule. `name` is the NAME.
+value of the wrong type, `ArgumentError` for a value that breaks the rule. NAME is the argument
+`name` of the check.
 """
 
 import functools
@@ -67,7 +68,7 @@ def require_path_name(name: str, value: object) -> None:
         raise ArgumentTypeError(name, "the path of a file", value)
 
 
-# Values of these types are not jax arrays. They are tested first, because the test is fast.
+# Types of values that are not jax arrays. `numeric` tests for them first, since the test is fast.
 _HOSTS = (np.ndarray, np.generic, float)
 
 
@@ -126,7 +127,7 @@ def floating(dtype: object) -> np.dtype:
 
 
 def require_beginning(name: str, tree: PyTree, shape: tuple[int, ...], words: str) -> list[Numbers]:
-    """Return a tree's leaves; raise an error in `words` unless all shapes begin with `shape`."""
+    """Return a pytree's leaves; raise unless each shape begins with `shape`, named by `words`."""
     leaves = jax.tree.leaves(tree)
     arrays = [array for leaf in leaves if (array := numeric(leaf)) is not None]
     if not arrays or len(arrays) < len(leaves):

@@ -58,7 +58,7 @@ def _is_run_time(value: object) -> bool:
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class Fixed:
-    """An attempt as a static argument: JAX compiles a separate program for every such attempt."""
+    """A planner's attempt as a static argument: JAX compiles one more program for each attempt."""
 
     attempt: object
 

@@ -50,7 +50,7 @@ class Drive(Protocol):
     def __call__(
         self, planner: "Planner", cases: PyTree, attempts: Sequence[Attempt] | None = None
     ) -> tuple[PyTree, PyTree]:
-        """Return plans of a batch by some of a planner's attempts, by default all of them.
+        """Plan a batch by the listed attempts of a planner, or by default by all its attempts.
 
         Returns:
             The plans, and an array or a number that is zero everywhere if all cases are solved.
@@ -100,8 +100,8 @@ class Planner(Generic[CaseT, PlanT]):
         """Convert an attempt to the pytree that the compiled `solve` takes as its second argument.
 
         By default each attempt is static, and compiles a program of its own. Attempts that are
-        pytrees of the same structure share one program; see `compiled`. Only the class and the
-        shapes of the cases may be used.
+        pytrees of the same structure share one program; see the module `core.compiled`. The method
+        may use only the class and the shapes of the cases.
         """
         return Fixed(attempt)
 

@@ -173,7 +173,7 @@ class Attempt:
     """One try of a planner at the cases that earlier attempts left unsolved; static under jit."""
 
     starts: int = 1  # number of starting points from which each case is solved
-    # Greatest violation of an earlier plan with which a case is tried again; None for no bound.
+    # Greatest violation of a case's plan with which the attempt is made; None means no bound.
     within: float | None = dataclasses.field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
@@ -313,7 +313,7 @@ def select_into(plans: PyTree, later: PyTree, lanes: np.ndarray) -> PyTree:
 
 
 def index_of_best(plans: PyTree, cost: PyTree = None) -> PyTree:
-    """Return the index of the best of K plans (K, ...) per case; `cost` replaces the plans' own."""
+    """Return the index of the best of K plans (K, ...) per case, by `cost` or the plans' costs."""
     xp = numpy_of(plans.status)
     good = is_solved(plans.status)
     finite = xp.isfinite(plans.cost) & xp.isfinite(plans.violation)

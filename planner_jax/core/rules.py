@@ -252,7 +252,7 @@ def all_ruled(cases: PyTree) -> Iterator[Ruled]:
 
 
 def _parts(tree: PyTree, place: str = "") -> Iterator[tuple[str, PyTree]]:
-    """Yield each part of a case whose class has `rules`, after its dotted prefix; `place` first."""
+    """Yield (prefix, part) for each part of `tree` whose class has `rules`; `tree` has `place`."""
     if getattr(type(tree), "rules", None):
         yield place, tree
     children: Mapping[str, PyTree] = {}

@@ -23,10 +23,10 @@ from planner_jax.trajectory.proportional_minco import ProportionalMinco, sample_
 
 BETWEEN_NODES = 0.004  # typical difference of the excess at a peak and at the nearest sample
 
-# A function of samples of a motion and of a pytree of numbers. It returns an array for each of E
-# limits, with the shape of the motion's height, positive where the limit is exceeded.
+# An `Excess` is a function of samples of a motion and of a pytree of numbers. It returns an array
+# for each of E limits, with the shape of the motion's height, positive where the limit is exceeded.
 Excess = Callable[[Motion, PyTree], tuple[Array, ...]]
-# A function of a motion and a pytree of numbers: it returns the cost per second at each sample.
+# A `Rate` is a function of samples of a motion and of a pytree of numbers: the cost per second.
 Rate = Callable[[Motion, PyTree], Array]
 
 
@@ -36,8 +36,8 @@ class Along:
 
     The penalty of a trajectory's segment is the integral, by the trapezoid rule, of the weighted
     smoothed hinges of excess + margin, plus the integral of the rate if there is one. There are E
-    limits, K samples of a segment, and C columns (boundary rows and whitened waypoint offsets) that
-    define it. h is the mean duration of its pieces.
+    limits and K samples of a segment. C columns (scaled states at both ends, and whitened waypoint
+    offsets) and h, the mean duration of a piece, define the segment.
     """
 
     maps: ProportionalMinco
@@ -47,7 +47,7 @@ class Along:
     hinge_width: float
     # Cost per second that the user defines (extras of a case). With it no CUDA kernel is used.
     rate: Rate | None = None
-    # 4 if the excess depends on position, velocity, acceleration and jerk; 5 if also on the snap.
+    # 4 if the limits depend on position, velocity, acceleration and jerk; 5 if also on the snap.
     orders: int = 4
     # Groups of derivatives (order, axis) that occur together in a limit, for `along_curvature`. The
     # penalty is a sum of functions of one group each. By default all derivatives are one group.
@@ -129,7 +129,7 @@ def _greatest(along: Along) -> Callable:
 
 @functools.cache
 def _integral(along: Along) -> Callable:
-    """Make `integrate_along` for these constants, with CUDA kernels for it and derivatives."""
+    """Make the function behind `integrate_along`, with CUDA kernels for values and derivatives."""
     values = _with_kernel(_values, along, "values")
     slopes = _with_kernel(_slopes, along, "slopes")
     curvature = _with_kernel(_curvature, along, "curvature")
@@ -168,7 +168,6 @@ def _greatest_of_segments(
 def _values(
     along: Along, columns: Array, durations: Array, parameters: PyTree
 ) -> tuple[Array, Array]:
-    """Return the penalties (N,) and the greatest excesses (N,) of N segments."""
     segments = jax.vmap(functools.partial(_of_segment, along), in_axes=(0, 0, None))
     return segments(columns, durations, parameters)
 
@@ -176,15 +175,12 @@ def _values(
 def _slopes(
     along: Along, columns: Array, durations: Array, parameters: PyTree
 ) -> tuple[Array, ...]:
-    """Return penalties, greatest excesses, and penalties' derivatives by columns and durations."""
     value = lambda c, h: _values(along, c, h, parameters)  # noqa: E731
     penalties, pull_back, worst = jax.vjp(value, columns, durations, has_aux=True)
     return penalties, worst, *pull_back(jnp.ones_like(penalties))
 
 
 def _slopes_by_all(along: Along, columns: Array, durations: Array, parameters: PyTree) -> tuple:
-    """Return penalties, greatest excesses, and derivatives by columns, durations, parameters."""
-
     def of_segment(columns: Array, duration: Array, parameters: PyTree) -> tuple:
         value = functools.partial(_of_segment, along)
         penalty, pull_back, worst = jax.vjp(value, columns, duration, parameters, has_aux=True)
@@ -194,7 +190,7 @@ def _slopes_by_all(along: Along, columns: Array, durations: Array, parameters: P
 
 
 def _curvature(along: Along, primals: tuple, tangents: tuple) -> tuple:
-    """Return the derivative of `_slopes_by_all` at `primals` along `tangents`; None is zero."""
+    """Return the derivative of `_slopes_by_all` along `tangents`, whose last entry may be None."""
     moves = 2 if tangents[2] is None else 3
     slopes = lambda *moving: _slopes_by_all(along, *moving, *primals[moves:])  # noqa: E731
     return jax.jvp(slopes, primals[:moves], tangents[:moves])[1]

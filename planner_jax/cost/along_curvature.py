@@ -40,9 +40,9 @@ class AlongCurvature:
     by_theta: Array  # ()
     columns_theta: Array  # (C, 3)
     theta_theta: Array  # ()
-    # Second derivatives at K samples, the input of `columns_columns` and `block_and_diagonal`. They
-    # are grouped by pairs of axes for which the same pairs of derivatives ("terms") occur together
-    # in limits: one array (terms * K, pairs of axes) for each group.
+    # Second derivatives of the penalty by the motion at K samples, for `columns_columns` and
+    # `block_and_diagonal`. Axis pairs (x, x), (x, y), ... that share their T pairs of derivative
+    # orders form a group; a group has one array (T * K, axis pairs).
     at_samples: tuple[Array, ...]
 
 
@@ -148,9 +148,10 @@ def block_and_diagonal(
 def _at_samples(
     along: Along, motion: Array, parameters: PyTree
 ) -> tuple[Array, Array, Array, dict[tuple[Slot, Slot], Array]]:
-    """Return penalties, greatest excess, and first and second derivatives at K samples.
+    """Return penalties (K,), the greatest excess (), and derivatives of the penalties at K samples.
 
-    `motion` (orders, K, 3) has position, velocity, ... of the samples; derivatives are by these.
+    `motion` (orders, K, 3) has position, velocity, ... of the samples. First derivatives by its
+    entries have its shape, and second derivatives (K,) are listed by pairs of its entries.
     """
     margins, factors = (
         jnp.asarray(np.array(each)[:, None], motion.dtype)
@@ -204,11 +205,7 @@ def _product(groups: tuple[tuple[Slot, ...], ...], curvature: dict, direction: A
 def _entries(
     along: Along, given: int, places: list[tuple[int, int]], at_samples: tuple[Array, ...]
 ) -> dict[tuple[int, int], Array]:
-    """Return second derivatives of a penalty by pairs of columns, for each pair of axes (x, y, z).
-
-    `places` are the indices of the columns in each pair. `at_samples` is the field of
-    `AlongCurvature`, and `given` the number of fixed columns.
-    """
+    """Return second derivatives (P,) of a penalty by P pairs of columns, for each pair of axes."""
     matrices = _matrices(along, given, tuple(places))
     found = {}
     for (pairs, _), matrix, numbers in zip(
@@ -239,8 +236,8 @@ class _Constants:
     samples: np.ndarray
     moving_samples: np.ndarray  # (orders, K, C)
     groups: tuple[tuple[Slot, ...], ...]
-    # Groups of pairs of axes; with each group the pairs of orders of derivatives ("terms") for
-    # which second derivatives of the penalty are not zero.
+    # Groups of pairs of axes, each with the pairs (d, e) of orders of the motion's derivatives by
+    # which the second derivatives of the penalty are not zero.
     pairs: tuple[tuple[tuple[tuple[int, int], ...], tuple[tuple[int, int], ...]], ...]
 
     @property
@@ -277,7 +274,7 @@ def _constants(along: Along, given: int) -> _Constants:
 def _matrices(
     along: Along, given: int, places: tuple[tuple[int, int], ...]
 ) -> tuple[np.ndarray, ...]:
-    """Return matrices that convert second derivatives at samples to derivatives by columns."""
+    """Return matrices from second derivatives at samples to derivatives by P pairs of columns."""
     constants = _constants(along, given)
     first, second = np.array(places).T
     found = []

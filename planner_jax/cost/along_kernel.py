@@ -210,14 +210,14 @@ def _result_shapes(mode: str, treedef: Treedef, num_columns: int) -> list[tuple[
 
 
 def load_numbers(ref: Ref) -> PyTree:
-    """Load a number of each lane (problem), or each component of columns (C, 3) of each lane."""
+    """Load one number, or C columns of three components, for each lane (problem of the batch)."""
     if len(ref.shape) != 3:
         return ref[...]
     return [[ref[c, axis] for axis in range(3)] for c in range(ref.shape[0])]
 
 
 def load_row(matrices: Ref, sample: Array, num_columns: int) -> Vectors:
-    """Load a sample's factors of the columns, for position, velocity, acceleration and jerk."""
+    """Load the factors (4, C) of C columns in a sample's position, velocity, acceleration, jerk."""
     return [[matrices[sample, d * num_columns + c] for c in range(num_columns)] for d in range(4)]
 
 
@@ -248,7 +248,7 @@ class _Sample:
     weight: Array
 
     def slope_by_columns(self, slope: Vectors) -> Vectors:
-        """Apply the chain rule: from derivatives by height to jerk, to derivatives by columns."""
+        """Convert derivatives by a sample's motion to derivatives by the C columns (chain rule)."""
         return [
             [
                 _total(
@@ -269,9 +269,10 @@ def _total(terms: Iterable[Array]) -> Array:
 def _of_sample(
     along: Along, mode: str, sample: _Sample, args: PyTree
 ) -> tuple[Array | None, tuple]:
-    """Return a sample's greatest excess, or None for "curvature", and its terms in the sums.
+    """Return a sample's greatest excess over a limit, and its terms in the kernel's sums.
 
-    `args` are columns, duration and parameters; for "curvature" also their direction.
+    `args` are columns, duration and parameters. In the mode "curvature" their direction follows,
+    and the first result is None.
     """
     (columns, duration, given), direction = args if mode == "curvature" else (args, ())
     free = unit_motion(sample.row, columns), duration

@@ -27,7 +27,7 @@ from planner_jax.cost.penalty import greatest_by_tangents
 from planner_jax.trajectory.polynomial import Motion
 from planner_jax.trajectory.proportional_minco import ProportionalMinco, by_pieces
 
-# Intervals of each piece for the check of a finished plan: many, since excesses may be narrow.
+# Number of intervals of a piece when a finished plan is checked; obstacles may be small.
 _CLOSE_NODES = 64
 
 
@@ -191,7 +191,7 @@ def for_batch(extras: object, batch: tuple[int, ...], dtype: DTypeLike) -> tuple
 
 
 def num_limits(extras: tuple[Extra, ...]) -> int:
-    """Return the number of limits among extras."""
+    """Return how many of the extras (terms that a user adds) are limits."""
     return sum(isinstance(extra, ExtraLimit) for extra in extras)
 
 
@@ -230,7 +230,7 @@ def greatest_extras(
 
 
 def extra_rate(motion: Motion, given: tuple) -> PyTree:
-    """Return the cost per second (N,) at N samples of all extras, the last entry of `given`."""
+    """Return the sum (N,) of the costs per second of the extras `given[-1]` at N samples."""
     samples = motion.pos, motion.vel, motion.acc
     rates = (extra.cost(*samples) for extra in given[-1] if isinstance(extra, ExtraCost))
     return sum(rates, jnp.zeros_like(motion.height))

@@ -58,7 +58,7 @@ def _call(
         matrices_ref, steps_ref, *out = refs[treedef.num_leaves :]
         columns, duration, given = jax.tree.unflatten(treedef, leaves)
         begin = grid_index(2) * share
-        # One more sample on either side, for the parabolas at the ends of this thread's samples.
+        # Each thread also computes its neighbours' nearest samples, which its parabolas need.
         first = jnp.maximum(begin - 1, 0)
         last = jnp.minimum(begin + share + 1, num_samples)
 

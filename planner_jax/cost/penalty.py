@@ -56,10 +56,10 @@ def greatest_by_parabolas(values: Array, times: np.ndarray) -> Array:
 def peak_above(
     left: Array, middle: Array, right: Array, before: Array | np.ndarray, after: Array | np.ndarray
 ) -> Array:
-    """Return the height >= 0 above the middle sample of the peak of a parabola through three.
+    """Return how high () the parabola through three samples rises above the middle sample.
 
-    It is 0 if the peak is not between the outer samples, and at most half of the samples' range.
-    The left sample is a time `before` the middle sample, and the right sample a time `after` it.
+    It is 0 if the parabola has no peak between the outer samples, and at most half of the samples'
+    range. The times from left to middle and from middle to right sample are `before` and `after`.
     """
     rising, falling = (middle - left) / before, (middle - right) / after
     bend, turn = rising + falling, after * rising - before * falling

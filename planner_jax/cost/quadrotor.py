@@ -57,7 +57,7 @@ def ground_excess(height: Array, limits: QuadrotorLimits) -> Array:
 def limits_along(
     motion: Motion, given: tuple[Array, QuadrotorLimits, tuple[Extra, ...]]
 ) -> tuple[PyTree, ...]:
-    """Return the excess at N samples, (N,), over each limit of flight, then of the extras."""
+    """Return the excess (N,) at N samples over each limit of flight, then over user's limits."""
     gravity, limits, extras = given
     return (*flight_excess(motion, gravity, limits), *extra_excess(motion, extras))
 
@@ -129,7 +129,7 @@ class Measure(enum.Enum):
 
 
 def _rotor_excess(motion: Motion, gravity: Array, limits: QuadrotorLimits) -> tuple[Array, ...]:
-    """Return each rotor's thrust above the maximum, then below the minimum, over the maximum."""
+    """Return f / f_max - 1 for each rotor's thrust f (N,), then (f_min - f) / f_max for each."""
     rotors = limits.rotors
     assert rotors is not None
     thrusts = rotor_thrusts(motion.acc, motion.jerk, motion.snap, gravity, rotors)
@@ -140,7 +140,7 @@ def _rotor_excess(motion: Motion, gravity: Array, limits: QuadrotorLimits) -> tu
 
 @dataclasses.dataclass(frozen=True)
 class _Kind:
-    """A kind of limits, such as of the speed, which belong to one field of `QuadrotorLimits`."""
+    """The excess over the limits in one field of `QuadrotorLimits`, such as the greatest speed."""
 
     field: str  # field of `QuadrotorLimits` that is None for a quadrotor without these limits
     measures: tuple[Measure, ...]  # one for each excess
@@ -233,8 +233,8 @@ def greatest_excess(
 ) -> list[Array]:
     """Return the greatest relative excess over each limit: an array (N,) for N segments of a plan.
 
-    Peaks between samples are included, by parabolas for limits of flight and by tangents for
-    extras. The other arguments are as for `greatest_along`.
+    Peaks between samples are included, by parabolas for limits of flight and by tangents for the
+    user's limits (`extras`). The other arguments are as for `greatest_along`.
     """
     along = flight_along(maps, nodes, dataclasses.replace(case, extras=()), 0.0, 1.0)
     greatest = greatest_along(along, columns, durations, (case.gravity, case.limits, ()))

@@ -27,8 +27,8 @@ SWITCH = "PLANNER_JAX_KERNELS"
 Results = TypeVar("Results")
 Shape = tuple[int, ...]
 Treedef = Any  # a PyTreeDef, whose class JAX hides from type checkers
-# Takes the leaves of a function's arguments, with the lanes (problems) on the last axis. Returns
-# the leaves of the results, or None if the kernel does not support such shapes or types.
+# A kernel takes the leaves of a function's arguments, with the lanes (problems) on the last axis.
+# It returns the leaves of the results, or None if it does not support such shapes or types.
 Kernel = Callable[[Sequence[Array]], Sequence[Array] | None]
 
 
@@ -75,7 +75,7 @@ def _has_triton() -> bool:
 
 @dataclasses.dataclass
 class _Entry:
-    """A compiled function that has a CUDA kernel: what makes the kernel, and array shapes."""
+    """A compiled function that has a CUDA kernel: the kernel's factory, and shapes of arrays."""
 
     path: str
     constants: tuple[Hashable, ...]
@@ -145,8 +145,8 @@ def kernel_of(eqn: JaxprEqn) -> Kernel | None:
     entry = _ENTRIES.get(eqn.params.get("name", ""))
     if entry is None:
         return None
-    # Reverse-mode differentiation splits a function into two with the same name, but other
-    # arguments or results. For these there is no kernel.
+    # Reverse-mode differentiation splits a function into two functions with the same name, but
+    # other arguments or results. These two functions have no kernel.
     shapes = [shape_of(atom) for atom in (*eqn.invars, *eqn.outvars)]
     is_whole = len(shapes) == len(entry.shapes) and all(
         of_call[len(of_call) - len(of_lane) :] == of_lane

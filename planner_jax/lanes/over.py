@@ -83,7 +83,7 @@ def _widen(value: _Value, shape: tuple[int, ...], lanes: int) -> Array:
 
 
 def _full_results(closed: ClosedJaxpr, leaves: Sequence[Array], lanes: int) -> list[Array]:
-    """Evaluate a function of one problem for all lanes (problems), the last axis of all arrays."""
+    """Evaluate the jaxpr of one lane (problem) for all lanes, the last axis of every array."""
     values = _evaluate(closed, [_Lanes(leaf) for leaf in leaves], lanes)
     pairs = zip(values, closed.jaxpr.outvars, strict=True)
     return [_widen(value, shape_of(out), lanes) for value, out in pairs]
@@ -133,7 +133,7 @@ def _outputs(eqn: JaxprEqn, inputs: list[_Value], lanes: int) -> list[_Value]:
 def _by_kernel(
     eqn: JaxprEqn, closed: ClosedJaxpr, kernel: kernels.Kernel, inputs: list[_Value], lanes: int
 ) -> list[_Value]:
-    """Evaluate a function's call by its CUDA kernel, and on other platforms by its operations."""
+    """Evaluate a call of a function that has a kernel: by the kernel on a GPU, else without it."""
     pairs = zip(inputs, eqn.invars, strict=True)
     arrays = [_widen(value, shape_of(atom), lanes) for value, atom in pairs]
     shapes = [(*shape_of(atom), lanes) for atom in eqn.outvars]

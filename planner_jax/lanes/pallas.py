@@ -21,7 +21,7 @@ _FEWEST = 16  # least number of lanes (problems of a batch) in a block of a kern
 
 
 def block_width(lanes: int, most: int) -> int | None:
-    """Return the number of lanes (problems) in a block, a divisor of `most`, or None if < 16."""
+    """Return the number of lanes (problems) in a GPU block, gcd(lanes, most); None if below 16."""
     width = math.gcd(lanes, most)
     return width if width >= _FEWEST else None
 
@@ -77,8 +77,8 @@ def kernel_by_lanes(
 ) -> Callable[..., Sequence[Array]]:
     """Make a `kernel_call` in float32 whose blocks contain all numbers of `width` lanes (problems).
 
-    `inputs` and `outputs` are shapes without the lanes, which are the last axis. Other arguments
-    are as for `kernel_call`, by default with one thread for each lane.
+    `inputs` and `outputs` are the arrays' shapes without the last axis, the lanes. `threads` is by
+    default one for each lane of a block. The other arguments are as for `kernel_call`.
     """
 
     def block(shape: tuple[int, ...]) -> Block:
@@ -112,7 +112,7 @@ def grid_index(axis: int) -> Array:
 
 
 def _spare_searches() -> None:
-    """Provide an empty module that JAX looks for, which makes kernels a third faster to lower."""
+    """Provide an empty module, since JAX looks for it on the disk each time it lowers a kernel."""
     name = "jaxlib.mlir.dialects.tt"
     if name not in sys.modules and importlib.util.find_spec(name) is None:
         sys.modules[name] = types.ModuleType(name)

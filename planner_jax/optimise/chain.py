@@ -69,8 +69,8 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
     shipped_name: ClassVar[str] = "exact"  # first part of the scales' names in the package
     num_end_variables: ClassVar[int]  # K, for each segment
     guess_table: ClassVar[np.ndarray]  # one row for each starting point, best first
-    # Numbers of intervals of each piece at which finished plans are checked: with one segment, with
-    # several. Between two catches the thrust may be small, where body rates peak sharply.
+    # Numbers of intervals of a piece in the check of a finished plan: of one segment, of several.
+    # Several segments need more: with a small thrust between catches, body rates peak sharply.
     decode_nodes: ClassVar[tuple[int, int]] = (32, 48)
     proportions: tuple[float, ...] = (1.0,) * 6  # relative durations of a segment's pieces
     nodes: int = 8  # number of intervals of each piece, at whose ends penalties are evaluated
@@ -95,7 +95,7 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
 
     @abc.abstractmethod
     def guess_ends(self, context: PyTree, num: int) -> Float[Array, "num N K"]:
-        """Return K end variables (SI units) of N segments, first guesses for `num` searches."""
+        """Return the K end variables (SI units) of N segments at `num` starting points."""
 
     @abc.abstractmethod
     def make_plan(
@@ -129,7 +129,7 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
         raise NotImplementedError
 
     def limit_learned(self, point: Float[Array, " n"]) -> Float[Array, " n"]:
-        """Clip the starting point that the network proposes; by default it is unchanged."""
+        """Clip the starting point (n,) that the network proposes; by default it is unchanged."""
         return point
 
     def _fit_scale(self, scale: tuple[float, ...]) -> tuple[float, ...]:
@@ -183,7 +183,7 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
         return (together / jnp.asarray(self.scale, together.dtype)[None]).ravel()
 
     def along(self, nodes: int, case: QuadrotorCase) -> Along:
-        """Return the penalties along a trajectory, evaluated at `nodes` intervals of each piece."""
+        """Return the definition of penalties, evaluated at `nodes` intervals of each piece."""
         return flight_along(self.maps, nodes, case, self.margin, self.hinge_width)
 
     def evaluate_ends(
@@ -251,7 +251,7 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
         )
 
     def decode(self, point: Float[Array, " n"], context: PyTree) -> PlanT:
-        """Return the plan at a point; its violation includes peaks between the samples."""
+        """Return the plan at a point (n,); its violation includes peaks between the samples."""
         offsets, natural = self.split(point)
         ends = self.meet(natural, context)
         durations = ends.durations / self.num_pieces

@@ -20,9 +20,9 @@ from planner_jax.optimise.preconditioner import block_preconditioner
 from planner_jax.optimise.settings import Curvature, Evaluation
 from planner_jax.trajectory.proportional_minco import ProportionalMinco, offset_energy
 
-# A function of k end variables of each of N segments, (N, k). It returns boundary rows (N, 2s, 3),
-# which are s scaled derivatives at each end; mean durations of a piece (N,) [s]; the cost of the
-# ends (); and the greatest excess over a limit at the ends ().
+# A function of the k end variables of N segments (N, k). It returns boundary rows (N, 2s, 3), which
+# are s scaled derivatives at each end; mean durations of a piece (N,) [s]; the part of the cost ()
+# that depends on the ends alone; and the greatest excess over a limit at the ends ().
 Ends = Callable[[Array], tuple[Array, Array, Array, Array]]
 
 
@@ -127,7 +127,7 @@ def chain_curvature(
 
     by_natural = by_natural.reshape(num, -1).at[:, 0].add(of.by_theta - power * energies)
     by_offsets = of.by_columns[:, num_rows:] + bend * offsets
-    # The preconditioner needs second derivatives among the end variables, and a diagonal.
+    # The preconditioner inverts the Hessian of the end variables, and the offsets' diagonal of it.
     strong = functools.partial(block_and_diagonal, along, num=num_rows, given=given)
     among_rows, alone = jax.vmap(strong)(of.at_samples)
     half = einsum("pnca,ncafb->pnfb", turned, among_rows)

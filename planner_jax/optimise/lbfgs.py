@@ -54,7 +54,7 @@ class LbfgsState:
 
 
 def init(point: Array, config: LbfgsConfig) -> LbfgsState:
-    """Return the state before the first iteration; nothing is evaluated."""
+    """Return the state before the first iteration from a `point` (n,); nothing is evaluated."""
     zero = jnp.zeros_like(point)
     empty = jnp.zeros((config.memory, point.shape[0]), point.dtype)
     unknown = jnp.full((), jnp.inf, point.dtype)
@@ -202,7 +202,7 @@ class _Choice:
 def _choose(
     config: LbfgsConfig, numbers: LbfgsNumbers, here: Evaluation, lengths: Array, trials: Evaluation
 ) -> _Choice:
-    """Select the trial point of least cost, if it costs less than the current point `here`."""
+    """Select the trial step to the least cost, if it costs less than the current point `here`."""
     costs = jnp.where(jnp.isfinite(trials.cost), trials.cost, jnp.inf)
     is_chosen = jnp.arange(costs.size) == jnp.argmin(costs)
 
@@ -217,7 +217,7 @@ def _choose(
     progress = here.cost - there.cost > tolerance * jnp.abs(here.cost)
     after = LbfgsNumbers(
         best=jax.tree.map(lambda a, b: jnp.where(is_best, a, b), there, best),
-        # If no trial lowers the cost, the next trial steps are shorter.
+        # If no trial step lowers the cost, the trial steps of the next iteration are shorter.
         reach=jnp.where(decreased, 1.0, 0.05 * numbers.reach),
         iteration=numbers.iteration + 1,
         stalled=jnp.where(progress, 0, numbers.stalled + 1),

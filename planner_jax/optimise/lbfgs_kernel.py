@@ -57,7 +57,8 @@ def _call(
         keep, moved, inverse = weigh_pair(dot(step, change), dot(change, change), dot(step, step))
         none = jnp.zeros_like(inverse)
 
-        # The loop takes the newest pair first. A new pair moves pair k + 1 of the memory to k.
+        # The loop takes the newest pair (step, change of the gradient) first. If a new pair is
+        # stored, pair k + 1 of the memory becomes pair k.
         alphas, kept, q, behind, later = [], [], grad, [step, change], inverse
         for k in reversed(range(num_pairs)):
             old, earlier = [read(steps, k), read(changes, k)], inverses[k]

@@ -42,8 +42,8 @@ class LevenbergConfig:
     # less than the fraction `tolerance`.
     settled: int = 2
     tolerance: float = 1e-2
-    # The search is aborted if, k >= 0 steps after step number `trial`, its cost exceeds
-    # hope * fade^k. None for `hope`: it is never aborted.
+    # A search is aborted if, k >= 0 steps after step number `trial`, its cost exceeds
+    # hope * fade^k. If `hope` is None, no search is aborted.
     trial: int = 0
     hope: float | None = None
     fade: float = 1.0
@@ -51,7 +51,7 @@ class LevenbergConfig:
 
 @struct.dataclass
 class LevenbergState:
-    """The best point of a search so far, and the numbers that the next step needs."""
+    """The state of a search: its best point so far, and the numbers that the next step needs."""
 
     point: Array  # (n,)
     model: Model  # at the point

@@ -158,7 +158,7 @@ def _optimum_at(point: Array, evaluation: Evaluation, config: Solver) -> Optimum
 
 
 def solve_round(planner: "OptimisedPlanner", attempt: Round, case: PyTree) -> PyTree:
-    """Return the best plan of one case from the starts and iterations of one round; pure."""
+    """Return the best plan of one case that one round (attempt) finds from its starts; pure."""
     last = planner.with_settings(attempt.settings)
     context = last.prepare(case)
 
@@ -190,7 +190,7 @@ def solve_round(planner: "OptimisedPlanner", attempt: Round, case: PyTree) -> Py
 
 
 def solve_batch(planner: "OptimisedPlanner", attempt: Round, cases: PyTree) -> PyTree:
-    """Plan a batch of cases with the starts and iterations of one round (attempt); pure."""
+    """Return the best plan of each case that one round (attempt) finds from its starts; pure."""
     last, num = planner.with_settings(attempt.settings), attempt.starts
     contexts = over_lanes(last.prepare)(jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), cases))
     before = planner.with_settings(_stages(attempt)[0].settings)

@@ -65,7 +65,7 @@ class NewtonState:
 
 
 def by_products(objective: Objective) -> Curved:
-    """Make the function of an objective's derivatives at a point, by automatic differentiation."""
+    """Make the function of an objective's `Curvature` at a point, by automatic differentiation."""
 
     def preconditioner(damping: Array) -> Callable[[Array], Array]:
         return lambda right: right / damping  # nothing but the damping of the Hessian is known
@@ -86,7 +86,7 @@ def by_products(objective: Objective) -> Curved:
 
 
 def init(point: Array, config: NewtonConfig) -> NewtonState:
-    """Return the state before the first iteration; nothing is evaluated."""
+    """Return the state before the first iteration from a `point` (n,); nothing is evaluated."""
     unknown = jnp.full((), jnp.inf, point.dtype)
     return NewtonState(
         point=point,
@@ -112,7 +112,7 @@ def is_stationary(numbers: NewtonNumbers, config: NewtonConfig) -> Array:
 
 
 def most_to_gain(numbers: NewtonNumbers, config: NewtonConfig, num: int) -> Array:
-    """Return indices (num,) of problems of greatest predicted decrease; unfinished ones first."""
+    """Return indices (num,) of problems, unfinished ones first, by falling predicted decrease."""
     expected = jnp.where(jnp.isnan(numbers.expected), jnp.inf, numbers.expected)
     return jnp.argsort(jnp.where(is_unfinished(numbers, config), -expected, 1.0))[:num]
 
@@ -182,7 +182,7 @@ def _lanczos(
     """
     num = min(num, gradient.size)
     scale = 1.0 / jnp.maximum(size, 1e-30)
-    # Row k of `images` is M times row k of `directions`.
+    # Row k of `images` is the product of M and row k of `directions`.
     images = jnp.zeros((num, gradient.size), gradient.dtype).at[0].set(gradient * scale)
     directions = jnp.zeros_like(images).at[0].set(turned * scale)
     diagonal, beside = [], []
@@ -206,7 +206,7 @@ def _lanczos(
 
 
 def _pivots(diagonal: list[Array], beside: list[Array], shift: Array) -> list[Array]:
-    """Return the pivots, none near 0, of a tridiagonal matrix (off-diagonal `beside`) + shift I."""
+    """Return pivots, none near 0, of T + shift I; T has the off-diagonal entries `beside`."""
     scale = functools.reduce(jnp.maximum, [jnp.abs(each) for each in (*diagonal, *beside)])
     least = _LEAST * scale + 1e-30
     found = []

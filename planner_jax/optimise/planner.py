@@ -25,7 +25,7 @@ from planner_jax.optimise.settings import (
     load_round,
 )
 
-# Settings of Newton's method after the first round (attempt) of `with_polish`, to the optimum.
+# Settings with which Newton's method continues the first round (attempt) to the optimum.
 _POLISH = NewtonConfig(
     max_steps=8,
     damping=1e-6,
@@ -67,7 +67,7 @@ class OptimisedPlanner(Planner[CaseT, PlanT], abc.ABC):
     """
 
     rounds: tuple[Round, ...]  # attempts, in order
-    # Subspace vectors of Newton's method; 0 if the preconditioner is nearly the inverse Hessian.
+    # Number of Newton's subspace vectors. With 0 the preconditioner counts as inverse Hessian.
     subspace: ClassVar[int] = 4
     adjoint: ClassVar[str] = "products"  # default of the argument `curvature` of `pj.gradient`
 
@@ -108,7 +108,7 @@ class OptimisedPlanner(Planner[CaseT, PlanT], abc.ABC):
         return jnp.zeros((), bool)
 
     def convert_point(self, point: Array, before: "OptimisedPlanner") -> Array:
-        """Convert a point (n,) of this planner with other settings to this planner's variables."""
+        """Convert a point (n,) of `before`, a copy with other settings, to own variables."""
         return point
 
     @property

@@ -108,19 +108,19 @@ class Differentiated(OptimisedPlanner):
         return _Context(case=case, inner=self.planner.prepare(case))
 
     def guesses(self, context: _Context, num: int) -> Array:
-        """Return the starting points of the inner planner."""
+        """Return the first `num` starting points (num, n) of the inner planner."""
         return self.planner.guesses(context.inner, num)
 
     def convert_point(self, point: Array, before: OptimisedPlanner) -> Array:
-        """Convert a point (n,) of `before`, which has other settings, to own variables."""
+        """Convert a point (n,) of `before`, a copy with other settings, to own variables."""
         return self.planner.convert_point(point, cast(Differentiated, before).planner)
 
     def objective(self, point: Array, context: _Context) -> Evaluation:
-        """Return the objective of the inner planner."""
+        """Evaluate the objective of the inner planner at a point (n,)."""
         return self.planner.objective(point, context.inner)
 
     def curvature_at(self, point: Array, context: _Context) -> Curvature:
-        """Return the derivatives of the inner planner's objective."""
+        """Return the derivatives of the inner planner's objective at a point (n,)."""
         return self.planner.curvature_at(point, context.inner)
 
     def rules_out(self, context: _Context) -> Array:
@@ -128,7 +128,7 @@ class Differentiated(OptimisedPlanner):
         return self.planner.rules_out(context.inner)
 
     def decode(self, point: Array, context: _Context) -> DifferentiatedPlan:
-        """Return the inner planner's plan, and the gradient at the point."""
+        """Return the inner planner's plan at a point (n,), with the gradient of its number."""
         plan = self.planner.decode(point, context.inner)
         return DifferentiatedPlan(
             plan=plan,

@@ -29,8 +29,8 @@ class Evaluation:
 
 
 Objective = Callable[[Array], Evaluation]
-# A function of a positive damping (). It returns a function that approximately solves the damped
-# Hessian's system: it multiplies a right side (n,) by a symmetric positive definite matrix.
+# A preconditioner is a function of a damping () > 0. It returns a function that nearly solves
+# the damped Hessian's system: it multiplies a right side (n,) by a positive definite matrix.
 Preconditioner = Callable[[Array], Callable[[Array], Array]]
 
 
@@ -39,7 +39,7 @@ class Curvature(NamedTuple):
 
     evaluation: Evaluation
     gradient: Array  # (n,)
-    # Returns a function that multiplies the Hessian by a direction (n,); called only if needed.
+    # A function that returns the product of the Hessian with a direction (n,), as a function.
     products: Callable[[], Callable[[Array], Array]]
     preconditioner: Preconditioner
 

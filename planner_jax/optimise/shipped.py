@@ -45,7 +45,7 @@ class StartNetwork:
 
 
 def select_start(cost: Callable[[Array], Array], guess: Array, learned: Array) -> Array:
-    """Return the starting point (n,) of lower cost: `guess`, or as a network corrected it."""
+    """Return the point (n,) of lower cost: `guess`, or `learned`, which a network corrected."""
     costs = jax.vmap(cost)(jnp.stack([guess, learned]))  # evaluate both points at once
     return jnp.where(costs[1] < costs[0], learned, guess)
 

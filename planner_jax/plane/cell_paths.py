@@ -20,7 +20,7 @@ _UNEVEN = 1.0  # cost of a change of speed by one level
 
 @struct.dataclass
 class CellPath:
-    """A path through a reach set: speed level, heading bin and grid cell at every time layer."""
+    """A car's path on a grid: speed level, heading bin and cell at equal time steps (layers)."""
 
     level: Array  # (layers,) int32, index of the speed up to the next layer
     bin: Array  # (layers,) int32, index of the heading, not wrapped to one revolution
@@ -29,10 +29,7 @@ class CellPath:
 
 @struct.dataclass
 class PathNoise:
-    """Gumbel noise for drawing one path as the smoothest of D random candidates.
-
-    For the noise of several paths, every array has one more leading axis.
-    """
+    """Gumbel noise that draws D random paths, of which the smoothest is used; may be batched."""
 
     layers: Array  # (layers + 1,), noise for the choice of the last layer
     ends: Array  # (D, levels, headings, 9), noise for the choice of the last cell
@@ -40,10 +37,10 @@ class PathNoise:
 
 
 def draw_noise(lattice: Lattice, num: int, seed: int, candidates: int) -> PathNoise:
-    """Draw Gumbel noise by which `draw_path` selects steps at random, for `num` paths.
+    """Draw the Gumbel noise with which `draw_path` draws `num` random paths.
 
     Each path is the smoothest of `candidates` random paths. `lattice` has the numbers of time
-    layers, speed levels and headings. All cases of a batch use the same noise.
+    steps, speed levels and headings. All cases of a batch use the same noise.
     """
     rng = np.random.default_rng(seed)
     ends = rng.gumbel(size=(num, candidates, lattice.levels, lattice.headings, 9))
@@ -53,14 +50,17 @@ def draw_noise(lattice: Lattice, num: int, seed: int, candidates: int) -> PathNo
 
 
 def _velocity(level: Array, heading: Array, grid: Grid) -> Array:
-    """Return velocities (..., 2) along the heading of bin 0 and to its left, in speed levels."""
+    """Return velocities (..., 2), in speed levels, of speed levels and heading bins (...) of a car.
+
+    Axis 0 has the heading of bin 0, and axis 1 points to its left.
+    """
     dtype = grid.cell.dtype
     angle = (2.0 * np.pi / grid.lattice.headings) * heading.astype(dtype)
     return level[..., None].astype(dtype) * jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)
 
 
 def _roughness(path: CellPath, grid: Grid, num: Array) -> Array:
-    """Return the sum of |v[n + 2] - v[n]|^2 for a path's velocities v at its first `num` layers."""
+    """Return the sum of |v[n + 2] - v[n]|^2 for a path's velocities v at its first `num` times."""
     velocity = _velocity(path.level, path.bin, grid)
     change = jnp.sum((velocity[2:] - velocity[:-2]) ** 2, axis=1)
     return jnp.sum(jnp.where(jnp.arange(2, grid.lattice.layers) < num, change, 0.0))

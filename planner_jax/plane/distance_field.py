@@ -60,7 +60,7 @@ def distance_field(walls: Obstacles, corner: Array, spacing: Array, size: int) -
         )
         return jnp.minimum(nearest, distances(*one, x.reshape(1, -1), y.reshape(1, -1))[0])
 
-    # The loop takes one wall at a time: a program for all at once takes minutes to compile.
+    # The loop takes one wall at a time: a program for all walls at once takes minutes to compile.
     none = jnp.full((1, size * size), 1e3, corner.dtype)
     nearest = lax.fori_loop(0, vertices.shape[0], take_nearer, none)
     return DistanceField(values=nearest.reshape(size, size), corner=corner, spacing=spacing)

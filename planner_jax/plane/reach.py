@@ -46,7 +46,7 @@ class Lattice:
 
 @struct.dataclass
 class Grid:
-    """The positions of the cells and the times of the layers of one case."""
+    """The grid of a set of reachable states: positions of its cells, and times of its layers."""
 
     lattice: Lattice = struct.field(pytree_node=False)
     lower: Array  # (2,) [m], corner of the map; the vehicle's middle must not leave the map
@@ -71,7 +71,7 @@ class Vehicle:
 
 @struct.dataclass
 class ReachSet:
-    """The reachable states of all time layers, and the moves and turns between layers."""
+    """The states that a car can reach at equally spaced times (layers), and its possible steps."""
 
     # (layers + 1, words, levels, headings, cells) uint32. The last axis is over cells along y. Each
     # bit of the words along the second axis is a cell along x.
@@ -122,7 +122,7 @@ def _pack(cells: Array) -> Array:
 
 
 def _move_y(rows: Array, move: Array) -> Array:
-    """Move cells (words, ..., cells) along y by `move` (...) cells; drop cells off the grid."""
+    """Shift bitmaps of cells by `move` (...) cells along y, the last axis of the bitmaps."""
     words, cells = rows.shape[0], rows.shape[-1]
     padded = jnp.pad(rows.reshape(words, -1, cells), ((0, 0), (0, 0), (_FARTHEST, _FARTHEST)))
     moved = jax.vmap(
@@ -134,7 +134,7 @@ def _move_y(rows: Array, move: Array) -> Array:
 
 
 def _move_x(rows: Array, move: Array) -> Array:
-    """Move cells, bits of (words, ..., cells), along x by `move` (...) cells, less than 32."""
+    """Shift bitmaps of cells by `move` (...) < 32 cells along x, the bits of 32-bit words."""
     none = jnp.zeros_like(rows[0])
     by = jnp.abs(move[..., None]).astype(jnp.uint32)
     carry = (32 - by) & 31
@@ -177,7 +177,7 @@ def _stencils(grid: Grid, movers: Obstacles, radius: Array) -> Array:
 
 
 def _draw_movers(grid: Grid, movers: Obstacles, stencils: Array, time: Array) -> Array:
-    """Return the cells (words, cells) uint32 that obstacles occupy, with bitmaps `stencils`."""
+    """Return a bitmap (words, cells) uint32 of the cells in moving obstacles at a `time` () [s]."""
     cells = grid.lattice.cells
     middle = (movers.centre + movers.velocity * time - grid.corner[None]) / grid.cell
     at = jnp.round(jnp.clip(middle, -cells, 2.0 * cells)).astype(jnp.int32) - _STENCIL // 2
@@ -259,7 +259,6 @@ def reach_set(
     blocked = _map_needed(draw_obstacles, times, halves_needed)
 
     def find_free(blocked: Array) -> Array:
-        """Return the cells (words, headings, cells) in which the car touches no obstacle."""
         each = jnp.broadcast_to(blocked[:, None], (num_cells // 32, headings, num_cells))
         return allowed & ~(_shift(each, discs[0]) | _shift(each, discs[1]))
 
@@ -306,7 +305,7 @@ def reach_set(
 
 
 def _start_bits(grid: Grid, initial_speed: Array, speed: Array) -> Array:
-    """Return the bits at time 0: the start cell and heading, and speed levels near the initial."""
+    """Mark the car's states at time 0: start cell, start heading, levels near the initial speed."""
     lattice, cell = grid.lattice, grid.start
     level = initial_speed / speed * (lattice.levels - 1)
     near = jnp.abs(jnp.arange(lattice.levels, dtype=level.dtype) - level) < 1.0
@@ -317,14 +316,14 @@ def _start_bits(grid: Grid, initial_speed: Array, speed: Array) -> Array:
 
 
 def _change_speed(bits: Array) -> Array:
-    """Mark every state whose speed level differs by at most one from a marked state's level."""
+    """Mark the states that a car reaches if it changes its speed by at most one level."""
     none = jnp.zeros_like(bits[:, :1])
     slower = jnp.concatenate([bits[:, 1:], none], axis=1)
     return bits | slower | jnp.concatenate([none, bits[:, :-1]], axis=1)
 
 
 def _turn(bits: Array, turns: Array) -> Array:
-    """Mark every state that the car reaches from a marked state by an allowed turn."""
+    """Mark the states that a car reaches by turns that `turns` (levels, 2 SPAN + 1) allows."""
     reached = jnp.zeros_like(bits)
     for k in range(2 * SPAN + 1):
         by = jnp.roll(bits, k - SPAN, axis=2)

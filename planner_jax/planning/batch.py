@@ -268,7 +268,7 @@ class _Batch:
         if threads == 1:  # JAX returns before a result is ready, so the next call is prepared early
             yield from map(solve, calls) if watch.waits else [solve(call) for call in calls]
             return
-        # One call runs alone at first, so that its program is not compiled in every thread.
+        # The first call runs alone, so that its program is compiled once and not in every thread.
         key = program_key(self.planner, attempt, calls[0][0].size, cases)
         alone = [] if key in compiled else [solve(calls[0])]
         compiled.add(key)
@@ -278,7 +278,7 @@ class _Batch:
             yield from later
 
     def plan_resident(self, attempts: Sequence[Attempt], cases: PyTree) -> tuple[PyTree, Array]:
-        """Return plans of cases in jax arrays; only numbers of unsolved cases reach the host."""
+        """Return plans of cases in jax arrays; the host reads only numbers of unsolved cases."""
         planner, mesh, watch, num = self.planner, self.mesh, self.watch, count_lanes(cases)
         if num % mesh.size:  # repeat the last case until all devices have equally many cases
             cases = _take(cases, np.arange(-(-num // mesh.size) * mesh.size))
@@ -307,7 +307,7 @@ class _Batch:
         return plans, unsolved
 
     def _first_plans(self, attempt: Attempt, cases: PyTree) -> tuple[PyTree, Array]:
-        """Make the first attempt by chunks; return plans, and each device's number of unsolved."""
+        """Return the first attempt's plans, and the number of unsolved cases on each device."""
         mesh, sizes, share = self.mesh, self.sizes(attempt), count_lanes(cases) // self.mesh.size
         if share == sizes.next(share):
             return solve_on_devices(self.planner, attempt, mesh, cases)

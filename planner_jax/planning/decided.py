@@ -103,7 +103,7 @@ def _split(choices: PyTree, axis: int) -> list[PyTree]:
 
 @jax.jit
 def _propose_all(decision: Decision, cases: PyTree) -> list[PyTree]:
-    """Return a list of proposals, best first; for a batch, each entry has one choice per case."""
+    """Return a list of proposed choices, best first; its entries have one choice for each case."""
     if cases.batch_shape == ():
         return _split(decision.propose(cases), 0)
     return _split(jax.vmap(decision.propose)(cases), 1)

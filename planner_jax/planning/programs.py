@@ -27,7 +27,8 @@ from planner_jax.core.rules import require_shapes
 
 # Numbers of lanes (cases) that a device solves in one call. Each number needs its own program.
 BUCKETS = (16, 128, 1024, 8192, 65536)
-# Greatest number of starting points in one call: on a CPU they fit a core's cache, and fill a GPU.
+# Greatest number of starting points in one call. More would not fit the cache of a CPU's core; on a
+# GPU this number keeps all processors busy.
 _CPU_CHUNK, _GPU_CHUNK = 256, 65536
 _GPU_BUSY = 8192  # least number of starts in one call that keeps a GPU busy
 _GPU_LEAST = 128  # least number of lanes of a call on a GPU; fewer lanes take the same time
@@ -84,7 +85,7 @@ def sizes_of(planner: Planner, attempt: Attempt, chunk: int | None, mesh: Mesh) 
 
 
 def on_devices(planner: Planner, devices: Sequence[jax.Device] | None) -> tuple[Planner, Mesh]:  # pyright: ignore[reportInvalidTypeForm]
-    """Return the planner with its arrays on all devices, and a mesh of the devices; None: local."""
+    """Return the planner with its arrays on all `devices` (None: all local ones), and a mesh."""
     mesh = Mesh(np.array(jax.local_devices() if devices is None else devices), ("lanes",))
     if jax.tree.leaves(planner):
         planner = jax.device_put(planner, replicated_sharding(mesh))
@@ -115,8 +116,8 @@ def replicated_sharding(mesh: Mesh) -> Sharding:
 def put_number(mesh: Mesh, value: int) -> Array:
     """Return an integer as an array on every device; cached, because each transfer takes time."""
     if mesh.size == 1:
-        # JAX compiles anew for arrays that are committed to a device. The arrays of most users are
-        # not, and with an uncommitted number every attempt runs the same program.
+        # JAX compiles another program for arrays that are committed to a device. The arrays of most
+        # users are uncommitted, and with an uncommitted number all attempts run one program.
         with jax.default_device(mesh.devices[0]):
             return jnp.asarray(value, jnp.int32)
     return jax.device_put(np.int32(value), replicated_sharding(mesh))
@@ -152,8 +153,8 @@ def place_lanes(tree: PyTree, mesh: Mesh) -> PyTree:
 # XLA would try its own kernels for every matrix product, which takes a third of the compile time
 # on a GPU, while cuBLAS is as fast for these products. On a CPU the option has no effect.
 _COMPILER_OPTIONS: Any = {"xla_gpu_enable_triton_gemm": False}
-# Until version 0.11 of JAX, XLA's older generator of code for a CPU takes 40 % less time. Programs
-# for one hit or catch are as fast with it; large batches, and loops over cases, are slower.
+# Before JAX 0.11, XLA's older code generator for CPUs compiles in 40 % less time. Its programs for
+# one hit or catch are as fast; its programs for large batches and loops over cases are slower.
 _IS_OLD = jax.__version_info__ < (0, 11)
 _QUICK_OPTIONS: Any = {"xla_cpu_use_fusion_emitters": False} if _IS_OLD else {}
 _Layout = tuple[tuple[tuple[int, ...], np.dtype], ...]  # shapes and dtypes of a tree's leaves
@@ -255,7 +256,7 @@ def _layout(leaves: Sequence[PyTree]) -> _Layout:
 
 @dataclasses.dataclass
 class _Result:
-    """Slices of a packed vector that hold a tree's leaves; set when JAX traces the function."""
+    """Positions of a result's leaves in its packed vector; set when JAX traces the function."""
 
     tree: PyTree = None
     fields: list[tuple[slice, tuple[int, ...]]] = dataclasses.field(default_factory=list)

@@ -23,7 +23,8 @@ _SPARE = 0.98  # fraction of each limit that braking uses
 _SAMPLES = 400  # number of times at which distances are computed
 _GAP = 1e-3  # [m] least distance at these times, since it may be smaller in between
 _DECELERATIONS = (1.0, 0.7, 0.4)  # tried decelerations / the car's greatest deceleration
-# Final curvatures to try after the curvature at the plan's end, as fractions of the greatest one.
+# Final curvatures of candidates, as fractions of the car's greatest curvature. The curvature at the
+# plan's end is tried first.
 _CURVATURES = (0.0, 0.5, -0.5, 1.0, -1.0)
 _USUAL = 1.0  # [m/s^2] or [1/m], value that replaces an infinite limit
 _SLOWER = (1.5, 2.0, 3.0)  # tried durations / the shortest in which all joints can stop

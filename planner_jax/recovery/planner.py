@@ -16,7 +16,7 @@ from planner_jax.optimise.settings import LbfgsConfig, Round
 from planner_jax.recovery.case import RecoveryCase, RecoveryPlan
 from planner_jax.trajectory.polynomial import PiecewisePolynomial
 
-# [m], in a starting point standstill is at least this far above the least allowed height.
+# [m] Least distance of standstill above the least allowed height, in starting points.
 _ABOVE_GROUND = 0.2
 # Starting points of the search, best first. Column 1: a base duration T_0 [s], to which the time
 # for the displacement at half the greatest speed is added. Column 2: a factor c; the displacement
@@ -70,7 +70,7 @@ class RecoveryPlanner(ChainPlanner[RecoveryCase, RecoveryPlan]):
             raise ArgumentError("to", f"one of {', '.join(RECOVERIES)}", self.to)
 
     def prepare(self, case: RecoveryCase) -> RecoveryContext:
-        """Return the context of a case, which consists of the case alone."""
+        """Return the context of a case, which contains only the case."""
         return RecoveryContext(case)
 
     def guess_ends(self, context: RecoveryContext, num: int) -> Array:

@@ -56,7 +56,7 @@ class RecoveringPlanner(PlannerAround[CaseT, PlanT]):
         return plans
 
     def _plan_at(self, factor: float, drive: Drive, cases: PyTree) -> tuple[PyTree, PyTree]:
-        """Plan with `factor` times the speed limit; return plans, and where only recovery fails."""
+        """Plan with `factor` times the speed limit; return plans, and which only lack recovery."""
         limits = cases.limits
         slower = dataclasses.replace(
             limits, speed=(factor * limits.speed).astype(limits.speed.dtype)

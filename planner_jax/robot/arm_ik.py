@@ -115,7 +115,10 @@ def inverse_kinematics(arm: Arm, rotation: Array, middle: Array) -> tuple[Array,
 def _arm_angles(
     geometry: _Geometry, wrist: Array, front: Array, elbow: Array
 ) -> tuple[Array, Array]:
-    """Return angles (3,) [rad] of joints 1 to 3 for a wrist centre, and whether it is reached."""
+    """Return angles (3,) [rad] of joints 1 to 3 for a wrist centre, and whether it is reached.
+
+    `front` and `elbow`, 1 or -1, select one of four solutions: a column of `_ARM_BRANCHES`.
+    """
     x, y, z = wrist
     lateral, upper_arm, forearm = geometry.lateral, geometry.upper_arm, geometry.forearm
     # The slack allows for rounding errors at points to which the arm is fully stretched.

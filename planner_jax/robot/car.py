@@ -91,7 +91,7 @@ def pose_at(start: Array, end: Array, speed: Array, curvature: Array, time: Arra
     """
     num = speed.shape[0] - 1
     step = end / num
-    # (K,) [s], for how long the car has driven on each of the K pieces until `time`.
+    # `length` (K,) [s] is how long the car has driven on each of the K pieces until `time`.
     length = jnp.clip(time - step * jnp.arange(num, dtype=speed.dtype), 0.0, step)
     rise = (speed[1:] - speed[:-1]) / step
     bend = (curvature[1:] - curvature[:-1]) / step

@@ -14,7 +14,7 @@ from planner_jax.core.errors import ArgumentError
 from planner_jax.core.rules import POSITIVE
 
 _MOST = 10**8  # greatest number of setpoints that one call may compute
-# Numbers of plans and of times in one compiled call, for a single plan and for a batch.
+# (number of plans, number of times) in one compiled call, for a single plan and for a batch.
 _ONE, _BATCH = (1, 1024), (64, 64)
 TreeT = TypeVar("TreeT")
 

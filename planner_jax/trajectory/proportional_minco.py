@@ -84,7 +84,7 @@ class ProportionalMinco:
 
 @functools.cache
 def _hermite_map(order: int) -> np.ndarray:
-    """Return the matrix from derivatives at both ends to coefficients of a piece of duration 1."""
+    """Return the matrix from a polynomial's derivatives at 0 and 1 to its coefficients."""
     size = 2 * order
     ends = np.zeros((size, size))
     for d in range(order):
@@ -95,7 +95,7 @@ def _hermite_map(order: int) -> np.ndarray:
 
 @functools.cache
 def _hermite_energy(order: int) -> np.ndarray:
-    """Return the integral of |p^(order)|^2 on a piece of 1 s as quadratic form in end states."""
+    """Return the integral of |p^(order)|^2 over [0, 1], a quadratic form in p's end derivatives."""
     hermite = _hermite_map(order)
     return hermite.T @ energy_form(2 * order - 1, order)[0] @ hermite
 
@@ -115,7 +115,7 @@ def _energy(coefficients: np.ndarray, shares: np.ndarray) -> np.ndarray:
 
 
 def _least_energy(energy: np.ndarray, num: int) -> np.ndarray:
-    """Minimise the form `energy` over all but `num` unknowns: a quadratic form of these `num`."""
+    """Return the quadratic form of the first `num` unknowns when the others minimise `energy`."""
     first, free = np.s_[:num], np.s_[num:]
     best = np.linalg.solve(energy[free, free], energy[free, first])
     return energy[first, first] - energy[first, free] @ best
@@ -158,8 +158,8 @@ def proportional_minco(
     b, q = np.s_[: 2 * s], np.s_[2 * s :]
     from_offsets, norm = np.eye(known.size), 1.0
     for k in range(len(kinds) if m > 1 else 0):
-        # Offsets (of positions, then of velocities) are deviations from the values of least energy.
-        # The columns before them are fixed then, and the columns after them minimise the energy.
+        # Offsets of positions (k = 0) or velocities (k = 1) at waypoints are deviations from the
+        # values of least energy. Columns before them are fixed, and columns after them are free.
         begin, end = (2 * s + j * (m - 1) for j in (k, k + 1))
         before, own = np.s_[:begin], np.s_[begin:end]
         reduced = _least_energy(energy, end)
