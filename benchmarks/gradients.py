@@ -160,7 +160,7 @@ def _measure(
 
 
 def _compare(bench: Bench, options: argparse.Namespace, differentiate: Any, few: Any) -> None:
-    """Print the difference between gradients of the cases `few` and those at float64 optima."""
+    """Print errors of the gradients of the cases `few`, relative to float64 gradients."""
     found = differentiate(few, steps=options.steps)
     with jax.enable_x64(True):
         best = differentiate(_double(few), curvature="whole", solver=_LONG)

@@ -363,7 +363,7 @@ class Lattice:
         return np.array(rows[::-1])
 
     def _row(self, half: int, state: tuple[int, int, int]) -> list[float]:
-        """Return time [s], x, y [m], heading [rad], speed [m/s] after `half` half steps."""
+        """Return time, x, y, heading and speed of a state after `half` half steps, in SI units."""
         bit, level, heading = state
         row, column = divmod(bit, self.stride)
         x, y = self.origin + CELL * np.array([column, row])

@@ -1,11 +1,11 @@
 """Hand-eye calibration of a fixed camera beside a robot, on the host, in float64.
 
-The robot holds a board of known points before the camera, which does not move. Poses in view k:
-A_k of the flange in the robot's base frame, and B_k of the board in the camera's frame. Poses that
-are the same in all views: Z of the board on the flange, and X of the camera in the base frame. They
-satisfy  A_k Z = X B_k.  Two views j and k eliminate Z:  (A_j A_k^-1) X = X (B_j B_k^-1),  the
-equation A X = X B of the literature. It is solved in closed form, and the solution is refined on
-the measured points. Poses are (4, 4) matrices, lengths are in metres.
+The robot holds a board of known points before the camera, which does not move. In view k, A_k is
+the pose of the flange in the robot's base frame, and B_k the pose of the board in the camera's
+frame. In all views, Z is the pose of the board on the flange, and X the pose of the camera in the
+base frame. They satisfy  A_k Z = X B_k.  Two views j and k eliminate Z:
+(A_j A_k^-1) X = X (B_j B_k^-1),  the equation A X = X B of the literature. It is solved in closed
+form, and then refined on the measured points. Poses are (4, 4) matrices, lengths are in metres.
 """
 
 import dataclasses

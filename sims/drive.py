@@ -82,7 +82,7 @@ class DriveState:
 
 @struct.dataclass
 class Frame:
-    """The pose of a car at the end of a frame (some control steps), and its planned position."""
+    """The pose of a car at the end of a frame (20 ms of simulation), and its planned position."""
 
     time: Array  # () [s], time at the end of the frame
     pose: Array  # (3,) x, y [m] of the rear axle's centre and heading [rad]

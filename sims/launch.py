@@ -199,7 +199,7 @@ def watch_ball(
 
 
 def require_world(loop: Loop, kind: str, num_balls: int, **planned: Any) -> None:
-    """Raise `ValueError` unless the simulated world is the world for which plans are made.
+    """Raise `ValueError` unless the simulated world has the tool and the numbers that plans assume.
 
     Args:
         loop: settings of the loop, with the world.

@@ -301,7 +301,7 @@ def begin_compiling(
     """
     if loop.replan == 0.0 or not in_parts(flights):
         return lambda: None
-    # Real plans come from NumPy arrays. Zeros of another origin would need other programs.
+    # Zeros come from NumPy arrays, as plans do. For other arrays JAX compiles another program.
     zeros = functools.partial(
         jax.tree.map, lambda leaf: jnp.asarray(np.zeros(leaf.shape, leaf.dtype))
     )

@@ -113,7 +113,7 @@ class Robot(Protocol):
         ...
 
     def place(self, poses: np.ndarray) -> np.ndarray:
-        """Return a point (..., 3) [m] of the robot, its position, at R joint positions (..., R)."""
+        """Return the robot's position, a point (..., 3) [m], at R joint positions (..., R)."""
         ...
 
     def find_held_ball(self, pose: np.ndarray) -> np.ndarray:

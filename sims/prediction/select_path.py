@@ -151,7 +151,7 @@ def select(
         variance = error_variance = jnp.square(jnp.asarray(noise, dtype))
 
     def gain(squares: Array) -> Array:
-        """Return 2 log(likelihood of the best turn / likelihood of another fit)."""
+        """Return 2 log(likelihood of the best turn / of a fit with residual sum `squares`)."""
         excess = (squares - best.squares) / variance
         return excess if noise is not None else (freedom + 1.0) * jnp.log1p(excess / freedom)
 
@@ -193,7 +193,7 @@ def select(
 
 
 def _median(rates: Array, step: Array, chance: Array, of_zero: Array) -> Array:
-    """Return the median turn rate, if zero has probability `of_zero`, and each of `rates` `chance`.
+    """Return the median turn rate, for the probabilities `chance` of `rates` and `of_zero` of 0.
 
     The rates are `step` apart; each stands for the interval of this width around it.
     """

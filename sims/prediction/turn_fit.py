@@ -82,7 +82,7 @@ def tangent(seen: Centred, fit: TurnFit) -> tuple[Callable[[Array], Pair], Array
     """
 
     def differentiate_arcs(after: Array) -> tuple[Pair, Pair]:
-        """Return arcs g, and derivatives of positions by the turn rate for a fixed velocity."""
+        """Return arcs g(t) at times `after`, and the derivatives of  velocity g(t)  by the rate."""
         one = jnp.ones_like(fit.rate)
         arcs, slopes = jax.jvp(lambda rate: arc(rate, after), (fit.rate,), (one,))
         return arcs, _times(fit.velocity, slopes)
@@ -150,7 +150,6 @@ def _minus(a: Pair, b: Pair) -> Pair:
 
 
 def _times(a: Pair, b: Pair) -> Pair:
-    """Return the product of two complex numbers."""
     return a[0] * b[0] - a[1] * b[1], a[0] * b[1] + a[1] * b[0]
 
 
@@ -166,9 +165,6 @@ def _mean(seen: Centred, a: Pair) -> Pair:
 
 
 def _share(seen: Centred, arm: Pair, power: Array, a: Pair) -> Pair:
-    """Return the complex factor c that minimises the weighted sum of |a - c arm|^2.
-
-    The argument `power` is the weighted sum of |arm|^2.
-    """
+    """Return the complex c with the least weighted sum of |a - c arm|^2, `power` for |arm|^2."""
     safe = jnp.where(power > 0.0, power, 1.0)
     return _sum(seen, arm, a) / safe, _sum(seen, (-arm[1], arm[0]), a) / safe

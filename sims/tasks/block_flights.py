@@ -65,7 +65,7 @@ class Budget:
     plan: np.ndarray  # [s], wall time of planning
     wait: np.ndarray  # [s], from the end of planning until the arm starts
     move: np.ndarray  # [s], duration of the plan's motion
-    # From the end of the motion to the planned contact; negative if the motion ends later.
+    # [s], from the end of the motion to the planned contact; negative if the motion ends later.
     stand: np.ndarray
     rest: np.ndarray  # [s], from the planned contact until the ball enters the inner box
 

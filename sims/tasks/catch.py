@@ -60,7 +60,7 @@ _AFTER = 0.05  # [s], simulated time after the end of the last ball's horizon
 def _steadier(
     planner: Planner[CatchCase, CatchPlan],
 ) -> Planner[CatchCase, CatchPlan]:
-    """Return `exact` with a higher thrust at catches in initial guesses; keep other planners."""
+    """Return a planner whose initial guesses have more thrust at catches, if it is `exact`."""
     if isinstance(planner, DecidedPlanner) and isinstance(planner.planner, ExactCatch):
         own = dataclasses.replace(planner.planner, lift=LIFT)
         return dataclasses.replace(planner, planner=own)

@@ -151,7 +151,7 @@ def with_catch(flights: FlightState, found: CatchPlan, new: Array) -> FlightStat
 class _EveryAttempt(Driver):
     """A planning driver that runs all attempts (settings to try) of a planner concurrently."""
 
-    # A time limit of 0 s: no attempt is followed by another attempt in the same call.
+    # With the time limit of 0 s, one call starts no second attempt.
     watch: Watch = dataclasses.field(default_factory=lambda: Watch(0.0))
 
     def __call__(
