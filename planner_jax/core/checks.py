@@ -127,7 +127,10 @@ def floating(dtype: object) -> np.dtype:
 
 
 def require_beginning(name: str, tree: PyTree, shape: tuple[int, ...], words: str) -> list[Numbers]:
-    """Return a pytree's leaves; raise unless each shape begins with `shape`, named by `words`."""
+    """Return a pytree's leaves as arrays; raise unless the shape of each begins with `shape`.
+
+    `words` describe the required shape in the error's text.
+    """
     leaves = jax.tree.leaves(tree)
     arrays = [array for leaf in leaves if (array := numeric(leaf)) is not None]
     if not arrays or len(arrays) < len(leaves):

@@ -35,7 +35,7 @@ class Kind(enum.Enum):
 
 
 class Drive(Protocol):
-    """Runs planners on behalf of a composite planner, whose method `plan_by` receives it."""
+    """The function with which a composite planner runs other planners; see `Planner.plan_by`."""
 
     @property
     def is_pure(self) -> bool:
@@ -146,15 +146,15 @@ class Planner(Generic[CaseT, PlanT]):
         return self
 
     def begin(self, *args: PyTree, **news: PyTree) -> Case:
-        """Return the cases of a re-planner: what remains of cases whose plans are being executed.
+        """Return what remains to be planned of cases whose plans are being executed.
 
         The returned cases start at the robot's present state, contain the changed quantities and
-        the previous plans, and leave out what is already done, such as targets caught. A re-planner
-        takes the arguments of `pj.replan`: the original cases, the previous plans, the time since
+        the previous plans, and leave out what is already done, such as targets caught. The
+        arguments are those of `pj.replan`: the original cases, the previous plans, the time since
         the plans started, and changed quantities by name.
 
         Raises:
-            TypeError: the planner is not a re-planner.
+            TypeError: the planner cannot continue from existing plans.
         """
         raise TypeError(
             f"{type(self).__name__} cannot plan again: use hits' and catches' exact, intercepts' "
@@ -166,9 +166,9 @@ class Planner(Generic[CaseT, PlanT]):
     ) -> "tuple[PyTree, PyTree]":
         """Return an `OptimisedPlanner`, and the cases with decisions such as an order of targets.
 
-        `plan_of` plans cases by a planner; the decisions are taken from these plans. By default the
-        decisions are the first proposals. The function is then pure and makes no plan, and
-        derivatives treat the decisions as constants.
+        The decisions are taken from plans that `plan_of` makes of cases by a planner. By default
+        they are the first proposals of the planner. The function is then pure and makes no plan,
+        and derivatives treat the decisions as constants.
 
         Raises:
             TypeError: the planner does not minimise a cost.
@@ -211,7 +211,7 @@ class PlannerAround(Planner[CaseT, PlanT]):
         return self.planner
 
     def replanner(self) -> Planner:
-        """Return the re-planner of the wrapped planner."""
+        """Return the planner that continues from existing plans of the wrapped planner."""
         return self.planner.replanner()
 
 

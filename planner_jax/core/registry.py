@@ -46,7 +46,7 @@ class Task:
     home: str  # module with the functions `case`, `draw`, `planner` and `judge`
     planners: Mapping[str, str]  # name -> class or function that makes the planner; default first
     suites: Mapping[str, str]  # name -> a sentence about its cases; default first
-    # Planners read from a file, as in "library:motions.bin" -> the command that writes the file.
+    # Planner that reads a file, as in "library:motions.bin" -> command that writes the file.
     from_file: Mapping[str, str] = dataclasses.field(default_factory=dict)
     # Classes with the settings of the task's sweeps, and of its simulated flights in `sims`.
     sweep: str = "planner_jax.runs.settings:SweepSettings"
@@ -56,7 +56,7 @@ class Task:
     # Keyword arguments with which speed benchmarks call `planner`.
     bench: Mapping[str, object] = dataclasses.field(default_factory=dict)
     contact: str | None = None  # dotted name of the contact times in a plan, such as "stroke.time"
-    # Name of the planner with whose costs plans are compared; None: with those of a longer search.
+    # Planner whose costs are the reference for other plans; None: a longer search is it.
     yardstick: str | None = None
 
     @property

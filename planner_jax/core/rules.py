@@ -26,8 +26,8 @@ class Rule:
     """A condition on every number of an array."""
 
     words: str  # text of the rule, as in "limits.speed must be WORDS, got -1"
-    # A function of an array with any leading axes, and of the case (or part of a case) that
-    # contains the array. It returns, number by number, where the condition holds.
+    # `holds` is a function of an array with any leading axes, and of the case (or part of a case)
+    # that contains the array. It returns for each number whether the condition holds.
     holds: Callable[[Numbers, PyTree], Numbers]
     infinite: bool = False  # whether the numbers may be infinite
     other: str = ""  # name of the array in the same part with which the numbers are compared

@@ -47,7 +47,7 @@ class Along:
     hinge_width: float
     # Cost per second that the user defines (extras of a case). With it no CUDA kernel is used.
     rate: Rate | None = None
-    # 4 if the limits depend on position, velocity, acceleration and jerk; 5 if also on the snap.
+    # Number of derivatives on which limits depend: 4 for position to jerk, 5 with the snap.
     orders: int = 4
     # Groups of derivatives (order, axis) that occur together in a limit, for `along_curvature`. The
     # penalty is a sum of functions of one group each. By default all derivatives are one group.
@@ -70,7 +70,7 @@ class Along:
         return f"Along{(*shape, *code, *hinges, self.rate is None, self.orders)}"
 
     def matrices(self) -> np.ndarray:
-        """Return matrices (K, orders, C) from C columns to K samples of a segment, for h = 1 s."""
+        """Return matrices (K, orders, C) from end states and offsets to K samples, at h = 1 s."""
         each = [self.maps.sample_matrix(self.nodes, d) for d in range(self.orders)]
         return np.stack(each, axis=1)
 
@@ -225,5 +225,5 @@ def _of_segment(
     penalty = duration * jnp.sum(hinges * weights[None])
     if along.rate is not None:
         penalty = penalty + duration * jnp.sum(along.rate(motion, parameters) * weights)
-    # A CPU computes a maximum of pairs of limits faster than a maximum of stacked limits.
+    # On a CPU, maxima of two arrays in turn are faster than a maximum over stacked arrays.
     return penalty, jnp.max(functools.reduce(jnp.maximum, each))

@@ -1,8 +1,8 @@
 """Penalties of `cost.along` with first and second derivatives, for Newton's method.
 
-Samples are linear in a segment's columns (boundary rows and waypoint offsets), and a limit depends
-on few derivatives of the motion. So the Hessian is one product with a constant matrix for each pair
-of axes, where `jax.hessian` would need one tangent for each unknown.
+Samples of a segment are linear in its columns, which are scaled end states and waypoint offsets. A
+limit depends on few derivatives of the motion. So the Hessian is one product with a constant matrix
+for each pair of axes, where `jax.hessian` would need one tangent for each unknown.
 """
 
 import dataclasses
@@ -112,7 +112,7 @@ def curvature_along(
 
 
 def columns_columns(along: Along, at_samples: tuple[Array, ...], given: int = 0) -> Array:
-    """Return second derivatives (C, 3, C, 3) of a segment's penalty by its C variable columns."""
+    """Return the Hessian (C, 3, C, 3) of a segment's penalty in end states and waypoint offsets."""
     num = _constants(along, given).num_moving
     every = [(c, f) for c in range(num) for f in range(num)]
     return _square(_entries(along, given, every, at_samples), num)
@@ -205,7 +205,6 @@ def _product(groups: tuple[tuple[Slot, ...], ...], curvature: dict, direction: A
 def _entries(
     along: Along, given: int, places: list[tuple[int, int]], at_samples: tuple[Array, ...]
 ) -> dict[tuple[int, int], Array]:
-    """Return second derivatives (P,) of a penalty by P pairs of columns, for each pair of axes."""
     matrices = _matrices(along, given, tuple(places))
     found = {}
     for (pairs, _), matrix, numbers in zip(
@@ -230,9 +229,10 @@ def _square(entries: dict[tuple[int, int], Array], num: int) -> Array:
 class _Constants:
     """Constant matrices of `curvature_along`; they are cached for each `Along`."""
 
-    # Three stacked matrices from G fixed and C variable columns to K samples of all derivatives,
-    # (3 * orders * K, G + C). Fixed column d is proportional to h^d; it is multiplied by d in the
-    # second matrix and by d^2 in the third, for derivatives by log h.
+    # Three stacked matrices from a segment's end states and waypoint offsets (G fixed, C variable
+    # columns) to all derivatives at K samples, (3 * orders * K, G + C). For derivatives by log h,
+    # fixed column d, which is proportional to h^d, is multiplied by d in the second and by d^2 in
+    # the third matrix.
     samples: np.ndarray
     moving_samples: np.ndarray  # (orders, K, C)
     groups: tuple[tuple[Slot, ...], ...]
@@ -274,7 +274,6 @@ def _constants(along: Along, given: int) -> _Constants:
 def _matrices(
     along: Along, given: int, places: tuple[tuple[int, int], ...]
 ) -> tuple[np.ndarray, ...]:
-    """Return matrices from second derivatives at samples to derivatives by P pairs of columns."""
     constants = _constants(along, given)
     first, second = np.array(places).T
     found = []

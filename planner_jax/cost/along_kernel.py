@@ -27,13 +27,13 @@ from planner_jax.trajectory.polynomial import Motion
 
 _THREADS = 128  # threads of a block, one for each lane
 _ENOUGH = 512  # number of blocks that keeps a large GPU busy
-# Axes that the kernel computes of position (height only), velocity, acceleration and jerk.
+# Axes (0, 1, 2: x, y, z) of position, velocity, acceleration and jerk on which limits depend.
 _AXES = ((2,), (0, 1, 2), (0, 1, 2), (0, 1, 2))
 _WORST = 1  # index of the greatest excess among the results of a kernel
 
-# Results of a kernel: "values" are the sum of penalties and the greatest excess; "slopes" adds the
-# derivatives by columns and durations, "slopes by all" also by the parameters; "curvature" is the
-# derivative of all of these along a direction.
+# Results of a kernel: "values" are the sum of penalties and the greatest excess over a limit;
+# "slopes" adds derivatives by columns (end states, waypoint offsets) and durations, "slopes by all"
+# also by the limits; "curvature" is the derivative of all these along a direction.
 MODES = ("values", "slopes", "slopes by all", "curvature")
 
 Vectors = list[list[Array]]  # columns, or derivatives of a motion, each with its components
@@ -68,9 +68,8 @@ def grid_of(
 ) -> tuple[Grid, tuple[int, ...]] | None:
     """Return the grid for a kernel's arguments, and the axes that `vmap` has put in front of them.
 
-    `leaves` are the leaves of all arguments. `points` has the tuple (columns, durations,
-    parameters) of a point and, for the mode "curvature", of a direction. The result is None if the
-    kernel does not support the arguments.
+    `points` has the arguments of `integrate_along` at a point and, for the mode "curvature", in a
+    direction; `leaves` are their leaves. If the kernel does not support them, the result is None.
     """
     *_, num_columns, _, lanes = points[0][0].shape
     threads = block_width(lanes, _THREADS)
@@ -198,7 +197,7 @@ def _call(
 
 
 def _result_shapes(mode: str, treedef: Treedef, num_columns: int) -> list[tuple[int, ...]]:
-    """Return the shapes of the kernel's results, by mode, for one segment of one lane (problem)."""
+    """Return the shapes of a kernel's results in a mode, for one segment of one lane (problem)."""
     shapes: list[tuple[int, ...]] = [(), ()]
     if mode != "values":
         shapes += [(num_columns, 3), ()]
@@ -242,13 +241,13 @@ def unit_motion(row: Vectors, columns: Vectors) -> Vectors:
 
 @dataclasses.dataclass
 class _Sample:
-    """The constants of one sample: its row of the matrices, and its quadrature weight."""
+    """The constants of a trajectory's sample: the linear map to its motion, and its weight."""
 
     row: Vectors  # factors of the C columns, for position, velocity, acceleration and jerk
     weight: Array
 
     def slope_by_columns(self, slope: Vectors) -> Vectors:
-        """Convert derivatives by a sample's motion to derivatives by the C columns (chain rule)."""
+        """Convert derivatives by a sample's motion to derivatives by end states and offsets."""
         return [
             [
                 _total(
@@ -269,11 +268,6 @@ def _total(terms: Iterable[Array]) -> Array:
 def _of_sample(
     along: Along, mode: str, sample: _Sample, args: PyTree
 ) -> tuple[Array | None, tuple]:
-    """Return a sample's greatest excess over a limit, and its terms in the kernel's sums.
-
-    `args` are columns, duration and parameters. In the mode "curvature" their direction follows,
-    and the first result is None.
-    """
     (columns, duration, given), direction = args if mode == "curvature" else (args, ())
     free = unit_motion(sample.row, columns), duration
     if mode == "values":
@@ -315,10 +309,6 @@ def _penalty(along: Along, unit: Vectors, duration: Array, given: PyTree) -> tup
 
 
 def _slopes(along: Along, weight: Array, free: tuple, fixed: tuple) -> tuple[Array, tuple]:
-    """Return a sample's greatest excess, its weighted penalty, and derivatives by `free`.
-
-    `free` and then `fixed` are the arguments motion, duration and parameters of `_penalty`.
-    """
     value, pull_back, worst = jax.vjp(lambda *x: _penalty(along, *x, *fixed), *free, has_aux=True)
     return worst, (weight * value, *pull_back(jnp.ones_like(value) * weight))
 

@@ -27,7 +27,7 @@ from planner_jax.cost.penalty import greatest_by_tangents
 from planner_jax.trajectory.polynomial import Motion
 from planner_jax.trajectory.proportional_minco import ProportionalMinco, by_pieces
 
-# Number of intervals of a piece when a finished plan is checked; obstacles may be small.
+# Number of intervals of a piece in the check of finished plans: many, as obstacles may be small.
 _CLOSE_NODES = 64
 
 
@@ -160,9 +160,10 @@ class Dislike:
 
 
 def for_batch(extras: object, batch: tuple[int, ...], dtype: DTypeLike) -> tuple[Extra, ...]:
-    """Broadcast extras of one case to a batch, and convert their leaves to a dtype.
+    """Broadcast extras (the user's limits and costs) of one case to a batch, and convert them.
 
-    `batch` is () or (B,). Extras that have the batch axis already are only converted.
+    `batch` is () or (B,), and `dtype` the type of all leaves of the result. Extras that have the
+    batch axis already are only converted.
     """
     if not isinstance(extras, Sequence) or isinstance(extras, str):
         raise ArgumentTypeError("extras", "a sequence of limits and costs", extras)
@@ -196,7 +197,7 @@ def num_limits(extras: tuple[Extra, ...]) -> int:
 
 
 def extra_excess(motion: Motion, extras: tuple[Extra, ...]) -> tuple[Numbers, ...]:
-    """Return the excess (N,) over each extra limit at N samples of a motion."""
+    """Return the excess (N,) over each limit that the user added, at N samples of a motion."""
     samples = motion.pos, motion.vel, motion.acc
     return tuple(extra.excess(*samples) for extra in extras if isinstance(extra, ExtraLimit))
 
@@ -204,7 +205,7 @@ def extra_excess(motion: Motion, extras: tuple[Extra, ...]) -> tuple[Numbers, ..
 def greatest_extras(
     maps: ProportionalMinco, columns: Array, duration: Array, extras: tuple[Extra, ...]
 ) -> tuple[Array, ...]:
-    """Return the greatest excess () over each extra limit along a whole segment.
+    """Return the greatest excess () over each limit that the user added, along one segment.
 
     It is never too small if the excess is concave between samples: see
     `penalty.greatest_by_tangents`. `maps`, `columns` and `duration` describe one segment, as for
@@ -230,7 +231,7 @@ def greatest_extras(
 
 
 def extra_rate(motion: Motion, given: tuple) -> PyTree:
-    """Return the sum (N,) of the costs per second of the extras `given[-1]` at N samples."""
+    """Return the total cost per second (N,) of the user's terms `given[-1]` at N samples."""
     samples = motion.pos, motion.vel, motion.acc
     rates = (extra.cost(*samples) for extra in given[-1] if isinstance(extra, ExtraCost))
     return sum(rates, jnp.zeros_like(motion.height))

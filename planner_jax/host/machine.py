@@ -119,7 +119,7 @@ def as_here(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Re
     here = jax.config.jax_enable_x64  # type: ignore[attr-defined]
 
     def call(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> _Result:
-        # JAX would compile programs again, even if `enable_x64` sets the present precision.
+        # Within `enable_x64` JAX compiles programs again, even if the precision is unchanged.
         is_equal = jax.config.jax_enable_x64 == here  # type: ignore[attr-defined]
         with contextlib.nullcontext() if is_equal else jax.enable_x64(here):
             return function(*args, **kwargs)

@@ -48,7 +48,7 @@ def kernels() -> Kernels:
 
 
 def in_use() -> bool:
-    """Return whether functions traced by JAX use kernels: they are on, with Triton and a GPU."""
+    """Return whether functions that JAX traces use CUDA kernels, which need Triton and a GPU."""
     return is_switched_on() and has_gpu() and _has_triton()
 
 

@@ -25,7 +25,7 @@ _CALLS = frozenset(
     "checkpoint closed_call core_call custom_jvp_call custom_vjp_call jit pjit remat2".split()
 )
 # Operations that return their operands unchanged. In a program for several devices `reshard` marks
-# arrays as local to a device. The arrays of one lane are local already.
+# arrays as local to a device. The arrays of one lane (problem) are local already.
 _UNCHANGED = frozenset("copy copy_p reshard stop_gradient".split())
 _ELEMENTWISE = frozenset(
     "abs acos add add_any and asin atan atan2 cbrt ceil clamp convert_element_type "

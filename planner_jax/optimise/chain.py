@@ -69,7 +69,7 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
     shipped_name: ClassVar[str] = "exact"  # first part of the scales' names in the package
     num_end_variables: ClassVar[int]  # K, for each segment
     guess_table: ClassVar[np.ndarray]  # one row for each starting point, best first
-    # Numbers of intervals of a piece in the check of a finished plan: of one segment, of several.
+    # Intervals of each piece when a finished plan is checked: (of one segment, of several).
     # Several segments need more: with a small thrust between catches, body rates peak sharply.
     decode_nodes: ClassVar[tuple[int, int]] = (32, 48)
     proportions: tuple[float, ...] = (1.0,) * 6  # relative durations of a segment's pieces
@@ -91,11 +91,11 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
 
     @abc.abstractmethod
     def meet(self, natural: Float[Array, "N K"], context: PyTree) -> ChainEnds:
-        """Return durations and final states of N segments from their K end variables (SI units)."""
+        """Return durations and final states of N segments from K variables each: log duration, ..."""
 
     @abc.abstractmethod
     def guess_ends(self, context: PyTree, num: int) -> Float[Array, "num N K"]:
-        """Return the K end variables (SI units) of N segments at `num` starting points."""
+        """Return the K end variables (log duration, ...) of N segments at `num` starting points."""
 
     @abc.abstractmethod
     def make_plan(
@@ -125,7 +125,7 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
         return None
 
     def start_features(self, context: PyTree) -> Float[Array, " F"]:
-        """Return the F features of a case that are the inputs of the start network."""
+        """Return the F features of a case from which the network predicts a starting point."""
         raise NotImplementedError
 
     def limit_learned(self, point: Float[Array, " n"]) -> Float[Array, " n"]:
@@ -189,11 +189,11 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
     def evaluate_ends(
         self, natural: Float[Array, "N K"], context: PyTree
     ) -> tuple[Array, Array, Array, Array]:
-        """Compute the part of the objective that depends only on K end variables of N segments.
+        """Compute what depends only on the K end variables (log duration first) of N segments.
 
         Returns:
             Boundary rows (N, 8, 3), scaled states at both ends of the segments; mean durations of a
-            piece (N,) [s]; the part of the cost (); and the greatest excess at the ends ().
+            piece (N,) [s]; a part of the cost (); and the greatest excess at the ends ().
         """
         ends = self.meet(natural, context)
         durations = ends.durations / self.num_pieces

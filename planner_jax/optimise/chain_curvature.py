@@ -127,7 +127,7 @@ def chain_curvature(
 
     by_natural = by_natural.reshape(num, -1).at[:, 0].add(of.by_theta - power * energies)
     by_offsets = of.by_columns[:, num_rows:] + bend * offsets
-    # The preconditioner inverts the Hessian of the end variables, and the offsets' diagonal of it.
+    # The preconditioner inverts the Hessian of the end variables, and a diagonal for the offsets.
     strong = functools.partial(block_and_diagonal, along, num=num_rows, given=given)
     among_rows, alone = jax.vmap(strong)(of.at_samples)
     half = einsum("pnca,ncafb->pnfb", turned, among_rows)

@@ -18,7 +18,7 @@ _LARGEST = 12  # greatest number of rows for which a thread keeps all entries in
 
 
 def inverse_kernel(*, interpret: bool = False) -> Callable:
-    """Make the kernel of `preconditioner.positive_inverse`; with `interpret` it needs no GPU."""
+    """Make the CUDA kernel that inverts small matrices; with `interpret` it needs no GPU."""
 
     def kernel(treedef: Treedef, leaves: Sequence[Array]) -> Sequence[Array] | None:
         (matrix,) = leaves

@@ -182,7 +182,7 @@ def _lanczos(
     """
     num = min(num, gradient.size)
     scale = 1.0 / jnp.maximum(size, 1e-30)
-    # Row k of `images` is the product of M and row k of `directions`.
+    # Row k of `images` is M times row k of `directions`; M^-1 is the preconditioner.
     images = jnp.zeros((num, gradient.size), gradient.dtype).at[0].set(gradient * scale)
     directions = jnp.zeros_like(images).at[0].set(turned * scale)
     diagonal, beside = [], []

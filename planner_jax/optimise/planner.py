@@ -37,7 +37,7 @@ _POLISH = NewtonConfig(
     stragglers=(0.125, 10, 10),
 )
 _LONG = LbfgsConfig(max_steps=300, tolerance=1e-7, patience=6)
-# By effort, the settings of Newton's method after the first round (attempt); see `with_effort`.
+# Effort -> settings of Newton's method after the first round (attempt); see `with_effort`.
 _EFFORTS = {
     "good": NewtonConfig(max_steps=1, damping=1e-6, tolerance=2e-2, stragglers=(0.125, 2, 60)),
     "best": NewtonConfig(

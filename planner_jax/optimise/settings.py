@@ -39,7 +39,7 @@ class Curvature(NamedTuple):
 
     evaluation: Evaluation
     gradient: Array  # (n,)
-    # A function that returns the product of the Hessian with a direction (n,), as a function.
+    # `products()` returns the function that multiplies the Hessian by a direction (n,).
     products: Callable[[], Callable[[Array], Array]]
     preconditioner: Preconditioner
 
@@ -158,7 +158,7 @@ class CountedLbfgs(LbfgsConfig):
 
 @cached_by_precision
 def load_round(attempt: Round, is_counted: bool) -> Round | Fixed:
-    """Convert a round (attempt) to an argument of programs; static if a search has no steps.
+    """Convert a round (attempt) to a program's argument; it is static if a search has 0 iterations.
 
     Rounds that differ only in L-BFGS's numbers of iterations and tolerances share one program. If
     `is_counted`, numbers of iterations up to `COUNTED` are static: a GPU then need not ask the host

@@ -73,10 +73,10 @@ class Vehicle:
 class ReachSet:
     """The states that a car can reach at equally spaced times (layers), and its possible steps."""
 
-    # (layers + 1, words, levels, headings, cells) uint32. The last axis is over cells along y. Each
-    # bit of the words along the second axis is a cell along x.
+    # Bitmaps of the reachable states, (layers + 1, words, levels, headings, cells) uint32. The last
+    # axis is over cells along y. The bits of the words on the second axis are cells along x.
     bits: Array
-    # (layers, levels, headings, 2, 2) int32, moved cells [x, y] in each half of a step.
+    # (layers, levels, headings, 2, 2) int32, cells [x, y] that the car moves in each half step.
     moves: Array
     turns: Array  # (layers, levels, 2 SPAN + 1) bool, allowed turns at each level of speed
 
@@ -316,14 +316,12 @@ def _start_bits(grid: Grid, initial_speed: Array, speed: Array) -> Array:
 
 
 def _change_speed(bits: Array) -> Array:
-    """Mark the states that a car reaches if it changes its speed by at most one level."""
     none = jnp.zeros_like(bits[:, :1])
     slower = jnp.concatenate([bits[:, 1:], none], axis=1)
     return bits | slower | jnp.concatenate([none, bits[:, :-1]], axis=1)
 
 
 def _turn(bits: Array, turns: Array) -> Array:
-    """Mark the states that a car reaches by turns that `turns` (levels, 2 SPAN + 1) allows."""
     reached = jnp.zeros_like(bits)
     for k in range(2 * SPAN + 1):
         by = jnp.roll(bits, k - SPAN, axis=2)

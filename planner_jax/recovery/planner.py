@@ -16,7 +16,7 @@ from planner_jax.optimise.settings import LbfgsConfig, Round
 from planner_jax.recovery.case import RecoveryCase, RecoveryPlan
 from planner_jax.trajectory.polynomial import PiecewisePolynomial
 
-# [m] Least distance of standstill above the least allowed height, in starting points.
+# [m] Least height of the final position above the least allowed height, in starting points.
 _ABOVE_GROUND = 0.2
 # Starting points of the search, best first. Column 1: a base duration T_0 [s], to which the time
 # for the displacement at half the greatest speed is added. Column 2: a factor c; the displacement
@@ -74,7 +74,7 @@ class RecoveryPlanner(ChainPlanner[RecoveryCase, RecoveryPlan]):
         return RecoveryContext(case)
 
     def guess_ends(self, context: RecoveryContext, num: int) -> Array:
-        """Return `num` starts (num, 1, 4): log duration, and displacement to standstill [m]."""
+        """Return starting values (num, 1, 4) of log duration and displacement to standstill [m]."""
         case = context.case
         pos, vel = case.head_state[None, 0], case.head_state[None, 1]
         base, share = jnp.asarray(_GUESSES[:num], pos.dtype).T[..., None]

@@ -214,7 +214,7 @@ PAPER_CATCHER = QuadrotorModel(
     ),
     source="[Yu2023catch] (Catch Planner); body and rotors assumed",
 )
-# The quadrotor of [Yu2023bat, Fig. 2 and Section VI-A]. Body and rotors are of `PAPER_CATCHER`.
+# The quadrotor of [Yu2023bat, Fig. 2 and Section VI-A]. Body and rotors are from `PAPER_CATCHER`.
 PAPER_HITTER = dataclasses.replace(
     PAPER_CATCHER,
     name="paper-hitter",

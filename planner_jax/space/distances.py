@@ -75,7 +75,7 @@ def lowest_of_rectangle(middle: Array, edges: Array) -> Array:
 class Approach(NamedTuple):
     """The line through the nearest points of two bodies, in Pluecker coordinates."""
 
-    # Three components (), a unit vector from the second body to the first; 0 if the bodies cross.
+    # Components () of the unit vector from the second body to the first; 0 if the bodies cross.
     direction: Vector
     moment: Vector  # three components () [m], p x direction for any point p of the line
 
@@ -389,7 +389,6 @@ def _lowest_corner(middle: Array, edges: Array) -> Vector:
 
 
 def _gap_to_ground(lowest: Vector, *bodies: Array) -> Vector:
-    """Return the upward unit vector, the direction in which the distance from the ground grows."""
     return (jnp.zeros_like(lowest[0]), jnp.zeros_like(lowest[0]), jnp.ones_like(lowest[0]))
 
 
@@ -406,8 +405,8 @@ def _point_itself(lowest: Vector, *bodies: Array) -> Vector:
     return lowest
 
 
-# By distance function, three functions that `approach` needs: they return the parameters of the
-# nearest points, the gap between these points, and the nearest point of the first body.
+# Distance function -> three functions for `approach`, which return the parameters of the nearest
+# points, the gap between these points, and the nearest point of the first body.
 _PARTS: dict[Callable, tuple[Callable, Callable, Callable]] = {
     segment_to_segment: (_nearest_of_segments, _gap_of_segments, _point_of_segment),
     segment_to_rectangle: (_nearest_of_rectangle, _gap_to_rectangle, _point_of_segment),

@@ -68,10 +68,11 @@ class ProportionalMinco:
         return len(self.proportions)
 
     def sample_matrix(self, nodes: int, derivative: int) -> np.ndarray:
-        """Return the matrix that maps C columns to samples of a derivative, 0 for the position.
+        """Return the matrix from end states and waypoint offsets (C columns) to samples.
 
-        Each of M pieces has `nodes` + 1 samples, and neighbours share one, so that the shape is
-        (M nodes + 1, C). The product is divided by h^derivative for a mean piece duration h.
+        Each of M pieces has `nodes` + 1 samples of a derivative (0 is the position). Neighbours
+        share one sample, so that the shape is (M nodes + 1, C). The product is divided by
+        h^derivative for a mean piece duration h.
         """
         degree = 2 * self.order - 1
         factors = derivative_factors(degree, derivative)
@@ -101,12 +102,12 @@ def _hermite_energy(order: int) -> np.ndarray:
 
 
 def _energy(coefficients: np.ndarray, shares: np.ndarray) -> np.ndarray:
-    """Return the integral of |p^(s)|^2 as a quadratic form (C, C) in C columns [b; y].
+    """Return the integral of a spline's |p^(s)|^2 as a quadratic form (C, C) in C numbers.
 
-    The columns are scaled end states b and waypoint offsets y. The form is computed as a sum of
-    squares; otherwise rounding errors could exceed the small integral of a smooth motion far from
-    the origin. `coefficients` (M, 2s, C) map the columns to powers of the time since a piece's
-    start over its duration, and `shares` (M,) are durations of the M pieces.
+    These are scaled end states and waypoint offsets. `coefficients` (M, 2s, C) map them to the
+    polynomials of M pieces, and `shares` (M,) are the pieces' durations. The form is computed as a
+    sum of squares, because rounding errors could otherwise exceed the small integral of a smooth
+    motion far from the origin.
     """
     s = coefficients.shape[1] // 2
     root = np.linalg.cholesky(energy_form(2 * s - 1, s)[0][s:, s:]).T
@@ -137,7 +138,7 @@ def proportional_minco(
         raise ArgumentError("proportions", "some numbers > 0", proportions)
     s, m = order, len(proportions)
     shares = np.array(proportions) * m / np.sum(proportions)
-    # Piece i lasts r_i h. The d-th derivative by t / (r_i h) is r_i^d times the one by t / h.
+    # Piece i lasts r_i h. A d-th derivative by t / (r_i h) is r_i^d times the derivative by t / h.
     units = np.tile(shares[:, None] ** np.arange(s), 2)
     piece_energy = _hermite_energy(s)
     total = np.zeros(((m + 1) * s, (m + 1) * s))
@@ -275,7 +276,7 @@ def offset_energy(maps: ProportionalMinco, offsets: Array, piece_duration: Array
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _boundary_form(maps: ProportionalMinco, rows: Array) -> Array:
-    """Return `boundary_energy` () for pieces of 1 s mean duration; `rows` (2s, 3)."""
+    """Return `boundary_energy` () of scaled end states (2s, 3) for a mean piece duration of 1 s."""
     return jnp.sum(rows * _by_rows(maps, rows))
 
 
