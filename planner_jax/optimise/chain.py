@@ -42,7 +42,7 @@ _ORDER = 4  # derivative whose square is minimised: snap
 
 @struct.dataclass
 class ChainEnds:
-    """Durations and final states of N trajectory segments, computed from the end variables."""
+    """Durations and final states of N trajectory segments, computed from decision variables."""
 
     durations: Float[Array, " N"]  # [s], of the segments
     tail_states: Float[Array, "N 4 3"]  # position to jerk of the quadrotor at the segments' ends
@@ -69,8 +69,8 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
     shipped_name: ClassVar[str] = "exact"  # first part of the scales' names in the package
     num_end_variables: ClassVar[int]  # K, for each segment
     guess_table: ClassVar[np.ndarray]  # one row for each starting point, best first
-    # Intervals of each piece when a finished plan is checked: (of one segment, of several).
-    # Several segments need more: with a small thrust between catches, body rates peak sharply.
+    # Numbers of intervals of a piece in the check of a finished plan: for one segment, for more
+    # segments. With a small thrust between two catches, the body rate can have narrow peaks.
     decode_nodes: ClassVar[tuple[int, int]] = (32, 48)
     proportions: tuple[float, ...] = (1.0,) * 6  # relative durations of a segment's pieces
     nodes: int = 8  # number of intervals of each piece, at whose ends penalties are evaluated
@@ -91,7 +91,7 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
 
     @abc.abstractmethod
     def meet(self, natural: Float[Array, "N K"], context: PyTree) -> ChainEnds:
-        """Return durations and final states of N segments from K variables each: log duration, ..."""
+        """Return durations and final states of N segments from K variables for each end."""
 
     @abc.abstractmethod
     def guess_ends(self, context: PyTree, num: int) -> Float[Array, "num N K"]:
@@ -157,7 +157,7 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
         return proportional_minco(_ORDER, self.proportions)
 
     def guesses(self, context: PyTree, num: int) -> Float[Array, "num n"]:
-        """Return `num` starting points with waypoint offsets 0; a network may improve the first."""
+        """Return starting points (num, n) on smoothest curves; a network may improve the first."""
         if num > len(self.guess_table):
             raise ArgumentError("starts", f"<= {len(self.guess_table)}", num)
         natural = self.guess_ends(context, num)

@@ -108,7 +108,7 @@ class OptimisedPlanner(Planner[CaseT, PlanT], abc.ABC):
         return jnp.zeros((), bool)
 
     def convert_point(self, point: Array, before: "OptimisedPlanner") -> Array:
-        """Convert a point (n,) of `before`, a copy with other settings, to own variables."""
+        """Convert a point of `before`, a planner with other settings, to this planner's variables."""
         return point
 
     @property

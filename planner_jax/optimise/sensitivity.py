@@ -112,7 +112,7 @@ class Differentiated(OptimisedPlanner):
         return self.planner.guesses(context.inner, num)
 
     def convert_point(self, point: Array, before: OptimisedPlanner) -> Array:
-        """Convert a point (n,) of `before`, a copy with other settings, to own variables."""
+        """Convert a point of `before`, a planner with other settings, to this planner's variables."""
         return self.planner.convert_point(point, cast(Differentiated, before).planner)
 
     def objective(self, point: Array, context: _Context) -> Evaluation:
