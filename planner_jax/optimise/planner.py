@@ -108,7 +108,7 @@ class OptimisedPlanner(Planner[CaseT, PlanT], abc.ABC):
         return jnp.zeros((), bool)
 
     def convert_point(self, point: Array, before: "OptimisedPlanner") -> Array:
-        """Convert a point of `before`, a planner with other settings, to this planner's variables."""
+        """Convert a point (n,) of a planner with other settings to variables of this planner."""
         return point
 
     @property

@@ -5,10 +5,9 @@ For a number q(u, theta) of a plan, where u minimises cost(u, theta) and theta i
     dq/dtheta = q_theta - lambda^T cost_utheta,   cost_uu lambda = q_u,
 
 where indices denote derivatives. This is the adjoint form of the implicit function theorem, and
-lambda is the adjoint vector. Conjugate gradients [Hestenes1952] solve for
-lambda in a few steps. They use the planner's products with the Hessian
-(`OptimisedPlanner.curvature_at`), or the whole Hessian. lambda^T cost_utheta is a part of the
-derivative of the cost's gradient (by u and theta) along lambda.
+lambda is the adjoint vector. Conjugate gradients [Hestenes1952] solve for lambda in a few steps.
+They use the planner's products with the Hessian (`OptimisedPlanner.curvature_at`), or the whole
+Hessian. lambda^T cost_utheta is a part of the derivative of the cost's gradient along lambda.
 """
 
 import dataclasses
@@ -112,7 +111,7 @@ class Differentiated(OptimisedPlanner):
         return self.planner.guesses(context.inner, num)
 
     def convert_point(self, point: Array, before: OptimisedPlanner) -> Array:
-        """Convert a point of `before`, a planner with other settings, to this planner's variables."""
+        """Convert a point (n,) of a planner with other settings to variables of this planner."""
         return self.planner.convert_point(point, cast(Differentiated, before).planner)
 
     def objective(self, point: Array, context: _Context) -> Evaluation:

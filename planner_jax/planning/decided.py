@@ -21,8 +21,9 @@ class DecidedPlanner(PlannerAround[CaseT, PlanT]):
 
     `decision` proposes several choices for each case, and `planner` plans the case with every
     choice. The solved plan with the least `decision.rank` is selected, or the plan with the least
-    violation if none is solved. The planner's last and longest attempt is made only for cases
-    without a solved choice; if the first attempt is long, too, this holds for all later attempts.
+    violation if none is solved. The planner's last attempt, the longest, is made only for cases
+    that no choice has solved. If the first attempt is long, too, every later attempt is made only
+    for such cases.
     """
 
     decision: PyTree  # a `Decision`

@@ -291,7 +291,7 @@ def _boundary_form_jvp(
 
 
 def _by_rows(maps: ProportionalMinco, rows: Array) -> Array:
-    """Multiply `maps.boundary_energy` (2s, 2s) by rows (2s, 3), as a sum: faster than `matmul`."""
+    """Multiply `maps.boundary_energy` by end states (2s, 3), as a sum: faster than `matmul`."""
     return jnp.sum(jnp.asarray(maps.boundary_energy, rows.dtype)[..., None] * rows[None], axis=1)
 
 
