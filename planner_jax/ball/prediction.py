@@ -96,7 +96,6 @@ def _node_function(num_nodes: int) -> Callable:
 
     @functools.cache
     def slopes(moving: tuple[int, ...]) -> Callable:
-        """Build the function that differentiates states at nodes by the arguments `moving`."""
         return with_kernel(jax.jacfwd(integrate, argnums=moving), path, num_nodes, moving)
 
     def jvp(primals: tuple, tangents: tuple) -> tuple:

@@ -252,7 +252,7 @@ def all_ruled(cases: PyTree) -> Iterator[Ruled]:
 
 
 def _parts(tree: PyTree, place: str = "") -> Iterator[tuple[str, PyTree]]:
-    """Yield (prefix, part) for each part of `tree` whose class has `rules`; `tree` has `place`."""
+    """Yield (prefix, part) for the parts of `tree` whose class has `rules`; prefixes are dotted."""
     if getattr(type(tree), "rules", None):
         yield place, tree
     children: Mapping[str, PyTree] = {}

@@ -190,7 +190,6 @@ def _slopes_by_all(along: Along, columns: Array, durations: Array, parameters: P
 
 
 def _curvature(along: Along, primals: tuple, tangents: tuple) -> tuple:
-    """Return the derivative of `_slopes_by_all` along `tangents`, whose last entry may be None."""
     moves = 2 if tangents[2] is None else 3
     slopes = lambda *moving: _slopes_by_all(along, *moving, *primals[moves:])  # noqa: E731
     return jax.jvp(slopes, primals[:moves], tangents[:moves])[1]

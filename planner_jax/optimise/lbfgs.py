@@ -191,7 +191,7 @@ def is_stationary(numbers: LbfgsNumbers, config: LbfgsConfig) -> Array:
 
 @struct.dataclass
 class _Choice:
-    """The outcome of one iteration: the step length, and the scalars of the state after it."""
+    """The outcome of an iteration of L-BFGS: its step length, and scalars of the state after it."""
 
     numbers: LbfgsNumbers  # after the iteration
     length: Array  # (), factor on the direction; 0 without a decrease

@@ -248,7 +248,7 @@ def _lowest(diagonal: list[Array], beside: list[Array]) -> Array:
 
 
 def _tridiagonal_solve(diagonal: list[Array], beside: list[Array], shift: Array) -> Array:
-    """Solve (T + shift * I) x = (1, 0, ..., 0) for x (m,); T is a tridiagonal matrix."""
+    """Solve (T + shift I) x = (1, 0, ..., 0) for x (m,); T has off-diagonal entries `beside`."""
     pivots = _pivots(diagonal, beside, shift)
     right = [jnp.ones_like(pivots[0])]
     for k in range(1, len(pivots)):

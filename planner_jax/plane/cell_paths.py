@@ -50,7 +50,7 @@ def draw_noise(lattice: Lattice, num: int, seed: int, candidates: int) -> PathNo
 
 
 def _velocity(level: Array, heading: Array, grid: Grid) -> Array:
-    """Return velocities (..., 2), in speed levels, of speed levels and heading bins (...) of a car.
+    """Return velocities (..., 2), in units of a speed level, of speed levels and heading bins.
 
     Axis 0 has the heading of bin 0, and axis 1 points to its left.
     """
