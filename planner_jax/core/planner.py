@@ -35,7 +35,7 @@ class Kind(enum.Enum):
 
 
 class Drive(Protocol):
-    """The function with which a composite planner runs other planners; see `Planner.plan_by`."""
+    """The function with which the method `plan_by` of a planner runs other planners."""
 
     @property
     def is_pure(self) -> bool:

@@ -56,7 +56,7 @@ class Task:
     # Keyword arguments with which speed benchmarks call `planner`.
     bench: Mapping[str, object] = dataclasses.field(default_factory=dict)
     contact: str | None = None  # dotted name of the contact times in a plan, such as "stroke.time"
-    # Planner whose costs are the reference for other plans; None: a longer search is it.
+    # Planner whose plans' costs are the reference for cost gaps; None: a longer search's costs.
     yardstick: str | None = None
 
     @property

@@ -183,7 +183,7 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
         return (together / jnp.asarray(self.scale, together.dtype)[None]).ravel()
 
     def along(self, nodes: int, case: QuadrotorCase) -> Along:
-        """Return the definition of penalties, evaluated at `nodes` intervals of each piece."""
+        """Return the penalties' integrand and quadrature, with `nodes` intervals of each piece."""
         return flight_along(self.maps, nodes, case, self.margin, self.hinge_width)
 
     def evaluate_ends(

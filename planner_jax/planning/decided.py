@@ -1,4 +1,4 @@
-"""The composite planner that first decides what a case leaves open, such as an order of targets."""
+"""The planner that first decides what cases leave open, such as an order of the targets."""
 
 from collections.abc import Callable
 

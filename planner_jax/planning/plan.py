@@ -30,9 +30,9 @@ def plan(
 ) -> PlanT:
     """Plan one case, or a batch of cases with a leading axis on every leaf.
 
-    Inside a compiled function of the caller this is `solve`. The same call returns
-    bitwise the same plans. With other cases in the batch, other chunks or other devices, a case's
-    arithmetic is rounded differently. A search that ends before the optimum may then end at
+    Inside a compiled function of the caller this is `solve`. A repeated call returns bitwise equal
+    plans. With other cases in the batch, other chunks or other devices, a case's arithmetic is
+    rounded differently. A search that ends before the optimum may then end at
     another point, rarely with another status.
 
     Args:

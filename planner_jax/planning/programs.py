@@ -260,7 +260,7 @@ class _Result:
 
     tree: PyTree = None
     fields: list[tuple[slice, tuple[int, ...]]] = dataclasses.field(default_factory=list)
-    # Indices and dtypes of the leaves whose dtype differs from the vector's dtype.
+    # Indices and dtypes of the leaves whose dtype differs from the packed vector's dtype.
     others: list[tuple[int, np.dtype]] = dataclasses.field(default_factory=list)
 
 

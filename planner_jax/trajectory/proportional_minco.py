@@ -159,8 +159,8 @@ def proportional_minco(
     b, q = np.s_[: 2 * s], np.s_[2 * s :]
     from_offsets, norm = np.eye(known.size), 1.0
     for k in range(len(kinds) if m > 1 else 0):
-        # Offsets of positions (k = 0) or velocities (k = 1) at waypoints are deviations from the
-        # values of least energy. Columns before them are fixed, and columns after them are free.
+        # Offsets of waypoints (k = 0) or of velocities there (k = 1) are deviations from the values
+        # of least energy, given the end states and, for k = 1, the waypoints.
         begin, end = (2 * s + j * (m - 1) for j in (k, k + 1))
         before, own = np.s_[:begin], np.s_[begin:end]
         reduced = _least_energy(energy, end)
