@@ -357,7 +357,7 @@ def pipeline(bench: Bench, num: int, seed: int) -> None:
 
 
 def planning(bench: Bench, num: int, seed: int) -> None:
-    """Report planning times for one throw: for the arm's first motion, and for a re-planned one."""
+    """Report planning times for one throw: for the arm's first motion, and for re-planning."""
     cases = jax.tree.map(np.asarray, pj.block.draw(num, "short", seed, regime="R1", wide=True))
     planner, sensor = pj.block.planner(), eye(std=0.02)
     known = [

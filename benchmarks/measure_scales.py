@@ -180,7 +180,7 @@ def draw_weak_throws(num: int, seed: int) -> pj.catch.CatchCase:
 
 
 def hit_planners() -> dict[str, Any]:
-    """Return planners of hits with rough scales, one for each number of pieces, by file key."""
+    """Return planners of hits with rough scales, by their keys in the shipped file of scales."""
     found = {}
     for pieces in HIT_PIECES:
         first = (0.2,) * (3 * (pieces - 1)) + _FIRST_HIT
@@ -190,7 +190,7 @@ def hit_planners() -> dict[str, Any]:
 
 
 def catch_planners() -> dict[str, Any]:
-    """Return planners of catches with rough scales, one for each number of pieces, by file key."""
+    """Return planners of catches with rough scales, by their keys in the shipped file of scales."""
     found = {}
     for pieces in CATCH_PIECES:
         first = (0.3,) * (3 * (pieces - 1)) + _FIRST_CATCH

@@ -97,7 +97,7 @@ def unpack(vector, sizes: dict[str, int]) -> dict:
 
 
 def advance(motion: list, time) -> list:
-    """Return `motion` (position and derivatives) `time` [s] later; the last one is constant."""
+    """Return position and derivatives `time` [s] after `motion`, with constant last derivative."""
     orders = range(len(motion))
     return [
         sum(motion[n + i] * (time**i / math.factorial(i)) for i in orders[: len(motion) - n])

@@ -44,7 +44,10 @@ class Basis:
         self.scale = ca.DM(planner.scale).T
 
     def join(self, outward: Any, offsets: Any) -> tuple[Any, Any]:
-        """Return the C coefficients per axis (C, 3), and the mean duration h of a piece [s]."""
+        """Return the C coefficients per axis (C, 3), and the mean duration h of a piece [s].
+
+        `outward` is one vector with the boundary conditions and h.
+        """
         rows = 2 * ORDERS
         columns = ca.vertcat(ca.reshape(outward[: 3 * rows], rows, 3), offsets)
         return columns, outward[3 * rows]

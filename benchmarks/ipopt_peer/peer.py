@@ -194,8 +194,8 @@ def best_setting(peer: Peer, batch: Batch, accepted: Any) -> tuple[tuple, list[d
     """Select the fastest setting of IPOPT among those with the highest success rate.
 
     In nine of ten cases the setting's objective must also exceed the least objective of all
-    settings by at most 0.1 %. If no setting fulfils this, the one with the least excess is
-    selected.
+    settings by at most 0.1 %. If no setting fulfils this, the setting with the least excess
+    is selected.
 
     Args:
         peer: IPOPT on one form of the problem; the settings for this form are tried.

@@ -102,7 +102,7 @@ def best_turn(seen: Centred, fastest: ArrayLike) -> TurnFit:
     """Fit position, velocity and turn rate; derivatives of the fit are exact at the optimum."""
 
     def downhill(rate: Array) -> Array:
-        """Return minus half the derivative of the sum of squares by the rate, () [m^2 s/rad]."""
+        """Return half the sum of squared residuals, differentiated by -`rate`, () [m^2 s/rad]."""
         fit = fit_rate(seen, rate)
         _, slopes = jax.jvp(lambda rate: arc(rate, seen.after), (rate,), (jnp.ones_like(rate),))
         return _sum(seen, _times(fit.velocity, slopes), fit.residual)

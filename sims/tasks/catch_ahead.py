@@ -112,8 +112,8 @@ def with_catch(flights: FlightState, found: CatchPlan, new: Array) -> FlightStat
         old, number = flight.plan, new.size
         each = found.trajectory.durations.size // number
         used = jnp.sum(old.trajectory.durations.reshape(number, each), axis=1) > 0.0
-        # Number of catches of the old plan that stay, including past catches. The last catch of
-        # the old plan, of the ball that was not yet seen, is replaced by the found plan.
+        # Number of catches that are kept from the old plan, including past catches. The found plan
+        # replaces the old plan's last catch, which was planned for a ball that was not yet seen.
         num_kept = jnp.sum(used & ~new[old.order])
         place = jnp.arange(number)
         kept = place < num_kept

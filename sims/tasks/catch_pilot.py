@@ -37,11 +37,10 @@ class CatchPilot:
     # In the last 0.2 s before a catch the plan is not changed. A change would cost more accuracy
     # than new observations of the ball gain.
     planner: ReplanCatch = ReplanCatch(ExactCatch(lift=LIFT), shortest=0.2)
-    # Greatest relative violation of a limit with which a new plan is flown: first if one catch is
-    # left, then if several catches are left. A new plan with a greater violation is
-    # flown only if the old plan's violation is at least as large. While several catches are left,
-    # most of the violation lies in later catches, which will be planned again. Rejecting the new
-    # plan would miss the first ball.
+    # Greatest relative violation of a limit with which a new plan is flown in any case: for one
+    # remaining catch, and for several. Beyond it, the new plan must not violate limits more than
+    # the old plan. With several catches most of the violation lies in later catches, which will be
+    # planned again; rejecting the new plan would miss the first ball.
     excess: tuple[float, float] = (BORNE, 1.0)
     # Name of the method that decides order and times of the catches, or "policy:FILE". With "given"
     # the order and times of the current plan stay, and only the trajectory is planned from scratch.

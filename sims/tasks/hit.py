@@ -122,7 +122,7 @@ class HitPilot:
     def pose_problem(
         self, case: HitCase, plan: HitPlan, outlook: Outlook
     ) -> Replanning[HitCase, HitPlan]:
-        """Return the replanning problem for the predicted ball and robot; `plan` is now flown."""
+        """Return the replanning problem for the predicted ball and robot and the current plan."""
         return Replanning(
             case=replace_ball(case, outlook.balls, outlook.drag, outlook.head_state),
             previous=plan,

@@ -29,7 +29,7 @@ class Gains:
 
     @property
     def across(self) -> tuple[float, float]:
-        """Gains of the regulator: extra curvature per lateral [1/m^2] and heading error [1/m]."""
+        """Feedback gains: added curvature per lateral error [1/m^2] and heading error [1/m]."""
         place = self.bend / self.reach
         return place, float(np.sqrt((self.bend / self.turn) ** 2 + 2.0 * place))
 
@@ -45,7 +45,7 @@ class CarState:
 
 @struct.dataclass
 class Reference:
-    """The planned state of the car at one instant, with inputs of one actuator lag later."""
+    """The car's planned state at one instant, and the planned inputs one actuator lag later."""
 
     pos: Array  # (2,) [m], position of the rear axle's centre
     heading: Array  # () [rad]
