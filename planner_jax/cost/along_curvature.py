@@ -40,9 +40,8 @@ class AlongCurvature:
     by_theta: Array  # ()
     columns_theta: Array  # (C, 3)
     theta_theta: Array  # ()
-    # Second derivatives of the penalty by the motion at K samples, for `columns_columns` and
-    # `block_and_diagonal`. Axis pairs (x, x), (x, y), ... that share their T pairs of derivative
-    # orders form a group; a group has one array (T * K, axis pairs).
+    # Second derivatives of the penalty by the motion at the samples. Only `columns_columns` and
+    # `block_and_diagonal` use these arrays.
     at_samples: tuple[Array, ...]
 
 
@@ -236,8 +235,8 @@ class _Constants:
     samples: np.ndarray
     moving_samples: np.ndarray  # (orders, K, C)
     groups: tuple[tuple[Slot, ...], ...]
-    # Groups of pairs of axes, each with the pairs (d, e) of orders of the motion's derivatives by
-    # which the second derivatives of the penalty are not zero.
+    # Groups of pairs of axes such as (x, y). With each group, pairs of orders such as (1, 2), for
+    # velocity and acceleration, by which second derivatives of the penalty are not zero.
     pairs: tuple[tuple[tuple[tuple[int, int], ...], tuple[tuple[int, int], ...]], ...]
 
     @property

@@ -50,7 +50,7 @@ class Grid:
 
     @property
     def blocks(self) -> int:
-        """Number of blocks for one segment of all lanes (problems of the batch)."""
+        """Number of GPU blocks for one segment of all lanes (problems of the batch)."""
         return self.lanes // self.threads
 
     @property

@@ -13,8 +13,8 @@ from jax.experimental import pallas
 from jax.experimental.pallas.triton import CompilerParams, load, store
 from jax.typing import DTypeLike
 
-# The part of an array that one run of a kernel's body accesses: its shape, with None for an axis
-# that it lacks, and a function from the index in the grid to the block's index, counted in blocks.
+# The part of an array that one run of a kernel's body accesses: its shape (None: an axis that the
+# body does not see), and a function from the run's index in the grid to the block's index.
 Block = tuple[tuple[int | None, ...], Callable[..., tuple]]
 
 _FEWEST = 16  # least number of lanes (problems of a batch) in a block of a kernel

@@ -133,7 +133,7 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
         return point
 
     def _fit_scale(self, scale: tuple[float, ...]) -> tuple[float, ...]:
-        """Return the units of a segment's variables; a subclass may append to a short `scale`."""
+        """Return the units of a segment's variables; a subclass may append units to `scale`."""
         return scale
 
     @property

@@ -20,7 +20,7 @@ _LANES, _THREADS = 32, 128  # problems and threads of a CUDA block
 
 
 def turn_kernel(num_pairs: int, step_cap: float, *, interpret: bool = False) -> Callable:
-    """Make the CUDA kernel that computes `lbfgs.remember`, then `lbfgs.search_direction`."""
+    """Make the CUDA kernel that updates the memory of L-BFGS and computes the next direction."""
 
     def kernel(treedef: Treedef, leaves: Sequence[Array]) -> Sequence[Array] | None:
         grad = leaves[-1]

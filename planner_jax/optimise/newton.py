@@ -206,7 +206,7 @@ def _lanczos(
 
 
 def _pivots(diagonal: list[Array], beside: list[Array], shift: Array) -> list[Array]:
-    """Return pivots, none near 0, of T + shift I; T has the off-diagonal entries `beside`."""
+    """Return pivots, none near 0, of T + shift I with the tridiagonal T of `diagonal`, `beside`."""
     scale = functools.reduce(jnp.maximum, [jnp.abs(each) for each in (*diagonal, *beside)])
     least = _LEAST * scale + 1e-30
     found = []
@@ -248,7 +248,7 @@ def _lowest(diagonal: list[Array], beside: list[Array]) -> Array:
 
 
 def _tridiagonal_solve(diagonal: list[Array], beside: list[Array], shift: Array) -> Array:
-    """Solve (T + shift I) x = (1, 0, ..., 0) for x (m,); T has off-diagonal entries `beside`."""
+    """Solve (T + shift I) x = (1, 0, ..., 0) with the tridiagonal T of `diagonal` and `beside`."""
     pivots = _pivots(diagonal, beside, shift)
     right = [jnp.ones_like(pivots[0])]
     for k in range(1, len(pivots)):

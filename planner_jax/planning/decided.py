@@ -34,7 +34,7 @@ class DecidedPlanner(PlannerAround[CaseT, PlanT]):
         """Return the inner planner, which minimises a cost, and the cases with their choices.
 
         The choices are taken from plans that `plan_of` makes. Without `plan_of` they are the first
-        proposals of the decision, and nothing is planned.
+        choices that `decision` proposes, and nothing is planned.
         """
         if plan_of is None:
             return self.planner.settle(first_choice(self.decision, cases))

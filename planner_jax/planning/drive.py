@@ -41,7 +41,7 @@ class Driver:
     def __call__(
         self, planner: Planner, cases: PyTree, attempts: Sequence[Attempt] | None = None
     ) -> tuple[PyTree, PyTree]:
-        """Plan by the listed attempts, or by all; return plans, and zeros if all are solved."""
+        """Plan by the listed attempts, or by all; return plans, and marks or counts of failures."""
         if planner.kind is Kind.COMPOSITE:
             plans = planner.plan_by(self, cases)
             return plans, is_unsolved(plans.status)

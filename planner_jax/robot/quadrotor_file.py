@@ -277,7 +277,7 @@ def _merge(under: Mapping[str, Value], over: Mapping[str, Value]) -> dict[str, V
 
 
 def _require_units(description: Mapping[str, Value], place: str) -> None:
-    """Raise `RobotError` if an inertia has no unit; see the module's docstring."""
+    """Raise `RobotError` if an inertia has no unit: kg m^2 and g m^2 are easily confused."""
     for name, quantity in _FIELDS[""].items():
         if quantity and quantity.example and not _has_unit(value := description.get(name)):
             units = ", ".join(UNITS[quantity.kind])
