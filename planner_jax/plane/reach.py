@@ -280,7 +280,7 @@ def reach_set(
     ]
 
     def apart(bits: Array, n: Array) -> Array:
-        """Compute the states at time n + 1 from time n, each of `parts` in its own loop iteration.
+        """Compute the states at time step n + 1 from step n, each of `parts` in its own iteration.
 
         The parts are a change of speed, a turn and moves. XLA would otherwise fuse them on a CPU,
         and repeat the work of one part for every bit that the next part reads.

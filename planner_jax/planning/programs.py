@@ -71,7 +71,7 @@ class Sizes:
 
 
 def sizes_of(planner: Planner, attempt: Attempt, chunk: int | None, mesh: Mesh) -> Sizes:
-    """Return the call sizes of an attempt: `chunk` cases, or numbers that suit the device."""
+    """Return how many cases one call may solve: `chunk`, or numbers that suit the device."""
     busy = _GPU_BUSY // attempt.starts
     if chunk is not None:
         return Sizes(chunk, busy)
