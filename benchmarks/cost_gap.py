@@ -65,7 +65,7 @@ def _reference_planner(planner: Any, cases: Any, card: Task | None) -> Any:
     if card is None or card.yardstick is None:
         return None
     yardstick = card.planner(card.yardstick)
-    # The yardstick cannot plan re-planning problems and groups of targets, which are other classes.
+    # The yardstick, whose costs are the reference, cannot plan cases of another class.
     return yardstick if isinstance(cases, yardstick.case_type) else None
 
 

@@ -49,7 +49,7 @@ _KEPT = 5  # number of simulated frames from one recorded sample to the next
 
 
 class BlockFlight(FlightTask):
-    """The task `block` as `run.py` flies, scores and draws it; the settings are `BlockFly`."""
+    """Methods by which `run.py` flies, scores and draws the task `block`, and its settings."""
 
     settings: BlockFly
 

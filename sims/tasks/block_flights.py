@@ -229,7 +229,7 @@ def require_arm(world: World, cases: BlockCase) -> None:
     for (path, value), planned in zip(own, jax.tree.leaves(cases.arm), strict=True):
         name = path[-1].name
         same = np.shape(planned)[1:] == np.shape(value)
-        # Joint angles at the start are part of each case, so that the field `home` may differ.
+        # The field `home` may differ: each case has its own joint angles at the start.
         if name != "home" and not (same and np.allclose(planned, value, rtol=1e-5, atol=1e-6)):
             raise ArgumentError(name, "the same in plan and simulated arm", shown="")
 

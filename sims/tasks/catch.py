@@ -225,7 +225,7 @@ def fly_catches(
 
 
 class CatchFlight(BallFlightTask):
-    """The task `catch` as `run.py` flies, scores and draws it; the settings are `CatchFly`."""
+    """Methods by which `run.py` flies, scores and draws the task `catch`, and its settings."""
 
     settings: CatchFly
 

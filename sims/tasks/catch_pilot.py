@@ -38,7 +38,7 @@ class CatchPilot:
     # than new observations of the ball gain.
     planner: ReplanCatch = ReplanCatch(ExactCatch(lift=LIFT), shortest=0.2)
     # Greatest relative violation of a limit with which a new plan is flown in any case: for one
-    # remaining catch, and for several. Beyond it, the new plan must not violate limits more than
+    # remaining catch, and for several. Above it, the new plan must not violate limits more than
     # the old plan. With several catches most of the violation lies in later catches, which will be
     # planned again; rejecting the new plan would miss the first ball.
     excess: tuple[float, float] = (BORNE, 1.0)

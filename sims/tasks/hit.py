@@ -275,7 +275,7 @@ def fly_hits(
 
 
 class HitFlight(BallFlightTask):
-    """The task `hit` as `run.py` flies, scores and draws it; the settings are `HitFly`."""
+    """Methods by which `run.py` flies, scores and draws the task `hit`, and its settings."""
 
     settings: HitFly
 

@@ -40,7 +40,7 @@ _WALL_HEIGHT, _MOVER_HEIGHT, _TARGET_HEIGHT = 0.25, 0.2, 0.08  # [m], heights in
 
 
 class InterceptFlight(FlightTask):
-    """The task `intercept` as `run.py` drives, scores and draws it; settings are `InterceptFly`."""
+    """Methods by which `run.py` drives, scores and draws the task `intercept`, and its settings."""
 
     settings: InterceptFly
 
