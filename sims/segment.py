@@ -15,8 +15,8 @@ from planner_jax.studies.block.camera import Camera, back_project, from_numbers
 from planner_jax.studies.block.noise import StereoNoise
 
 WINDOW = 64  # [px], edge of the evaluated square around the median of the mask's pixels
-# Mean height of a sphere's visible half above its centre, toward a distant camera, in radii of the
-# sphere, averaged over the pixels.
+# Mean distance of a sphere's visible surface from the plane through its centre that faces a distant
+# camera, over all pixels of the sphere, divided by its radius.
 _MEAN_HEIGHT = 2.0 / 3.0
 _WHOLE = 0.7  # least fraction of a ball's pixels, expected at its depth, that must be visible
 

@@ -31,8 +31,8 @@ COARSE_FLOOR, FINE_FLOOR = -0.01, -0.003  # Lower bounds of the excess before an
 # Excess up to which the pieces of a solution are halved, to refine it. Halving reduces the excess
 # by 0.03 at most.
 REFINED_BELOW = 0.06
-# The pieces of a solution are halved only if its excess is at least this much below the excess of
-# every solution for which halving has failed.
+# A solution is refined by halving its pieces only if its excess is lower, by at least this amount,
+# than the excess of every solution whose refinement has failed.
 NEW_BELOW = 0.001
 # A case is abandoned after 4 starting points if the trajectory from each of them exceeds some
 # limit by more than 10 %.

@@ -56,7 +56,7 @@ class Reference:
 
 
 def reference_at(plan: CarPlan, time: Array, vehicle: Vehicle) -> Reference:
-    """Return the planned state at a time [s] since the plan's start, with inputs of one lag later.
+    """Return the planned state at a time [s] after the plan's start, and inputs for one lag later.
 
     A first-order lag delays a ramp by exactly its time constant. Inputs that are taken from one lag
     ahead therefore arrive in time, as long as they change slowly.
