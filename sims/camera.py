@@ -236,7 +236,6 @@ def _scene_model(arm_xml: str, camera: Camera, scene: Scene, ball_radius: float)
 
 
 def _element(tag: str, **attributes: Any) -> ET.Element:
-    """Return an MJCF element; lists and arrays become numbers separated by blanks."""
     written = {
         name: value if isinstance(value, str) else xml_numbers(*np.atleast_1d(value))
         for name, value in attributes.items()

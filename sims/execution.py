@@ -143,7 +143,6 @@ def _start(world: World, setting: _Setting, key: Array) -> ArmState:
 
 @functools.cache
 def _compile(world: World) -> tuple[Callable, Callable, Callable]:
-    """Return compiled functions that start arms, advance arms, and evaluate planned angles."""
     options = compiler_options()
     start = jax.jit(jax.vmap(functools.partial(_start, world)))
     advance = jax.jit(jax.vmap(functools.partial(_frames, world)), compiler_options=options)

@@ -161,7 +161,6 @@ class Scene:
         return min(at, self.num_samples - 1)
 
     def _machine(self) -> list[Part]:
-        """Return the pitching machine's parts at the launch position; empty without a machine."""
         launch = self.recording.launch(self.flight)
         return machine_parts(*launch) if launch and self.world.mouth else []
 

@@ -132,7 +132,6 @@ def _pose_problems(
 
 @functools.partial(jax.jit, static_argnames=("pilot", "number"))
 def _search_plans(pilot: Pilot, number: int, asked: Any) -> Any:
-    """Run the task's search number `number` on the B planning problems `asked`; return B plans."""
     return jax.vmap(pilot.searches[number])(asked)
 
 
@@ -140,7 +139,6 @@ def _search_plans(pilot: Pilot, number: int, asked: Any) -> Any:
 def _fly(
     loop: Loop, pilot: Pilot, flights: FlightState, drag: Array, num_periods: int
 ) -> tuple[FlightState, Record | None]:
-    """Simulate flights along their plans for `num_periods` planning periods, without replanning."""
 
     def one(flight: FlightState, drag: Array) -> tuple[FlightState, Record | None]:
         def next_observation(flight: FlightState, _: None) -> tuple[FlightState, Record | None]:

@@ -193,7 +193,6 @@ def make_recording(
 
 
 def _or_never(time: np.ndarray) -> np.ndarray:
-    """Replace NaN times, of events that never happen, by infinity."""
     return np.nan_to_num(time, nan=np.inf)
 
 

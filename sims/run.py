@@ -109,7 +109,6 @@ def start_flights(
 
 
 def _discard_unfinished(folder: RunFolder) -> str:
-    """Remove the files of an unfinished run, and return a message about the removal."""
     try:
         if folder.read_manifest()["state"] == "complete":
             return f"the flights are finished: {folder.path}"
@@ -210,7 +209,6 @@ def _fly_all(flight: FlightTask, cases: Any, shown: int) -> tuple[pa.Table, dict
 
 
 def _summary(flight: FlightTask, rows: pa.Table) -> dict[str, Any]:
-    """Return counts, success rate and tracking errors of a run, from its table of results."""
     success = np.asarray(rows["success"])
     low, high = wilson_interval(int(success.sum()), success.size)
     return {
@@ -301,5 +299,4 @@ def write_flight_report(folder: RunFolder) -> None:
 
 
 def _image(name: str) -> str:
-    """Return the HTML of a picture in the run folder."""
     return f'<p><img src="figures/{name}" alt="{name.partition(".")[0]}"></p>\n'

@@ -220,7 +220,6 @@ def _middle(counts: Array) -> Array:
 
 
 def _median(values: Array, usable: Array) -> Array:
-    """Return the median () of the usable values of an array; 0 if none is usable."""
     num = jnp.sum(usable)
     ordered = jnp.sort(jnp.where(usable, values, jnp.inf).reshape(-1))
     both = ordered[jnp.maximum(num - 1, 0) // 2] + ordered[num // 2]

@@ -30,7 +30,6 @@ _STEP = 0.01  # [s], step of the time slider
 
 
 def _rgb(colour: str) -> tuple[int, int, int]:
-    """Convert a colour #RRGGBB to red, green and blue, 0 to 255."""
     red, green, blue = (int(colour[k : k + 2], 16) for k in (1, 3, 5))
     return red, green, blue
 
@@ -181,7 +180,6 @@ class Viewer:
         self._server.stop()
 
     def _add_fixed_objects(self) -> None:
-        """Add the objects that all flights share: ground, scenery, robot, balls and trails."""
         add = self._scene
         add.set_up_direction("+z")
         add.add_grid(
@@ -246,7 +244,6 @@ class Viewer:
         return drawn
 
     def _draw_flight(self) -> None:
-        """Draw the standing objects of the selected flight, and then its first sample."""
         with self._lock, self._server.atomic():
             recording, row = self.recording, self._row
             for part in self._drawn:
@@ -294,7 +291,6 @@ class Viewer:
             self._show()
 
     def _show(self) -> None:
-        """Draw the moving objects at the time that the slider shows."""
         with self._lock, self._server.atomic():
             row, sample = self._row, self.sample
             robot = self.world.robot

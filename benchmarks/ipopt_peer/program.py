@@ -264,7 +264,6 @@ class Program:
         return ca.Function("nlp", [x, params], [f, g], ["x", "p"], ["f", "g"])
 
     def _gradient(self) -> Any:
-        """Build the objective and its gradient with respect to x."""
         x, params, natural, offsets = self._point()
         outward, core, _, by_natural = self._ends_slopes(natural, params)
         columns, h = self._basis.join(outward, offsets)
@@ -285,7 +284,6 @@ class Program:
         return ca.Function("gradient", [x, params], [f, gradient], ["x", "p"], ["f", "grad_f_x"])
 
     def _jacobian(self) -> Any:
-        """Build the constraints and their Jacobian with respect to x."""
         x, params, natural, offsets = self._point()
         outward, _, at_ends, by_natural = self._ends_slopes(natural, params)
         columns, h = self._basis.join(outward, offsets)

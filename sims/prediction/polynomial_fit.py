@@ -74,5 +74,4 @@ def _coefficients(root: Array, values: Array, span: Array) -> Array:
 
 
 def _powers(x: Array, degree: int) -> Array:
-    """Return the powers 0 to `degree` of numbers (...), as an array (..., degree + 1)."""
     return jnp.stack([x**k for k in range(degree + 1)], axis=-1)

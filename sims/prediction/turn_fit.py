@@ -154,12 +154,10 @@ def _times(a: Pair, b: Pair) -> Pair:
 
 
 def _sum(seen: Centred, a: Pair, b: Pair) -> Array:
-    """Return the weighted sum () over observations of the scalar products of points a and b."""
     return jnp.sum(seen.weight * (a[0] * b[0] + a[1] * b[1]))
 
 
 def _mean(seen: Centred, a: Pair) -> Pair:
-    """Return the weighted mean over observations of points, as a pair of coordinates ()."""
     x, y = (jnp.sum(seen.weight * each) / seen.total for each in a)
     return x, y
 

@@ -31,7 +31,6 @@ def _make_box_part(box: Box, colour: str, opacity: float) -> Part:
 
 
 def _around(ends: np.ndarray, radius: float) -> np.ndarray:
-    """Return opposite corners (2, 3) [m] of a beam's box, from the ends of its axis (2, 3) [m]."""
     across = radius * (ends[0] == ends[1])
     return np.stack([ends.min(axis=0) - across, ends.max(axis=0) + across])
 

@@ -119,7 +119,6 @@ def with_catch(flights: FlightState, found: CatchPlan, new: Array) -> FlightStat
         kept = place < num_kept
 
         def behind(old: Array, found: Array) -> Array:
-            """Join arrays with a row per catch: rows of the old plan, then of the found plan."""
             rows = jnp.where(kept, 0, place - num_kept)
             shape = (number, *(1,) * (old.ndim - 1))
             return jnp.where(kept.reshape(shape), old, found[rows])

@@ -109,7 +109,6 @@ class CatchPilot:
         return plan, good & (plan.violation <= jnp.maximum(excess, asked.previous.violation))
 
     def _decide_again(self, asked: Replanning[CatchCase, CatchPlan]) -> CatchPlan:
-        """Plan the remaining catches from scratch, with a newly decided order and times."""
         left = asked.case
         choices = find_decision(DECISIONS, self.decide, TRAINED).propose(left)
         choice = jax.tree.map(lambda leaf: leaf[0], choices)

@@ -216,7 +216,6 @@ def _get_drives(batch: Any) -> Driven:
 
 
 def _add_height(points: np.ndarray, height: float) -> np.ndarray:
-    """Append a height [m] to points (..., 2) [m] of the plane; NaN points get a height of NaN."""
     high = np.where(np.isfinite(points[..., :1]), height, np.nan)
     return np.concatenate([points, high], axis=-1)
 

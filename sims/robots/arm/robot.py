@@ -39,7 +39,6 @@ _THICKNESS = 0.01  # [m], thickness of the shield
 
 @functools.cache
 def _arm(xml: str) -> Any:
-    """Parse MJCF text into an `Arm` with NumPy float64 leaves."""
     return read_arm(xml, dtype=np.float64)
 
 
@@ -206,5 +205,4 @@ class ShieldArm:
 
 
 def _box(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return centre and half edges (3,) [m] of the box between two corners (2, 3)."""
     return 0.5 * (corners[0] + corners[1]), 0.5 * (corners[1] - corners[0])
