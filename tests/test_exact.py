@@ -158,14 +158,14 @@ def test_objective_gradient_agrees_with_finite_differences(float64):
 SUPPLE = dataclasses.replace(PLANNER, velocities=True)
 
 
-def test_a_point_that_is_converted_to_velocities_as_variables_is_the_same_plan(cases):
+def test_with_zero_offsets_of_velocities_a_point_is_the_same_plan(cases):
     lane = pj.take(cases, 1)
     context, guess = first_guess(lane)
     point = guess + 0.1 * np.random.default_rng(1).normal(size=guess.size).astype(np.float32)
 
     @jax.jit
     def both(point):
-        converted = SUPPLE.convert_point(point, PLANNER)
+        converted = jnp.zeros(SUPPLE.held.shape).at[~SUPPLE.held].set(point)
         plans = PLANNER.decode(point, context), SUPPLE.decode(converted, context)
         return (
             converted,
@@ -180,7 +180,6 @@ def test_a_point_that_is_converted_to_velocities_as_variables_is_the_same_plan(c
         supple.trajectory.coeffs[:, :4], usual.trajectory.coeffs[:, :4], atol=2e-3
     )
     np.testing.assert_allclose(costs[1].cost, costs[0].cost, rtol=1e-3)
-    np.testing.assert_array_equal(SUPPLE.convert_point(converted, SUPPLE), converted)
 
 
 def test_velocities_as_variables_have_exact_derivatives(float64, cases):
@@ -204,7 +203,7 @@ def test_all_guesses_but_the_first_pass_the_ball_as_fast_as_the_way_there_asks(c
     @jax.jit
     def impacts(case):
         context = PLANNER.prepare(case)
-        natural = PLANNER.guesses(context, 12)[:, -8:] * jnp.asarray(PLANNER.scale[-8:])[None]
+        natural = PLANNER.guesses(context, 13)[1:, -8:] * jnp.asarray(PLANNER.scale[-8:])[None]
         return jax.vmap(lambda own: PLANNER.impact(own, context))(natural)
 
     found = impacts(lane)
@@ -230,7 +229,7 @@ def test_late_hits_that_no_short_search_finds_are_found_by_the_rounds_after_it()
     assert shares[2] > 0.965
 
 
-@pytest.mark.parametrize(("planner", "starts"), [(PLANNER, 12), (pj.catch.ExactCatch(), 6)])
+@pytest.mark.parametrize(("planner", "starts"), [(PLANNER, 13), (pj.catch.ExactCatch(), 6)])
 def test_sizes_that_make_no_sense_are_refused(planner, starts):
     rule = r"proportions must be of >= 2 pieces, finite and > 0, got \(1.0,\)"
     with pytest.raises(ValueError, match=rule):

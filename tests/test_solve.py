@@ -12,7 +12,7 @@ from jax import Array
 from planner_jax.core.protocol import Plan, Status, is_solved
 from planner_jax.optimise.planner import OptimisedPlanner, pending
 from planner_jax.optimise.settings import Evaluation, LbfgsConfig, Round, Stage
-from planner_jax.planning import batch
+from planner_jax.planning import batch, searches
 from planner_jax.planning.plan import plan, solve
 from tests.trees import assert_same
 
@@ -151,17 +151,22 @@ def test_arrays_on_a_device_stay_there_and_give_the_same_plans(apart, monkeypatc
 
 def test_a_later_round_takes_only_what_is_unsolved(monkeypatch):
     monkeypatch.setattr(batch, "is_one_cpu", lambda mesh: False)
-    sizes, solve_on_devices = [], batch.solve_on_devices
+    sizes, solve_on_devices, divide_batch = [], batch.solve_on_devices, searches.divide_batch
 
     def note_size(planner, attempt, mesh, cases):
         sizes.append(cases.goal.size)
         return solve_on_devices(planner, attempt, mesh, cases)
 
+    def note_divided(planner, attempt, mesh, cases):
+        sizes.append(cases.goal.size)
+        return divide_batch(planner, attempt, mesh, cases)
+
     monkeypatch.setattr(batch, "solve_on_devices", note_size)
+    monkeypatch.setattr(searches, "divide_batch", note_divided)
     goals = np.full(300, 0.5, np.float32)
     goals[[7, -1]] = 3.5
     assert is_solved(plan(WellPlanner(), Well(jnp.asarray(goals))).status).all()
-    assert sorted(sizes[:2]) == [128, 256] and sizes[2:] == [16]  # the first two calls run at once
+    assert sorted(sizes[:2]) == [128, 256] and sizes[2:] == [2]  # the first two calls run at once
 
 
 def retry_within(within):

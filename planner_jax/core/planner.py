@@ -105,6 +105,13 @@ class Planner(Generic[CaseT, PlanT]):
         """
         return Fixed(attempt)
 
+    def divides(self, attempt: PyTree, /) -> bool:
+        """Return whether an attempt consists of searches that `pj.plan` runs one by one.
+
+        Only an `OptimisedPlanner` has such attempts.
+        """
+        return False
+
     @property
     def inner(self) -> "Planner":
         """The planner inside a planner that wraps another one; otherwise the planner itself."""

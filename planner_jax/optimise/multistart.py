@@ -3,16 +3,18 @@
 import dataclasses
 import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from types import ModuleType
 from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 from jax import Array, lax
 from jaxtyping import PyTree
 
+from planner_jax.core.arithmetic import numpy_of
 from planner_jax.core.protocol import Status, index_of_best, is_unsolved, status_of
 from planner_jax.lanes import over_lanes
 from planner_jax.optimise import lbfgs
@@ -158,7 +160,7 @@ def _optimum_at(point: Array, evaluation: Evaluation, config: Solver) -> Optimum
 
 
 def solve_round(planner: "OptimisedPlanner", attempt: Round, case: PyTree) -> PyTree:
-    """Return the best plan of one case that one round (attempt) finds from its starts; pure."""
+    """Return the plan of one case from one start, with the iterations of one round; pure."""
     last = planner.with_settings(attempt.settings)
     context = last.prepare(case)
 
@@ -170,79 +172,144 @@ def solve_round(planner: "OptimisedPlanner", attempt: Round, case: PyTree) -> Py
             lambda x: problem.curvature_at(x, context),
         )
 
-    before = planner.with_settings(_stages(attempt)[0].settings)
-    points = before.guesses(context, attempt.starts)
-    spent = jnp.zeros(len(points), jnp.int32)
-    optimum = None
-    for stage in _stages(attempt):
+    first = planner.with_settings(attempt.all_stages[0].settings)
+    optimum = _at_start(first.guesses(context, 1)[0])
+    for stage in attempt.all_stages:
         problem = planner.with_settings(stage.settings)
-        points = _of_each(functools.partial(problem.convert_point, before=before), points)
-        optimum = _of_each(functools.partial(search, problem, stage.solver), points)
-        before = problem
-        points, spent = optimum.point, spent + optimum.iterations
-        if stage.keep is not None:
-            kept = _cheapest(optimum.evaluation.cost, stage.keep)
-            points, spent = points[kept], spent[kept]
-    assert optimum is not None  # a round has at least one stage
-    optimum = dataclasses.replace(optimum, iterations=spent)
-    plans = _of_each(lambda found: _plan_at(last, found, context), optimum)
-    return jax.tree.map(lambda leaf: leaf[0], plans) if len(points) == 1 else _best(plans)
+        optimum = _add_spent(search(problem, stage.solver, optimum.point), optimum)
+    return _plan_at(last, optimum, context)
 
 
 def solve_batch(planner: "OptimisedPlanner", attempt: Round, cases: PyTree) -> PyTree:
-    """Return the best plan of each case that one round (attempt) finds from its starts; pure."""
-    last, num = planner.with_settings(attempt.settings), attempt.starts
-    contexts = over_lanes(last.prepare)(jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), cases))
-    before = planner.with_settings(_stages(attempt)[0].settings)
-    starts = over_lanes(lambda context: before.guesses(context, num))(contexts)
-    # Each start of each case is one problem of the solver; the starts of a case are adjacent.
-    points = jnp.moveaxis(starts, 0, -1).reshape(starts.shape[1], -1)
-    of_starts = _repeat(contexts, num)
-    spent = jnp.zeros(points.shape[1:], jnp.int32)
-    optimum = None
-    for stage in _stages(attempt):
+    """Plan a batch of cases from one start each, with the iterations of one round; pure."""
+    last = planner.with_settings(attempt.settings)
+    contexts = over_lanes(last.prepare)(_lanes_last(cases))
+    first = planner.with_settings(attempt.all_stages[0].settings)
+    starts = over_lanes(lambda context: first.guesses(context, 1)[0])(contexts)
+    optimum = over_lanes(_at_start)(starts)
+    for stage in attempt.all_stages:
         problem = planner.with_settings(stage.settings)
-        points = over_lanes(functools.partial(problem.convert_point, before=before))(points)
-        before = problem
-        optimum = minimise_lanes(
-            problem.objective, points, of_starts, stage.solver, problem.curvature_at
+        found = minimise_lanes(
+            problem.objective, optimum.point, contexts, stage.solver, problem.curvature_at
         )
-        points, spent = optimum.point, spent + optimum.iterations
-        if stage.keep is not None:
-            costs = optimum.evaluation.cost.reshape(-1, num)
-            kept = jax.vmap(functools.partial(_cheapest, num=stage.keep))(costs)
-            kept = (kept + num * jnp.arange(len(costs))[:, None]).ravel()
-            points, spent, num = points[:, kept], spent[kept], min(stage.keep, num)
-            of_starts = _repeat(contexts, num)
-    assert optimum is not None  # a round has at least one stage
-    optimum = dataclasses.replace(optimum, iterations=spent)
-    plans = over_lanes(functools.partial(_plan_at, last))(optimum, of_starts)
-    plans = jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), plans)
-    if num == 1:
-        return plans
-    split = lambda x: x.reshape(-1, num, *x.shape[1:])  # noqa: E731
-    return jax.vmap(_best)(jax.tree.map(split, plans))
+        optimum = _add_spent(found, optimum)
+    return _lanes_first(over_lanes(functools.partial(_plan_at, last))(optimum, contexts))
 
 
-def _stages(attempt: Round) -> tuple[Stage, ...]:
-    return (*attempt.stages, Stage(attempt.solver, attempt.settings))
+@struct.dataclass
+class Searches:
+    """L searches of one stage, the lanes of a batch: their cases, and where they start."""
+
+    cases: PyTree  # leaves (L, ...)
+    index: Array  # (L,) int32, index of the starting point among the guesses; -1: `point`
+    point: Array  # (L, n), starting points in n variables
 
 
-def _of_each(function: Callable, starts: PyTree) -> PyTree:
-    if len(jax.tree.leaves(starts)[0]) > 1:
-        return jax.vmap(function)(starts)
-    return jax.tree.map(lambda leaf: leaf[None], function(jax.tree.map(lambda x: x[0], starts)))
+def count_guesses(rounds: Sequence[Round], stage: Stage) -> int:
+    """Return how many guesses rounds need that begin with a stage of these settings."""
+    begun = [each for each in rounds if each.all_stages[0].settings == stage.settings]
+    return max((each.first + each.starts for each in begun if each.is_divided), default=0)
 
 
-def _repeat(contexts: PyTree, num: int) -> PyTree:
-    if num == 1:
-        return contexts
-    return jax.tree.map(lambda x: jnp.repeat(x, num, axis=-1), contexts)
+def run_searches(
+    planner: "OptimisedPlanner", stage: Stage, num: int, searches: Searches
+) -> tuple[Array, PyTree]:
+    """Run one stage of many searches, each from one of the first `num` guesses, or a point; pure.
+
+    Returns:
+        The points (L, n) at which the L searches end, and the plans at these points.
+    """
+    problem = planner.with_settings(stage.settings)
+    contexts = over_lanes(problem.prepare)(_lanes_last(searches.cases))
+
+    def start_of(context: PyTree, index: Array, point: Array) -> Array:
+        if not num:
+            return point
+        guesses = problem.guesses(context, num)
+        guess = jnp.sum(
+            jnp.where(jnp.arange(num, dtype=index.dtype)[:, None] == index, guesses, 0.0), axis=0
+        )
+        return jnp.where(index < 0, point, guess) if point.size else guess
+
+    starts = over_lanes(start_of)(contexts, searches.index, searches.point.T)
+    held = problem.held
+
+    def objective(point: Array, given: tuple[Array, PyTree]) -> Evaluation:
+        start, context = given
+        if held is not None:
+            point = jnp.where(stage.frozen & held, start, point)
+        return problem.objective(point, context)
+
+    def curvature_at(point: Array, given: tuple[Array, PyTree]) -> Curvature:
+        return problem.curvature_at(point, given[1])
+
+    optimum = minimise_lanes(objective, starts, (starts, contexts), stage.solver, curvature_at)
+    plans = over_lanes(functools.partial(_plan_at, problem))(optimum, contexts)
+    return optimum.point.T, _lanes_first(plans)
 
 
-def _cheapest(costs: Array, num: int) -> Array:
-    """Return the indices (num,) of the `num` least costs; costs that are not finite come last."""
-    return jnp.argsort(jnp.where(jnp.isfinite(costs), costs, jnp.inf))[:num]
+def divide_round(
+    search: Callable[[Stage, PyTree, PyTree, PyTree], tuple[PyTree, PyTree]],
+    attempt: Round,
+    cases: PyTree,
+) -> PyTree:
+    """Return the best plan of every case of a batch, from all starts and stages of a round.
+
+    `search` runs one stage of L searches. It takes the stage, cases with leaves (L, ...), and
+    indices (L,) and points (L, n) of the starts as in `Searches`; the points are None in the first
+    stage. Its results are as those of `run_searches`. The arrays may be NumPy's or JAX's.
+    """
+    xp = numpy_of(*jax.tree.leaves(cases))
+    size, num = len(jax.tree.leaves(cases)[0]), attempt.starts
+    owner = xp.repeat(xp.arange(size), num)  # (L,), the case of each search
+    index = xp.tile(xp.arange(attempt.first, attempt.first + num, dtype=np.int32), size)
+    points, spent, plans = None, 0, None
+    for stage in attempt.all_stages:
+        own = jax.tree.map(lambda leaf, owner=owner: leaf[owner], cases)
+        points, plans = search(stage, own, index, points)
+        plans = plans.replace(iterations=spent + plans.iterations)
+        if stage.keep is not None and stage.keep < num:
+            costs = xp.where(xp.isfinite(plans.cost), plans.cost, xp.inf).reshape(size, num)
+            kept = xp.argsort(costs, axis=1)[:, : stage.keep] + num * xp.arange(size)[:, None]
+            owner, points, plans = jax.tree.map(
+                lambda leaf, kept=kept: leaf[kept.ravel()], (owner, points, plans)
+            )
+            num = stage.keep
+        index, spent = xp.full(size * num, -1, np.int32), plans.iterations
+    by_case = jax.tree.map(lambda leaf: leaf.reshape(size, num, *leaf.shape[1:]), plans)
+    best = index_of_best(jax.tree.map(lambda leaf: xp.moveaxis(leaf, 1, 0), by_case))
+    return jax.tree.map(lambda leaf: leaf[xp.arange(size), best], by_case)
+
+
+def solve_divided(planner: "OptimisedPlanner", attempt: Round, cases: PyTree) -> PyTree:
+    """Plan a batch of cases from all starts of a round, in one program; pure."""
+
+    def search(
+        stage: Stage, cases: PyTree, index: Array, points: Array | None
+    ) -> tuple[Array, PyTree]:
+        num = attempt.first + attempt.starts if points is None else 0
+        if points is None:
+            points = jnp.zeros((len(index), 0))
+        return run_searches(planner, stage, num, Searches(cases, index, points))
+
+    return divide_round(search, attempt, cases)
+
+
+def _at_start(point: Array) -> Optimum:
+    nothing, zero = jnp.zeros((), point.dtype), jnp.zeros((), jnp.int32)
+    return Optimum(point, Evaluation(nothing, nothing), zero, jnp.zeros((), bool))
+
+
+def _add_spent(optimum: Optimum, before: Optimum) -> Optimum:
+    return dataclasses.replace(optimum, iterations=before.iterations + optimum.iterations)
+
+
+def _lanes_last(cases: PyTree) -> PyTree:
+    return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1), cases)
+
+
+def _lanes_first(plans: PyTree) -> PyTree:
+    return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, -1, 0), plans)
 
 
 def _plan_at(planner: "OptimisedPlanner", optimum: Optimum, context: PyTree) -> PyTree:
@@ -252,8 +319,3 @@ def _plan_at(planner: "OptimisedPlanner", optimum: Optimum, context: PyTree) -> 
     hopeless = is_unsolved(status) & planner.rules_out(context)
     status = jnp.where(hopeless, jnp.int32(Status.TOO_FAR), status)
     return plan.replace(cost=cost, iterations=optimum.iterations, status=status)
-
-
-def _best(plans: PyTree) -> PyTree:
-    best = index_of_best(plans)
-    return jax.tree.map(lambda leaf: leaf[best], plans)

@@ -7,12 +7,13 @@ from typing import ClassVar, Self
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 from jaxtyping import PyTree
 
 from planner_jax.core.choices import EFFORTS, require_one_of
 from planner_jax.core.planner import CaseT, Planner, PlanT
-from planner_jax.optimise.multistart import solve_batch, solve_round
+from planner_jax.optimise.multistart import solve_batch, solve_divided, solve_round
 from planner_jax.optimise.settings import (
     Curvature,
     Evaluation,
@@ -107,9 +108,10 @@ class OptimisedPlanner(Planner[CaseT, PlanT], abc.ABC):
         """
         return jnp.zeros((), bool)
 
-    def convert_point(self, point: Array, before: "OptimisedPlanner") -> Array:
-        """Convert a point (n,) of a planner with other settings to variables of this planner."""
-        return point
+    @property
+    def held(self) -> np.ndarray | None:
+        """Which of the n variables a `frozen` stage holds at their starting values, (n,) bool."""
+        return None
 
     @property
     def attempts(self) -> tuple[Round, ...]:
@@ -122,11 +124,18 @@ class OptimisedPlanner(Planner[CaseT, PlanT], abc.ABC):
 
     def solve(self, case: PyTree, attempt: Round) -> PyTree:
         """Return the plan that one round (attempt) finds for one case."""
+        if attempt.is_divided:
+            plans = self.solve_lanes(jax.tree.map(lambda leaf: leaf[None], case), attempt)
+            return jax.tree.map(lambda leaf: leaf[0], plans)
         return solve_round(self, attempt, case)
 
     def solve_lanes(self, cases: PyTree, attempt: Round) -> PyTree:
         """Return the plans that one round (attempt) finds for a batch."""
-        return solve_batch(self, attempt, cases)
+        return (solve_divided if attempt.is_divided else solve_batch)(self, attempt, cases)
+
+    def divides(self, attempt: Round) -> bool:
+        """Return whether `pj.plan` runs the searches of a round one by one; see `is_divided`."""
+        return attempt.is_divided
 
     def settle(
         self, cases: PyTree, plan_of: Callable[[Planner, PyTree], PyTree] | None = None

@@ -13,7 +13,6 @@ Hessian. lambda^T cost_utheta is a part of the derivative of the cost's gradient
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import cast
 
 import jax
 import jax.numpy as jnp
@@ -110,9 +109,14 @@ class Differentiated(OptimisedPlanner):
         """Return the first `num` starting points (num, n) of the inner planner."""
         return self.planner.guesses(context.inner, num)
 
-    def convert_point(self, point: Array, before: OptimisedPlanner) -> Array:
-        """Convert a point (n,) of a planner with other settings to variables of this planner."""
-        return self.planner.convert_point(point, cast(Differentiated, before).planner)
+    @property
+    def held(self) -> np.ndarray | None:
+        """The variables that the inner planner holds in a `frozen` stage."""
+        return self.planner.held
+
+    def divides(self, attempt: Round) -> bool:
+        """Return false: separate programs for searches would each compute the gradient."""
+        return False
 
     def objective(self, point: Array, context: _Context) -> Evaluation:
         """Evaluate the objective of the inner planner at a point (n,)."""

@@ -1,6 +1,7 @@
 """Types of objectives, and settings of searches: solvers, preliminary stages and rounds."""
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -8,7 +9,12 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
-from planner_jax.core.checks import require_kind, require_number, require_numbers
+from planner_jax.core.checks import (
+    require_kind,
+    require_number,
+    require_numbers,
+    require_switch,
+)
 from planner_jax.core.choices import require_size
 from planner_jax.core.compiled import Fixed, cached_by_precision, with_run_time_numbers
 from planner_jax.core.errors import ArgumentError, ArgumentTypeError
@@ -121,7 +127,7 @@ Solver = LbfgsConfig | NewtonConfig
 Settings = tuple[tuple[str, object], ...]  # fields of a planner, and their values
 
 
-@with_run_time_numbers()
+@with_run_time_numbers("frozen")
 @dataclasses.dataclass(frozen=True)
 class Stage:
     """A preliminary search on an easier problem; its result is the start of the next search."""
@@ -129,9 +135,12 @@ class Stage:
     solver: Solver
     settings: Settings = ()
     keep: int | None = None  # number of a case's cheapest starts that continue; None for all
+    # Whether L-BFGS holds the variables `OptimisedPlanner.held` at their values in the start.
+    frozen: bool = False
 
     def __post_init__(self) -> None:
         require_kind("solver", self.solver, LbfgsConfig, NewtonConfig)
+        require_switch("frozen", self.frozen)
         if self.keep is not None:
             require_size("keep", self.keep, 1)
 
@@ -144,10 +153,26 @@ class Round(Attempt):
     solver: Solver = LbfgsConfig()
     settings: Settings = ()  # values of planner fields during this attempt
     stages: tuple[Stage, ...] = ()  # searches before the search by `solver`, from easy to hard
+    first: int = 0  # index of the first of the `starts` starting points, the planner's `guesses`
 
     def __post_init__(self) -> None:
         super().__post_init__()
         require_kind("solver", self.solver, LbfgsConfig, NewtonConfig)
+        require_size("first", self.first, 0)
+
+    @property
+    def all_stages(self) -> tuple[Stage, ...]:
+        """The preliminary stages, and the round's own search as the last stage."""
+        return (*self.stages, Stage(self.solver, self.settings))
+
+    @property
+    def is_divided(self) -> bool:
+        """Whether each search of each case is a lane (one problem of a batch) of a program.
+
+        This is so if a case has several searches, or a round has its own settings. Rounds whose
+        searches have equal settings then share a program, whatever their numbers of starts are.
+        """
+        return self.starts > 1 or self.first > 0 or bool(self.settings)
 
 
 @with_run_time_numbers("tolerance", "patience")
@@ -164,15 +189,24 @@ def load_round(attempt: Round, is_counted: bool) -> Round | Fixed:
     `is_counted`, numbers of iterations up to `COUNTED` are static: a GPU then need not ask the host
     after every iteration whether the loop has ended.
     """
-
-    def load(solver: Solver) -> Solver:
-        if (not is_counted or solver.max_steps > COUNTED) or not isinstance(solver, LbfgsConfig):
-            return solver
-        return CountedLbfgs(**vars(solver))
-
-    solvers = [attempt.solver, *(stage.solver for stage in attempt.stages)]
-    if any(solver.max_steps == 0 for solver in solvers):
+    if any(stage.solver.max_steps == 0 for stage in attempt.all_stages):
         return Fixed(attempt)
+    load = functools.partial(_load_solver, is_counted=is_counted)
     stages = [dataclasses.replace(each, solver=load(each.solver)) for each in attempt.stages]
     own = load(attempt.solver)
     return dataclasses.replace(attempt, solver=own, stages=tuple(stages), within=None)
+
+
+@cached_by_precision
+def load_stage(stage: Stage, is_counted: bool) -> Stage | Fixed:
+    """Convert one stage of a divided round to an argument of programs, as `load_round` does."""
+    stage = dataclasses.replace(stage, keep=None)
+    if stage.solver.max_steps == 0:
+        return Fixed(stage)
+    return dataclasses.replace(stage, solver=_load_solver(stage.solver, is_counted))
+
+
+def _load_solver(solver: Solver, is_counted: bool) -> Solver:
+    if (not is_counted or solver.max_steps > COUNTED) or not isinstance(solver, LbfgsConfig):
+        return solver
+    return CountedLbfgs(**vars(solver))

@@ -148,7 +148,8 @@ def plan_batch(
     resident, num = is_resident(cases), count_lanes(cases)
     # One CPU shares its memory with the host. There the chunks are planned by one thread for each
     # core, and NumPy cuts and joins them: a JAX program would be compiled for every new size.
-    if resident and (num == batch.sizes(attempts[0]).next(num) or not is_one_cpu(mesh)):
+    is_small = is_one_cpu(mesh) and num != batch.sizes(attempts[0]).next(num)
+    if resident and not is_small and not planner.divides(attempts[0]):
         return batch.plan_resident(attempts, cases)
     cases = jax.tree.map(np.asarray, cases)
     plans, unsolved = _try_in_turn(attempts, num, watch, functools.partial(batch.try_lanes, cases))
@@ -261,6 +262,9 @@ class _Batch:
         def solve(call: _Call) -> PyTree:
             if may_end and watch.is_over:
                 return None
+            if self.planner.divides(attempt):
+                lanes, num = call
+                return self._divide(attempt, jax.tree.map(lambda leaf: leaf[lanes[:num]], cases))
             part = jax.device_put(jax.tree.map(lambda leaf: leaf[call[0]], cases), spec)
             found, _ = solve_on_devices(self.planner, attempt, self.mesh, part)
             return jax.block_until_ready(found) if threads > 1 or watch.waits else found
@@ -277,6 +281,11 @@ class _Batch:
             yield from alone
             yield from later
 
+    def _divide(self, attempt: Attempt, cases: PyTree) -> PyTree:
+        from planner_jax.planning.searches import divide_batch  # few cases need it
+
+        return divide_batch(self.planner, attempt, self.mesh, cases)
+
     def plan_resident(self, attempts: Sequence[Attempt], cases: PyTree) -> tuple[PyTree, Array]:
         """Return plans of cases in jax arrays; the host reads only numbers of unsolved cases."""
         planner, mesh, watch, num = self.planner, self.mesh, self.watch, count_lanes(cases)
@@ -284,6 +293,7 @@ class _Batch:
             cases = _take(cases, np.arange(-(-num // mesh.size) * mesh.size))
         cases = place_lanes(cases, mesh)
         first, *others = attempts
+        num_of_device = count_lanes(cases) // mesh.size
         watch.report(planner, first, 0, num)
         plans, unsolved = self._first_plans(first, cases)
         for attempt in others:
@@ -300,7 +310,17 @@ class _Batch:
             watch.report(planner, attempt, 0, np.asarray(due).sum())
             for begin, size in self.sizes(attempt).cuts(most):
                 part, lanes = _cut_unsolved(mesh, size, cases, before, put_number(mesh, begin))
-                later, _ = solve_on_devices(planner, attempt, mesh, part)
+                if planner.divides(attempt):
+                    is_case = np.asarray(lanes) < num_of_device
+                    some = jax.tree.map(
+                        lambda leaf, is_case=is_case: np.asarray(leaf)[is_case], part
+                    )
+                    found = self._divide(attempt, some)
+                    row = np.maximum(np.cumsum(is_case) - 1, 0)  # repeats a plan for the padding
+                    later = jax.tree.map(lambda leaf, row=row: leaf[row], found)
+                    later = jax.device_put(later, lane_sharding(mesh))
+                else:
+                    later, _ = solve_on_devices(planner, attempt, mesh, part)
                 plans, unsolved = _select_locally(mesh, plans, later, lanes)
         if num % mesh.size:  # JAX cannot shard an axis into unequal parts
             plans = _take(jax.device_put(plans, mesh.devices[0]), np.arange(num))

@@ -80,7 +80,12 @@ def _plan_one(planner: Planner, attempts: Sequence[Attempt], case: PyTree, watch
         if best is not None and watch.is_over:
             return mark_out_of_time(best, True)
         watch.report(planner, attempt, 0, 1)
-        plan = solve_one(planner, case, attempt)
+        if planner.divides(attempt):
+            from planner_jax.planning.searches import divide_one  # few cases need it
+
+            plan = divide_one(planner, attempt, case)
+        else:
+            plan = solve_one(planner, case, attempt)
         watch.report(planner, attempt, 1, 1)
         if best is None or is_better(plan, best):
             best = plan

@@ -73,6 +73,8 @@ class Sizes:
 def sizes_of(planner: Planner, attempt: Attempt, chunk: int | None, mesh: Mesh) -> Sizes:
     """Return how many cases one call may solve: `chunk`, or numbers that suit the device."""
     busy = _GPU_BUSY // attempt.starts
+    if planner.divides(attempt) and mesh.devices[0].platform == "cpu":
+        return Sizes(BUCKETS[0], busy)
     if chunk is not None:
         return Sizes(chunk, busy)
     if mesh.devices[0].platform != "cpu":
@@ -152,11 +154,11 @@ def place_lanes(tree: PyTree, mesh: Mesh) -> PyTree:
 
 # XLA would try its own kernels for every matrix product, which takes a third of the compile time
 # on a GPU, while cuBLAS is as fast for these products. On a CPU the option has no effect.
-_COMPILER_OPTIONS: Any = {"xla_gpu_enable_triton_gemm": False}
-# Before JAX 0.11, XLA's older code generator for CPUs compiles in 40 % less time. Its programs for
-# one hit or catch are as fast; its programs for large batches and loops over cases are slower.
+COMPILER_OPTIONS: Any = {"xla_gpu_enable_triton_gemm": False}
+# Until version 0.11 of JAX, XLA's older generator of code for a CPU takes 40 % less time. Programs
+# for one hit or catch are as fast with it; large batches, and loops over cases, are slower.
 _IS_OLD = jax.__version_info__ < (0, 11)
-_QUICK_OPTIONS: Any = {"xla_cpu_use_fusion_emitters": False} if _IS_OLD else {}
+QUICK_OPTIONS: Any = {"xla_cpu_use_fusion_emitters": False} if _IS_OLD else {}
 _Layout = tuple[tuple[tuple[int, ...], np.dtype], ...]  # shapes and dtypes of a tree's leaves
 
 
@@ -180,7 +182,7 @@ def solve_on_devices(
     return _solve_on_devices(planner, planner.load_attempt(attempt, cases), mesh, cases)
 
 
-@functools.partial(jax.jit, static_argnames="mesh", compiler_options=_COMPILER_OPTIONS)
+@functools.partial(jax.jit, static_argnames="mesh", compiler_options=COMPILER_OPTIONS)
 def _solve_on_devices(
     planner: Planner, loaded: PyTree, mesh: Mesh, cases: PyTree
 ) -> tuple[PyTree, Array]:
@@ -304,5 +306,5 @@ def _program(
         result.others = [(k, leaf.dtype) for k, leaf in enumerate(leaves) if leaf.dtype != dtype]
         return jnp.concatenate([leaf.ravel().astype(dtype) for leaf in leaves])
 
-    options = _QUICK_OPTIONS if compiles_quickly else None
+    options = QUICK_OPTIONS if compiles_quickly else None
     return _Program(jax.jit(run, compiler_options=options), dtype, result)

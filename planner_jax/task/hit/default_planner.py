@@ -8,7 +8,7 @@ after the impact is a variable instead, which avoids these divisions.
 """
 
 import dataclasses
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +21,7 @@ from planner_jax.ball.prediction import LEAST_NODES, target_at
 from planner_jax.core.choices import require_size
 from planner_jax.cost.quadrotor import Measure
 from planner_jax.optimise.chain import ChainEnds, ChainPlanner
-from planner_jax.optimise.planner import OptimisedPlanner, pending
+from planner_jax.optimise.planner import pending
 from planner_jax.optimise.settings import LbfgsConfig, Round, Stage
 from planner_jax.optimise.shipped import StartNetwork, load_network
 from planner_jax.robot.quadrotor import tangent_basis
@@ -47,7 +47,6 @@ _FEATURE_TIMES = (0.5, 0.75, 0.95)  # times of the ball that the network sees / 
 # waypoints' velocities are variables need a starting point that nearly keeps the limits. `margin`
 # is the relative distance from a limit at which penalties start; it must cover peaks between nodes.
 _ANY_FEASIBLE = (("energy_weight", 1e-11), ("margin", 0.01), ("nodes", 8))
-_FROM_GUESSES = (*_ANY_FEASIBLE, ("learned", False))
 WITH_VELOCITIES = (*_ANY_FEASIBLE, ("velocities", True))
 _SMALL_MARGIN = (
     ("energy_weight", 1e-11),
@@ -59,9 +58,11 @@ _SMALL_MARGIN = (
 _VELOCITY_SCALE = 2.0  # unit of the offsets of velocities; measured units range from 0.6 to 7
 _PASSING = 0.9  # greatest speed at the ball in a starting point / speed limit
 # Starting points, the most successful first. Columns: time of the impact / time at which the ball
-# would land without a hit; flight time after the impact [s]; thrust per unit mass / gravity.
+# would land without a hit; flight time after the impact [s]; thrust per unit mass / gravity. A
+# network may improve the first row. The second row repeats it, and stays as it is.
 _GUESSES = np.array(
     [
+        (0.92, 1.7, 1.2),
         (0.92, 1.7, 1.2),
         (0.75, 1.7, 1.2),
         (0.75, 1.3, 0.9),
@@ -82,26 +83,32 @@ def _hard(steps: int) -> LbfgsConfig:
     return LbfgsConfig(max_steps=steps, memory=12, tolerance=1e-6, patience=5)
 
 
+def _smooth(steps: int, keep: int) -> Stage:
+    return Stage(_hard(steps), WITH_VELOCITIES, keep, frozen=True)
+
+
 # A round is an attempt to solve the cases that are unsolved so far. The first two rounds solve easy
 # cases. Later rounds search for any plan that keeps the limits: the energy has hardly any weight.
 # Rounds 3 and 4 start at a point that a network predicts. Rounds 5 and 6 start at all rows of
-# `_GUESSES` and continue the best of these starts. Rounds 4 and 6 take only cases whose greatest
-# relative excess over a limit is below `within`.
+# `_GUESSES` after the first one, at first without changing velocities at waypoints, and continue
+# the best of these starts. Rounds 4 and 6 take only cases whose greatest relative excess over a
+# limit is below `within`.
 _ROUNDS = (
     Round(1, LbfgsConfig(max_steps=3)),
     Round(1, LbfgsConfig(max_steps=60)),
     Round(1, _hard(150), WITH_VELOCITIES),
-    Round(1, _hard(500), _SMALL_MARGIN, (Stage(_hard(800), WITH_VELOCITIES, keep=1),), within=0.1),
-    Round(12, _hard(240), WITH_VELOCITIES, (Stage(_hard(50), _FROM_GUESSES, keep=2),)),
+    Round(1, _hard(500), _SMALL_MARGIN, (Stage(_hard(800), WITH_VELOCITIES),), within=0.1),
+    Round(12, _hard(240), WITH_VELOCITIES, (_smooth(50, keep=2),), first=1),
     Round(
         starts=12,
         solver=_hard(300),
         settings=_SMALL_MARGIN,
         stages=(
-            Stage(_hard(60), _FROM_GUESSES, keep=6),
-            Stage(_hard(150), _FROM_GUESSES, keep=2),
+            _smooth(60, keep=6),
+            _smooth(150, keep=2),
             Stage(_hard(400), WITH_VELOCITIES, keep=1),
         ),
+        first=1,
         within=0.04,
     ),
 )
@@ -234,9 +241,9 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
             axis=1,
         )
         natural = jnp.pad(times, ((0, 0), (0, 5)))
-        if num > 1:  # in hard cases the racket must also move across its normal
-            moving = jax.vmap(lambda each: self._set_passing_speed(each, context))(natural[1:])
-            natural = jnp.concatenate([natural[:1], moving])
+        if num > 2:  # in hard cases the racket must also move across its normal
+            moving = jax.vmap(lambda each: self._set_passing_speed(each, context))(natural[2:])
+            natural = jnp.concatenate([natural[:2], moving])
         return natural[:, None]
 
     def _set_passing_speed(self, natural: Array, context: HitContext) -> Array:
@@ -253,12 +260,13 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
         across = tangent_basis(impact.stroke.normal)
         return natural.at[3:5].set(jnp.stack([jnp.sum(vel * each) for each in across]))
 
-    def convert_point(self, point: Array, before: OptimisedPlanner) -> Array:
-        """Add zero velocity offsets to `point` if the search `before` has no such variables."""
-        if self.velocities == cast(ExactHit, before).velocities:
-            return point
-        places, own = point[: self._num_places], point[self._num_places :]
-        return jnp.concatenate([places, jnp.zeros_like(places), own])
+    @property
+    def held(self) -> np.ndarray | None:
+        """The velocities at the waypoints, if they are variables: with offset 0 they are smooth."""
+        if not self.velocities:
+            return None
+        index = np.arange(len(self.scale))
+        return (index >= self._num_places) & (index < 2 * self._num_places)
 
     def meet(self, natural: Array, context: HitContext) -> ChainEnds:
         """Return the impact that its 8 variables (1, 8) describe, as the end of the trajectory.
