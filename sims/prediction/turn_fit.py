@@ -82,7 +82,6 @@ def tangent(seen: Centred, fit: TurnFit) -> tuple[Callable[[Array], Pair], Array
     """
 
     def differentiate_arcs(after: Array) -> tuple[Pair, Pair]:
-        """Return arcs g(t) at times `after`, and the derivatives of  velocity g(t)  by the rate."""
         one = jnp.ones_like(fit.rate)
         arcs, slopes = jax.jvp(lambda rate: arc(rate, after), (fit.rate,), (one,))
         return arcs, _times(fit.velocity, slopes)
@@ -102,7 +101,6 @@ def best_turn(seen: Centred, fastest: ArrayLike) -> TurnFit:
     """Fit position, velocity and turn rate; derivatives of the fit are exact at the optimum."""
 
     def downhill(rate: Array) -> Array:
-        """Return half the sum of squared residuals, differentiated by -`rate`, () [m^2 s/rad]."""
         fit = fit_rate(seen, rate)
         _, slopes = jax.jvp(lambda rate: arc(rate, seen.after), (rate,), (jnp.ones_like(rate),))
         return _sum(seen, _times(fit.velocity, slopes), fit.residual)
