@@ -26,7 +26,6 @@ MOVES = {
 
 
 def numbers(case):
-    """Return cost, contact time and hitting point of the optimum, and its status."""
     plan = optimal_plan(PLANNER, case)
     return jnp.stack([plan.cost, plan.stroke.time, *plan.stroke.ball_pos]), plan.status
 

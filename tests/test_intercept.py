@@ -216,7 +216,6 @@ def test_an_unsolvable_case_has_a_status_and_others_are_solved(scenes, name):
 
 @pytest.fixture(scope="module")
 def early():
-    """Plan early meetings on an open map, behind a wall with an end, and behind a wall across."""
     batch = stack([scene((5.0, 5.0)), scene((6.0, 4.0), [HALF]), scene((6.0, 4.0), [WALL])])
     search = dataclasses.replace(SEARCHES[0], solver=LevenbergConfig(40))
     return batch, pj.plan(pj.intercept.planner(meet="early", searches=(search,)), batch)

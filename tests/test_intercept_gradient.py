@@ -51,7 +51,6 @@ def move_to_optimum(smooth, case):
 
 
 def optimum_near_straight(planner, case):
-    """Return the smooth planner near a straight drive, and the case at the point of least cost."""
     smooth, case = planner.smooth_near(case, make_straight_plan(case, planner.pieces))
     return smooth, move_to_optimum(smooth, case)
 

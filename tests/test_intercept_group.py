@@ -136,14 +136,6 @@ def test_the_referee_confirms_solved_groups(planned, decide):
     assert verdict.sentence(5).startswith(verdict.failed_limit[5] + ": leg ")
 
 
-@pytest.mark.slow
-def test_groups_can_be_planned_inside_a_compiled_function(planned):
-    groups, plans = planned[0], planned[1]["greedy"]
-    traced = jax.eval_shape(lambda groups: pj.solve(planner("greedy"), groups), groups)
-    for ours, theirs in zip(jax.tree.leaves(traced), jax.tree.leaves(plans), strict=True):
-        assert (ours.shape, ours.dtype) == (theirs.shape, theirs.dtype)
-
-
 def test_the_best_order_is_no_later_than_the_greedy_one(planned):
     best, greedy = planned[1]["best"], planned[1]["greedy"]
     both = pj.are_solved(best) & pj.are_solved(greedy)
@@ -222,22 +214,6 @@ def test_the_referee_rejects_a_plan_with_a_wrong_leg(planned):
             np.testing.assert_array_equal(verdict.leg, leg)
     one = pj.group.judge(*pj.take((groups, wrong["a leg aside"][0]), 0))
     assert one.sentence().startswith("start: leg 1: the plan starts 0.01 off")
-
-
-def test_groups_and_single_targets_are_distinguished():
-    with pytest.raises(ValueError, match="decide must be one of best, greedy, given, got 'worst'"):
-        pj.group.planner(decide="worst")
-    with pytest.raises(TypeError, match="decide"):
-        pj.intercept.planner("spacetime", decide="best")
-    with pytest.raises(TypeError, match="class InterceptCase, got InterceptGroup"):
-        pj.plan(pj.intercept.planner(), draw(1, 0, 2))
-    with pytest.raises(TypeError, match="cases must be a InterceptCase, got a InterceptGroup"):
-        pj.intercept.judge(draw(1, 0, 2), None)
-    for name in ("group", "spacetime"):
-        with pytest.raises(ValueError, match="suite must be one of easy, medium"):
-            pj.intercept.draw(1, name)
-    with pytest.raises(ValueError, match="planner must be one of spacetime, quick"):
-        pj.intercept.planner("group")
 
 
 def test_a_sweep_of_groups_has_a_row_for_every_group(monkeypatch, tmp_path):

@@ -35,7 +35,6 @@ def box(left, low, right, high):
 
 
 def gate(closing, time=6.0):
-    """Make a scene: a wall has a gap straight ahead, which a mover closes from the side."""
     return scene(
         (6.0, 4.0),
         time=time,

@@ -11,17 +11,11 @@ from closed_forms import positions_on
 from planner_jax.core.protocol import take
 from planner_jax.referee.clearance import clearances
 from planner_jax.referee.intercept import referee_intercepts
+from planner_jax.task.intercept import suites
 from planner_jax.task.intercept.api import draw, observe
 from planner_jax.task.intercept.plan import InterceptPlan
 from planner_jax.task.intercept.searches import earliest_arrival
 from planner_jax.task.intercept.spec import SUITES
-from planner_jax.task.intercept.suites import (
-    BODY_MIDDLE,
-    CAUSES,
-    SIZE,
-    draw_with_counts,
-    first_cause,
-)
 
 NUM, SEED = 24, 3
 PLAIN = [name for name, suite in SUITES.items() if not suite.is_maze]
@@ -36,7 +30,9 @@ def numpy(tree):
 @pytest.fixture(scope="module")
 def batches():
     with jax.enable_x64(True):
-        batches = {name: draw_with_counts(name, NUM, SEED, dtype=jnp.float64) for name in SUITES}
+        batches = {
+            name: suites.draw_with_counts(name, NUM, SEED, dtype=jnp.float64) for name in SUITES
+        }
         return {name: replace(each, cases=numpy(each.cases)) for name, each in batches.items()}
 
 
@@ -77,8 +73,8 @@ def test_shapes_follow_the_suite_and_starts_the_paper(batches, name):
     start = cases.start
     assert (start[:, [0, 2]] == [0.8, 0.0]).all() and (cases.speed == 0.5).all()
     assert start[:, 1].min() >= 1.0 and start[:, 1].max() <= 7.0 and np.ptp(start[:, 1]) > 4.0
-    np.testing.assert_array_equal(cases.upper, np.full((NUM, 2), SIZE))
-    np.testing.assert_allclose(cases.body.middle, BODY_MIDDLE)
+    np.testing.assert_array_equal(cases.upper, np.full((NUM, 2), suites.SIZE))
+    np.testing.assert_allclose(cases.body.middle, suites.BODY_MIDDLE)
 
 
 @each_suite
@@ -134,7 +130,7 @@ def test_movers_cross_the_straight_line_at_the_time_of_a_drive_at_constant_speed
 def test_targets_stay_on_the_map_and_off_the_walls(batches, name):
     cases, suite = batches[name].cases, SUITES[name]
     path = positions_on(cases.target, np.linspace(0.0, suite.time, 400))
-    assert path.min() >= -1e-3 and path.max() <= SIZE + 1e-3
+    assert path.min() >= -1e-3 and path.max() <= suites.SIZE + 1e-3
     assert least_distance(cases.walls, path).min() > 0.0
     speed = np.linalg.norm(cases.target.vel, axis=1)
     assert 0.2 <= speed.min() and speed.max() <= 0.5
@@ -147,13 +143,13 @@ def test_targets_stay_on_the_map_and_off_the_walls(batches, name):
 @each_suite
 def test_start_and_meeting_are_clear(batches, name):
     cases, suite = batches[name].cases, SUITES[name]
-    start = (cases.start[:, :2] + [BODY_MIDDLE, 0.0])[:, None]
+    start = (cases.start[:, :2] + [suites.BODY_MIDDLE, 0.0])[:, None]
     end = positions_on(cases.target, np.array([suite.time]))
     assert least_distance(cases.walls, start).min() >= 0.35
     assert least_distance(cases.movers, start).min() >= 0.35
     assert least_distance(cases.walls, end).min() >= 0.4
     assert least_distance(cases.movers, end, suite.time).min() >= 0.4
-    assert end.min() >= 0.3 - 1e-9 and end.max() <= SIZE - 0.3 + 1e-9
+    assert end.min() >= 0.3 - 1e-9 and end.max() <= suites.SIZE - 0.3 + 1e-9
 
 
 def test_a_rush_ends_half_a_second_after_the_first_layer_that_meets_the_target(batches):
@@ -167,7 +163,7 @@ def test_a_rush_ends_half_a_second_after_the_first_layer_that_meets_the_target(b
         arrivals = np.array([arrival(take(full, k)) for k in range(3)])
     np.testing.assert_allclose(cases.time[:3], arrivals + 0.5)
     end = positions_on(cases.target, cases.time[:, None])
-    assert end.min() >= 0.0 and end.max() <= SIZE
+    assert end.min() >= 0.0 and end.max() <= suites.SIZE
     assert least_distance(cases.walls, end).min() >= 0.4
     assert least_distance(cases.movers, end, cases.time[:, None, None]).min() >= 0.4
 
@@ -200,7 +196,7 @@ def test_a_mazes_walls_have_one_gap_each_and_dead_ends_before_them(batches):
         assert end[0] > across[0]
         for right in across:
             pieces = ~is_arm & np.isclose(high[:, 0], right)
-            assert low[pieces, 1].min() == 0.0 and high[pieces, 1].max() == SIZE
+            assert low[pieces, 1].min() == 0.0 and high[pieces, 1].max() == suites.SIZE
             gap = low[pieces, 1].max(), high[pieces, 1].min()
             assert 0.7 - 1e-9 <= gap[0] - gap[1] <= 1.1 + 1e-9
             arms = is_arm & np.isclose(high[:, 0], right - 0.2)
@@ -215,14 +211,13 @@ def test_a_mazes_walls_have_one_gap_each_and_dead_ends_before_them(batches):
 @each_suite
 def test_every_rejected_draw_has_a_cause(batches, name):
     draws, rejected = batches[name].draws, batches[name].rejected
-    assert tuple(rejected) == CAUSES
+    assert tuple(rejected) == suites.CAUSES
     np.testing.assert_array_equal(sum(rejected.values()), draws - 1)
     assert 0.01 < NUM / draws.sum() < 0.5
     assert rejected["target off the map"].sum() > 0.3 * draws.sum()
 
 
 def plain_draw(**changes):
-    """Return an acceptable draw, with changes: a target that comes from the right to (5, 4)."""
     box = np.array([[-0.1, -4.0], [0.1, -4.0], [0.1, 3.6], [-0.1, 3.6], [-0.1, 3.6], [-0.1, 3.6]])
     mover = np.array([[-0.2, -0.2], [0.2, -0.2], [0.2, 0.2], [-0.2, 0.2]])
     draw = {
@@ -244,7 +239,6 @@ def plain_draw(**changes):
 
 
 def wall(x, y):
-    """Return a small wall in place of the wall that leaves a gap of 0.4 m at the map's edge."""
     corners = 0.1 * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, 1], [-1, 1]])
     return {"walls": np.stack([[x, y] + corners] * 2)}
 
@@ -255,7 +249,7 @@ def mover(x, y, velocity):
 
 def causes_of(draws):
     stacked = {k: np.concatenate([each[k] for each in draws]) for k in draws[0]}
-    return [(*CAUSES, "")[index] for index in first_cause(SUITES["hard"], stacked)]
+    return [(*suites.CAUSES, "")[index] for index in suites.first_cause(SUITES["hard"], stacked)]
 
 
 def test_every_cause_of_rejection_is_found():
@@ -271,7 +265,7 @@ def test_every_cause_of_rejection_is_found():
         "no way": plain_draw(walls=plain_draw()["walls"][0] * [1.0, 1.1]),
         "out of reach": plain_draw(reached=False),
     }
-    assert tuple(draws) == ("", *CAUSES)
+    assert tuple(draws) == ("", *suites.CAUSES)
     assert causes_of(list(draws.values())) == list(draws)
 
 

@@ -31,7 +31,6 @@ PAGE = Path(__file__).parents[1] / "docs" / "live.md"
 
 
 def positions_of(vel):
-    """Return positions (200, 3) [m] of a thrown ball, one every STEP."""
     ball = pj.BallState(jnp.array([3.0, 0.1, 1.7]), jnp.asarray(vel, jnp.float32))
     thrown = pj.BallPath(ball, jnp.full(3, CATCH_DRAG), jnp.asarray(9.81))
     return np.asarray(jax.jit(jax.vmap(thrown.at))(STEP * jnp.arange(200)).pos, float)
@@ -44,7 +43,6 @@ def path():
 
 @pytest.fixture(scope="module")
 def warm():
-    """Return a planner that has compiled all programs, with a deadline that it always meets."""
     planner = LivePlanner(CatchStroke(), deadline=30.0)
     planner.warm_up()
     yield planner
@@ -165,7 +163,6 @@ def test_bad_packets_are_counted_by_name_without_an_effect(warm, path):
     nan, far = (np.nan, 0.0, 0.0), (3.0, 3.0, 9.0)
 
     def disturb(step, data):
-        """Return a good packet and a bad one, of seven kinds in turn."""
         throw.sequence += 4
         n, now = throw.sequence - 3, throw.now
         packets = [

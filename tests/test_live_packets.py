@@ -95,7 +95,6 @@ def packet(sequence, sent):
 
 
 def faults(marks):
-    """Return the faults of one sender's packets (number, sending time, arrival time)."""
     arrivals = Arrivals()
     found = [arrivals.check(packet(n, sent), "a", now)[0] for n, sent, now in marks]
     return found, arrivals

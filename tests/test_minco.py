@@ -59,7 +59,6 @@ def interpolate(head, tail, waypoints, durations):
 
 
 def draw_problem(order, pieces, seed=0, dtype=np.float64):
-    """Draw end states, waypoints about a metre apart, and unequal durations."""
     rng = np.random.default_rng((seed, order, pieces))
     head, tail = rng.normal(size=(2, order, 3))
     waypoints = rng.normal(size=(pieces - 1, 3))
@@ -136,7 +135,6 @@ def dense_solution(head, tail, waypoints, durations):
 
 
 def ends(coeffs, durations, derivative):
-    """Return a derivative at the start and at the end of every piece, (M, 3) each."""
     size = coeffs.shape[1]
     start = np.einsum("k,mki->mi", derivative_row(0.0, derivative, size), coeffs)
     rows = np.array([derivative_row(t, derivative, size) for t in durations])
@@ -295,18 +293,6 @@ def test_samples_are_the_values_of_the_trajectory(order, pieces):
     np.testing.assert_allclose(motion.height, pos[:, 2], atol=1e-10)
     for samples, values in zip((motion.vel, motion.acc, motion.jerk), others, strict=True):
         np.testing.assert_allclose(samples, values, atol=1e-10 * np.abs(values).max())
-
-
-def test_a_batch_of_trajectories_equals_a_loop():
-    rows, offsets = draw_rows(4, 5)
-    many = [(rows, offsets, 0.45), (3.0 * rows, -offsets, 0.2), (rows[::-1], 0.0 * offsets, 1.0)]
-    together = jax.jit(jax.vmap(functools.partial(solve_for, 4, 5)))(
-        *(np.stack(x) for x in zip(*many, strict=True))
-    )
-    for k, (rows, offsets, duration) in enumerate(many):
-        alone = solve_for(4, 5, rows, offsets, np.array(duration))
-        for many_leaf, leaf in zip(*map(jax.tree.leaves, (together, alone)), strict=True):
-            np.testing.assert_allclose(many_leaf[k], leaf, atol=1e-12 * np.abs(leaf).max())
 
 
 def test_samples_and_energy_in_float32_are_right_to_a_millionth():

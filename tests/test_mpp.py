@@ -29,7 +29,6 @@ def throws():
 
 @pytest.fixture(scope="module")
 def pairs():
-    """Draw two throws and an absent target each, two cases in reversed order; plan them."""
     cases = draw(NUM, "parabola2", 4, num_targets=3)
     order = np.tile([0, 1, 2], (NUM, 1))
     order[:2] = [1, 0, 2]

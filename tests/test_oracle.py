@@ -8,12 +8,7 @@ import pytest
 import planner_jax as pj
 
 pytest.importorskip("casadi")
-from planner_jax.benchmarks.hit_oracle.search import (
-    STARTS,
-    find_hit,
-    passes_referee,
-    starting_points,
-)
+from planner_jax.benchmarks.hit_oracle import search
 
 
 def serve(limit_scale):
@@ -24,22 +19,22 @@ def serve(limit_scale):
 
 def test_an_easy_serve_is_proven_feasible_by_a_trajectory_that_the_referee_passes():
     easy = serve(1.0)
-    finding = find_hit(easy, starting_points(2, 0))
+    finding = search.find_hit(easy, search.starting_points(2, 0))
     assert finding.verdict == "feasible"
-    assert passes_referee(easy, finding.coeffs, finding.durations)
+    assert search.passes_referee(easy, finding.coeffs, finding.durations)
     assert finding.durations.sum() == pytest.approx(finding.impact_time)
 
 
 def test_a_hopeless_serve_is_infeasible():
-    finding = find_hit(serve(0.2), starting_points(4, 0))
+    finding = search.find_hit(serve(0.2), search.starting_points(4, 0))
     assert finding.verdict == "infeasible"
     assert finding.least_excess > 0.1
     assert finding.coeffs is None
 
 
 def test_starts_are_the_listed_ones_and_then_drawn_by_the_seed():
-    assert starting_points(3, 0) == list(STARTS[:3])
-    more = starting_points(len(STARTS) + 2, 1)
-    assert more[: len(STARTS)] == list(STARTS)
-    assert more == starting_points(len(STARTS) + 2, 1)
-    assert more[-2:] != starting_points(len(STARTS) + 2, 2)[-2:]
+    assert search.starting_points(3, 0) == list(search.STARTS[:3])
+    more = search.starting_points(len(search.STARTS) + 2, 1)
+    assert more[: len(search.STARTS)] == list(search.STARTS)
+    assert more == search.starting_points(len(search.STARTS) + 2, 1)
+    assert more[-2:] != search.starting_points(len(search.STARTS) + 2, 2)[-2:]

@@ -30,7 +30,6 @@ BROKEN = {
 
 @pytest.fixture(scope="module")
 def meet():
-    """Return the task, with its folder on the path of packages."""
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(OWN_TASK)
         all_tasks.cache_clear()
@@ -143,14 +142,6 @@ def test_throughput_is_measured_with_success_and_cost_beside(meet, tmp_path, pla
     assert (summary["num"], summary["success_rate"]) == (num, 1.0)
     gaps = [summary[f"cost_gap_{name}"] for name in ("median", "p90", "p99")]
     assert gaps == [None] * 3 if planner == "scipy" else -1e-3 < gaps[0] <= gaps[1] < 0.05
-
-
-def test_an_unknown_planner_is_one_line(tmp_path):
-    done = command(tmp_path, "sweep", "meet", "--planner", "nobody")
-    assert (done.code, done.out) == (2, "")
-    line = "planner-jax: error: --planner must be one of smooth, scipy, got 'nobody'\n"
-    assert done.err == line
-    assert not list(tmp_path.iterdir())
 
 
 def test_a_broken_package_beside_it_is_named_in_one_line_and_the_rest_works(tmp_path):

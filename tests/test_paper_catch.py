@@ -30,7 +30,6 @@ pytestmark = pytest.mark.usefixtures("float64")
 
 
 def rows(name, num=None):
-    """Return the first rows of a file as cases, and its columns."""
     path = Path(__file__).parent / "data" / f"catch_{name}.csv"
     with path.open(encoding="utf-8") as file:
         table = list(csv.DictReader(file))[:num]

@@ -90,7 +90,6 @@ def batch():
 
 @pytest.fixture
 def crooked():
-    """Return points close to a wall that exceed the curvature limit."""
     rng = np.random.default_rng(0)
     line = np.stack([np.linspace(0.5, 5.5, 24), np.full(24, 1.3)], axis=1)
     return line + rng.normal(0.0, 0.06, line.shape)

@@ -40,7 +40,6 @@ def still(x, y):
 
 
 def scene(target=(6.0, 4.0), movers=(), velocities: Any = 0.0, walls=(), **settings):
-    """Return a case with the array sizes of drawn cases."""
     return pj.intercept.case(
         still(*target),
         walls=obstacles(walls, room=(12, 6)),
@@ -60,7 +59,6 @@ BENT = along(
 
 
 def crossing(rng, path, num):
-    """Return movers that reach random points of a path at random times."""
     at = np.asarray(path.pos)[rng.integers(10, len(path.pos), num)]
     time, angle = rng.uniform(1.0, 9.0, num), rng.uniform(0.0, 2.0 * np.pi, num)
     velocity = rng.uniform(0.1, 0.6, (num, 1)) * np.stack([np.cos(angle), np.sin(angle)], 1)

@@ -26,7 +26,6 @@ SHAPES = {"smooth": smooth_hinge, "steep": steep_hinge}
 
 @jax.jit
 def penalties(x, width):
-    """Return value, first and second derivative of every shape at one x."""
     found = {}
     for name, shape in SHAPES.items():
         slope = jax.grad(shape)

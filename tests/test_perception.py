@@ -20,13 +20,7 @@ from planner_jax.studies.block.flight_fit import (
     error_across,
     fit_flight,
 )
-from planner_jax.studies.block.noise import (
-    IsotropicNoise,
-    depth_std,
-    information,
-    sightings,
-    stereo_noise,
-)
+from planner_jax.studies.block.noise import IsotropicNoise, information, sightings, stereo_noise
 
 GRAVITY = 9.81
 NUM = 16
@@ -204,13 +198,6 @@ def test_a_camera_or_noise_that_cannot_be_is_refused_in_a_line(make, options, me
     with pytest.raises(ValueError, match=message) as caught:
         make(**(usual if make is looking_at else {}) | options)
     assert "\n" not in str(caught.value)
-
-
-def test_the_noise_of_depth_grows_with_the_square_of_the_distance():
-    noise = stereo_noise()
-    near, far = depth_std(CAMERA, noise, jnp.array([2.0, 8.0]))
-    assert far == pytest.approx(16.0 * near)
-    assert near == pytest.approx(4.0 * 0.1 / (CAMERA.focal * 0.12), rel=1e-5)
 
 
 @pytest.mark.parametrize(

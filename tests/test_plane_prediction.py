@@ -47,7 +47,6 @@ def noisy(path, times=TIMES):
 
 
 def draw_targets():
-    """Draw targets: their positions ahead (NUM, 2) and observations of them (NUM, 15, 2)."""
     rng = np.random.default_rng(1)
     heading = rng.uniform(-np.pi, np.pi, NUM)
     vel = rng.uniform(0.2, 0.5, (NUM, 1)) * np.stack([np.cos(heading), np.sin(heading)], 1)
@@ -90,7 +89,6 @@ def moments(prediction, radius):
 
 
 def at(polynomial, times):
-    """Return the positions (T, 2) on a polynomial path at times (T,)."""
     coeffs = np.asarray(polynomial.coeffs, float)[::-1]
     passed = np.asarray(times) - float(polynomial.origin)
     return np.stack([np.polyval(column, passed) for column in coeffs.T], -1)

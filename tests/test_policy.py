@@ -56,15 +56,6 @@ def test_every_action_is_an_order_and_times_that_rise():
     assert (times[:, :3] <= cases.horizon[:, :1] + 3 * INSTANT).all()
 
 
-def test_greater_handicaps_put_a_target_last():
-    cases = cases_of()
-    action = np.zeros((NUM, 3, PER_TARGET), np.float32)
-    action[:, 1, 0] = 1.0
-    tables = jax.jit(jax.vmap(timetable))(cases)
-    choices = jax.jit(jax.vmap(choice_of))(cases, tables, jnp.asarray(action))
-    assert (np.asarray(choices.order)[:, -1] == 1).mean() > 0.9
-
-
 def test_attention_does_not_see_the_order_of_targets_or_absent_ones(fresh):
     network = NETWORKS["attention"]()
     rng = np.random.default_rng(2)  # noise on all weights, as the last layer is zero

@@ -8,13 +8,7 @@ import numpy as np
 import pytest
 from derivatives import assert_gradient_matches_differences
 
-from planner_jax.trajectory.polynomial import (
-    PiecewisePolynomial,
-    derivative_factors,
-    evaluate,
-    snap_energy,
-    total_duration,
-)
+from planner_jax.trajectory import polynomial
 
 DURATIONS = (0.4, 1.1, 0.7)
 DEGREE = 5
@@ -24,18 +18,19 @@ float64 = pytest.mark.usefixtures("float64")
 
 @jax.jit
 def values_at(trajectory, time):
-    return tuple(evaluate(trajectory, time, order) for order in range(DEGREE + 2))
+    return tuple(polynomial.evaluate(trajectory, time, order) for order in range(DEGREE + 2))
 
 
 @jax.jit
 def energies_of(trajectory):
-    return tuple(snap_energy(trajectory, order) for order in range(DEGREE + 2))
+    return tuple(polynomial.snap_energy(trajectory, order) for order in range(DEGREE + 2))
 
 
 def trajectory(dtype=np.float64, seed=0):
-    """Draw three pieces that do not join."""
     coeffs = np.random.default_rng(seed).normal(size=(3, DEGREE + 1, 3))
-    return PiecewisePolynomial(coeffs=coeffs.astype(dtype), durations=np.array(DURATIONS, dtype))
+    return polynomial.PiecewisePolynomial(
+        coeffs=coeffs.astype(dtype), durations=np.array(DURATIONS, dtype)
+    )
 
 
 def exact(piece, local, order=0):
@@ -46,7 +41,7 @@ def exact(piece, local, order=0):
 def test_derivative_factors_are_falling_factorials():
     for order in range(7):
         expected = [math.perm(k, order) for k in range(6)]
-        np.testing.assert_array_equal(derivative_factors(5, order), expected)
+        np.testing.assert_array_equal(polynomial.derivative_factors(5, order), expected)
 
 
 @float64
@@ -70,7 +65,7 @@ def test_a_piece_starts_when_the_previous_one_ends_and_the_outer_ones_continue()
 
 @float64
 def test_the_slope_in_time_is_the_next_derivative():
-    rate_of = jax.jit(jax.jacfwd(lambda time, path: evaluate(path, time, 1)))
+    rate_of = jax.jit(jax.jacfwd(lambda time, path: polynomial.evaluate(path, time, 1)))
     for time in (-0.1, 0.2, 1.2, 2.5):
         expected = values_at(trajectory(), time)[2]
         np.testing.assert_allclose(rate_of(time, trajectory()), expected, rtol=1e-12)
@@ -78,9 +73,9 @@ def test_the_slope_in_time_is_the_next_derivative():
 
 @float64
 def test_the_durations_add_up_in_one_trajectory_and_in_many():
-    assert float(total_duration(trajectory())) == pytest.approx(2.2, rel=1e-15)
+    assert float(polynomial.total_duration(trajectory())) == pytest.approx(2.2, rel=1e-15)
     many = jax.tree.map(lambda x: np.stack([x, 2.0 * x]), trajectory())
-    np.testing.assert_allclose(total_duration(many), [2.2, 4.4], rtol=1e-15)
+    np.testing.assert_allclose(polynomial.total_duration(many), [2.2, 4.4], rtol=1e-15)
 
 
 @float64
@@ -97,21 +92,7 @@ def test_the_energy_is_the_quadrature_of_the_squared_derivative(order):
 @float64
 def test_the_gradients_match_finite_differences():
     def total(trajectory):
-        value = evaluate(trajectory, 1.8, 1)
-        return snap_energy(trajectory, 3) + jnp.sum(value * jnp.arange(1.0, 4.0))
+        value = polynomial.evaluate(trajectory, 1.8, 1)
+        return polynomial.snap_energy(trajectory, 3) + jnp.sum(value * jnp.arange(1.0, 4.0))
 
     assert_gradient_matches_differences(total, trajectory())
-
-
-def test_batch_equals_loop_in_float32():
-    many = jax.tree.map(
-        lambda a, b: np.stack([a, 1.5 * b]), *(trajectory(np.float32, k) for k in (0, 1))
-    )
-    times = np.array([1.3, 0.2], np.float32)
-    both = jax.vmap(lambda path, time: (evaluate(path, time), snap_energy(path)))
-    values, energies = map(np.asarray, jax.jit(both)(many, times))
-    assert values.dtype == energies.dtype == np.float32
-    for k in range(2):
-        one = jax.tree.map(lambda x, k=k: x[k], many)
-        np.testing.assert_allclose(values[k], values_at(one, times[k])[0], rtol=1e-5)
-        np.testing.assert_allclose(energies[k], energies_of(one)[4], rtol=1e-5)

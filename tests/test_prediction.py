@@ -8,31 +8,25 @@ import numpy as np
 import pytest
 from convergence import observed_order
 from derivatives import assert_gradient_matches_differences
-from serve import DRAG, GRAVITY, assert_close, float64, pick, serve, three_balls
+from serve import DRAG, GRAVITY, assert_close, float64, serve
 
+from planner_jax.ball import prediction
 from planner_jax.ball.flight import BallState, drag_free_flight, rk4_step
-from planner_jax.ball.prediction import (
-    PathTable,
-    convolution_weights,
-    horizon_of,
-    predict_path,
-    target_at,
-)
 from planner_jax.ball.prediction_kernel import table_kernel
 
 HORIZON, NUM_NODES = 1.5, 13  # ten intervals of 0.15 s between time 0 and the horizon
 RESOLUTION = 0.15
 
 # Compiled once for all tests of equal shapes and dtype; "many" have a row of times.
-predict = jax.jit(functools.partial(predict_path, num_nodes=NUM_NODES))
-many_targets = jax.jit(jax.vmap(target_at, in_axes=(None, 0)))
+predict = jax.jit(functools.partial(prediction.predict_path, num_nodes=NUM_NODES))
+many_targets = jax.jit(jax.vmap(prediction.target_at, in_axes=(None, 0)))
 step_once = jax.jit(rk4_step)
 drag_free = jax.jit(jax.vmap(drag_free_flight, in_axes=(None, 0, None)))
 
 
 @jax.jit
 def target_and_rate(table, time):
-    return jax.jvp(lambda t: target_at(table, t), (time,), (jnp.ones_like(time),))
+    return jax.jvp(lambda t: prediction.target_at(table, t), (time,), (jnp.ones_like(time),))
 
 
 def path(drag=DRAG, dtype=np.float64):
@@ -40,11 +34,10 @@ def path(drag=DRAG, dtype=np.float64):
 
 
 def table_of(function, resolution, num_nodes=NUM_NODES):
-    """Tabulate `function(time)`, which returns a position (3,) and its velocity."""
     times = resolution * (np.arange(num_nodes) - 1.0)
     nodes = [function(t) for t in times]
     pos, vel = (np.array(rows) for rows in zip(*nodes, strict=True))
-    return PathTable(pos=pos, vel=vel, resolution=np.asarray(resolution))
+    return prediction.PathTable(pos=pos, vel=vel, resolution=np.asarray(resolution))
 
 
 def swing(t):
@@ -57,7 +50,7 @@ def swing(t):
 def test_nodes_are_runge_kutta_steps_from_one_before_the_start_to_one_past_the_horizon():
     table = jax.tree.map(np.asarray, path())
     assert table.pos.shape == table.vel.shape == (NUM_NODES, 3)
-    np.testing.assert_allclose(horizon_of(table), HORIZON, rtol=1e-15)
+    np.testing.assert_allclose(prediction.horizon_of(table), HORIZON, rtol=1e-15)
     state = step_once(serve(), -RESOLUTION, DRAG, GRAVITY)
     assert_close((table.pos[0], table.vel[0]), (state.pos, state.vel), rtol=1e-14)
     state = serve()
@@ -68,13 +61,13 @@ def test_nodes_are_runge_kutta_steps_from_one_before_the_start_to_one_past_the_h
 
 def test_a_table_of_too_few_nodes_is_refused():
     with pytest.raises(ValueError, match=r"^num_nodes must be >= 5, got 4$"):
-        predict_path(serve(), HORIZON, DRAG, GRAVITY, num_nodes=4)
+        prediction.predict_path(serve(), HORIZON, DRAG, GRAVITY, num_nodes=4)
 
 
 @float64
 def test_the_kernel_reproduces_quadratics_and_reads_nodes_exactly():
     u = np.linspace(0.0, 1.0, 11)
-    weights = np.asarray(jax.jit(jax.vmap(convolution_weights))(u))
+    weights = np.asarray(jax.jit(jax.vmap(prediction.convolution_weights))(u))
     nodes = np.arange(-1.0, 3.0)
     for power in range(3):
         np.testing.assert_allclose(weights @ nodes**power, u**power, atol=1e-15)
@@ -144,8 +137,8 @@ def test_a_time_outside_the_table_continues_at_constant_velocity(time, end):
 
 def somewhere_on_the_path(point):
     ball, drag, gravity, time = point
-    table = predict_path(ball, HORIZON, drag, gravity, num_nodes=5)
-    state = target_at(table, time)
+    table = prediction.predict_path(ball, HORIZON, drag, gravity, num_nodes=5)
+    state = prediction.target_at(table, time)
     return jnp.sum(state.pos * jnp.arange(1.0, 4.0)) + jnp.sum(state.vel**2)
 
 
@@ -154,22 +147,6 @@ def somewhere_on_the_path(point):
 def test_the_gradient_in_ball_drag_gravity_and_time_matches_finite_differences(position):
     point = (serve(), DRAG, GRAVITY, position * HORIZON / 2.0)
     assert_gradient_matches_differences(somewhere_on_the_path, point, step=1e-6, rtol=1e-6)
-
-
-@float64
-def test_batch_equals_loop():
-    balls = three_balls()
-    horizons, drags = np.array([HORIZON, 0.3, 2.0]), np.array([DRAG, 0.0, 0.3])
-    gravity, times = np.float64(GRAVITY), np.array([1.5, 0.4, -0.1])
-    tables = jax.jit(
-        jax.vmap(functools.partial(predict_path, num_nodes=NUM_NODES), in_axes=(0, 0, 0, None))
-    )(balls, horizons, drags, gravity)
-    targets = jax.jit(jax.vmap(target_at))(tables, times)
-    tables, targets = jax.tree.map(np.asarray, (tables, targets))
-    for k in range(3):
-        table = predict(pick(balls, k), horizons[k], drags[k], gravity)
-        assert_close(pick(tables, k), table, rtol=1e-13)
-        assert_close(pick(targets, k), target_and_rate(table, float(times[k]))[0], rtol=1e-13)
 
 
 def kernel_arguments(lanes=32):
@@ -184,7 +161,7 @@ def kernel_arguments(lanes=32):
 def table_of_lane(nodes):
     def table(pos, vel, step, drag, gravity):
         ball = BallState(pos, vel)
-        path = predict_path(ball, step * (nodes - 3), drag, gravity, num_nodes=nodes)
+        path = prediction.predict_path(ball, step * (nodes - 3), drag, gravity, num_nodes=nodes)
         return path.pos, path.vel
 
     return table

@@ -9,14 +9,7 @@ from derivatives import assert_gradient_matches_differences
 from flown_plans import matrices
 
 import planner_jax as pj
-from planner_jax.robot.quadrotor import (
-    QuadrotorLimits,
-    QuadrotorPlan,
-    body_rate_squared,
-    body_z,
-    net_thrust,
-    tangent_basis,
-)
+from planner_jax.robot import quadrotor
 from planner_jax.runs.timing import CompileClock
 
 GRAVITY = 9.81
@@ -27,10 +20,10 @@ FIELDS = ("pos", "vel", "acc", "jerk", "quat_wxyz", "body_rate", "thrust")
 
 float64 = pytest.mark.usefixtures("float64")
 
-rate_squared = jax.jit(body_rate_squared)
-axis = jax.jit(body_z)
-basis = jax.jit(jax.vmap(tangent_basis))
-rate_and_gradient = jax.jit(jax.value_and_grad(body_rate_squared, argnums=(0, 1)))
+rate_squared = jax.jit(quadrotor.body_rate_squared)
+axis = jax.jit(quadrotor.body_z)
+basis = jax.jit(jax.vmap(quadrotor.tangent_basis))
+rate_and_gradient = jax.jit(jax.value_and_grad(quadrotor.body_rate_squared, argnums=(0, 1)))
 
 
 def acceleration(time, order=0):
@@ -51,7 +44,7 @@ def attitude(time):
 @float64
 def test_the_thrust_carries_the_weight_and_the_body_axis_follows_it():
     acc = np.array([[0.0, 0.0, 0.0], [3.0, 0.0, 4.0 - GRAVITY], [0.0, 0.0, -2.0 * GRAVITY]])
-    np.testing.assert_allclose(net_thrust(acc, GRAVITY), acc + GRAVITY * UP, rtol=1e-15)
+    np.testing.assert_allclose(quadrotor.net_thrust(acc, GRAVITY), acc + GRAVITY * UP, rtol=1e-15)
     expected = [[0.0, 0.0, 1.0], [0.6, 0.0, 0.8], [0.0, 0.0, -1.0]]
     np.testing.assert_allclose(axis(acc, GRAVITY), expected, atol=1e-15)
 
@@ -62,7 +55,7 @@ def test_singular_attitudes_are_finite_the_axis_in_free_fall_and_the_basis_strai
     assert np.all(np.isfinite(x)) and np.all(np.isfinite(y))
     fall = np.array([0.0, 0.0, -GRAVITY], np.float32)
     assert not np.any(axis(fall[None], np.float32(GRAVITY)))
-    jacobian = jax.jit(jax.jacfwd(body_z))(fall, np.float32(GRAVITY))
+    jacobian = jax.jit(jax.jacfwd(quadrotor.body_z))(fall, np.float32(GRAVITY))
     assert np.all(np.isfinite(jacobian))
 
 
@@ -92,7 +85,9 @@ def test_the_body_rate_is_that_of_the_turning_attitude(time):
 @pytest.mark.parametrize("acc", [(0.0, 0.0, 0.0), (3.0, -5.0, 2.0), (4.0, 1.0, -12.0)])
 def test_the_gradient_of_the_body_rate_matches_finite_differences(acc):
     point = (np.array(acc), np.array([20.0, -7.0, 11.0]), GRAVITY)
-    assert_gradient_matches_differences(lambda point: body_rate_squared(*point), point, rtol=1e-6)
+    assert_gradient_matches_differences(
+        lambda point: quadrotor.body_rate_squared(*point), point, rtol=1e-6
+    )
 
 
 # In hover; near and in free fall; near and at straight down.
@@ -117,7 +112,7 @@ def test_the_body_rate_is_right_to_rounding_in_float32(float64):
 
 
 def test_scaled_limits_keep_the_ground():
-    limits = QuadrotorLimits(speed=5.0, acceleration=15.0, body_rate=4.0, min_height=0.25)
+    limits = quadrotor.QuadrotorLimits(speed=5.0, acceleration=15.0, body_rate=4.0, min_height=0.25)
     half = limits.scale(0.5, 9.81)
     assert (half.speed, half.acceleration, half.body_rate) == (2.5, 7.5, 2.0)
     assert half.min_height == limits.min_height
@@ -128,7 +123,7 @@ def plan_of(coeffs, durations):
     """Return a plan, or a batch, in float64 where that is enabled."""
     coeffs, durations = np.asarray(coeffs, float), np.asarray(durations, float)
     blank = np.zeros(coeffs.shape[:-3])
-    return QuadrotorPlan(
+    return quadrotor.QuadrotorPlan(
         *(blank, blank, blank.astype(np.int32), blank.astype(np.int32)),
         trajectory=pj.PiecewisePolynomial(coeffs=coeffs, durations=durations),
         gravity=np.full(coeffs.shape[:-3], GRAVITY),
@@ -142,7 +137,6 @@ def hover(duration=0.5):
 
 
 def curve(seed=0, duration=0.8):
-    """Return one piece of degree 7 that turns and tilts without losing its thrust."""
     coeffs = np.random.default_rng(seed).normal(size=(1, 8, 3))
     return plan_of(coeffs / np.array([1, 1, 1, 2, 6, 24, 60, 120])[:, None], [duration])
 

@@ -71,7 +71,6 @@ def test_an_infinite_thrust_is_no_limit():
 
 @pytest.fixture(scope="module")
 def serves():
-    """Draw serves and replace two: one ball flies away, the other lands too soon."""
     drawn = jax.tree.map(np.array, pj.hit.draw(4, seed=1))
     drawn.ball.pos[1], drawn.ball.vel[1] = (-2.0, 0.0, 2.0), (-14.0, 0.0, 6.0)
     drawn.ball.pos[2], drawn.ball.vel[2] = (-6.5, 0.0, 0.6), (0.0, 0.0, -2.0)
@@ -102,7 +101,6 @@ def test_a_number_that_is_not_finite_rules_out_nothing(serves):
 
 
 def throw(*balls, horizon=1.2, **options):
-    """Make one case with balls (position, velocity) without drag."""
     pos, vel = (np.asarray(part, np.float32)[None] for part in zip(*balls, strict=True))
     shape = pos.shape[:2]
     path = BallPath(BallState(pos, vel), 0.0 * pos, np.full(shape, 9.81, np.float32))

@@ -77,7 +77,6 @@ def motion(shape, end=GOAL, durations=PIECES, start=HOME):
 
 
 def good(shape=REST_TO_REST, end=GOAL, durations=PIECES, velocity=INCOMING, at=CONTACT, **options):
-    """Return the leaves, with leading axis 1, of an arm that blocks the ball."""
     fall = np.array([0.0, 0.0, GRAVITY])
     begin = velocity + fall * CONTACT_TIME
     pos = at - begin * CONTACT_TIME + 0.5 * fall * CONTACT_TIME**2
@@ -360,7 +359,6 @@ def gap(first, second):
 
 
 def solids_of(angles):
-    """Return the arm's solids: link, middle, spanning rows and radius of capsules and shield."""
     frames, found = links(angles), []
     for k, (first, second) in enumerate(ARM.capsule_ends):
         rotation, place = frames[ARM.capsule_link[k]]

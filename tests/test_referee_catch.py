@@ -83,7 +83,6 @@ assert_good, assert_fails = checks(judge)
 
 
 def one_target(place=START, *, pos=None, vel=(0.0, 0.0, -3.0), time=1.1, drag=0.0, gravity=0.0):
-    """Return leaves of a hover and a target of constant velocity, which is at `pos` at `time`."""
     pos = np.array(place) + [0.0, 0.0, NET_HEIGHT] if pos is None else np.asarray(pos)
     leaves = good()
     return leaves | {

@@ -24,12 +24,10 @@ H = TIME / (KNOTS - 1)  # duration of a piece
 
 
 def square(x, y, half, sense=1):
-    """Return the corners of a square around (x, y)."""
     return np.array([x, y]) + half * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])[::sense]
 
 
 def group(polygons=(), velocities=(), room=(3, 6)):
-    """Return the leaves of obstacles, with leading axis 1, and NaN for absent ones."""
     centre, corners = np.full((room[0], 2), np.nan), np.full((*room, 2), np.nan)
     velocity = np.full((room[0], 2), np.nan)
     for k, polygon in enumerate(polygons):

@@ -48,7 +48,6 @@ def low(height=0.8):
 
 @pytest.fixture
 def others(tmp_path, monkeypatch):
-    """Write a package with these entry points, {group: {name: object}}, onto the path."""
     (tmp_path / "planner_jax_others.py").write_text(MODULE)
     folder = tmp_path / "planner_jax_others-1.0.dist-info"
     folder.mkdir()

@@ -84,7 +84,6 @@ def test_positions_of_rotors_may_be_pairs_of_numbers_pairs_as_text_or_one_text()
 
 
 def change_fields(**fields):
-    """Return the text of a file with some fields replaced; None removes a field."""
     description = copy.deepcopy(FIELDS)
     for name, value in fields.items():
         part, _, field = name.rpartition("__")
@@ -99,21 +98,17 @@ def change_fields(**fields):
 BAD = """
 mass | 800 gg | mass must be in kg, g, got '800 gg'; did you mean g?
 mass | 3 m | mass must be in kg, g, got '3 m'
-mass | heavy | mass must be in kg, g, got 'heavy'
 mass | 1 2 kg | mass must be a number in kg, g, got '1 2 kg'
 mass | 1.2.3 kg | mass must be in kg, g, got '1.2.3 kg'; did you mean kg?
 mass | 1 to 2 kg | mass must be in kg, g, got '1 to 2 kg'
 mass | 1e999 kg | mass must be finite, got '1e999 kg'
 mass | .nan | mass must be finite, got nan
-mass | true | mass must be in kg, g, got True
 mass | [~] | mass must be in kg, g, got None
 mass | -1 kg | mass must be > 0, got -1
-mass | ~ | mass must be given, got nothing
 tool | ~ | tool must be given, got nothing
 tool | net | tool must be fields with values, got 'net'
 tool.radius | ~ | tool.radius must be given, got nothing
 tool.kind | rackett | tool.kind must be net or racket, got 'rackett'; did you mean racket?
-tool.kind | 3 | tool.kind must be text, got 3
 masss | 1 kg | field must be one of FIELDS, got 'masss'; did you mean mass?
 tool.size | 1 m | tool field must be one of TOOL, got 'size'
 rotors.places | 1 m | rotors.places must be 8 numbers in m, cm, mm, got '1 m'
@@ -127,7 +122,6 @@ inertia | 3 3 5 g m | inertia must be in INERTIAS, got '3 3 5 g m'; did you mean
 inertia | 3 3 5 | inertia must have its UNIT, got '3 3 5'
 inertia | [3, 3, 5] | inertia must have its UNIT, got [3, 3, 5]
 inertia | [3 g m^2, 3 g m^2, 5] | inertia must have its UNIT, got ['3 g m^2', '3 g m^2', 5]
-inertia | 3 | inertia must have its UNIT, got 3
 model | my.urdf | model must name an MJCF file, .xml, got 'my.urdf'
 """
 WORDS = {
@@ -272,8 +266,6 @@ def test_the_command_lists_robots_and_prints_one_to_begin_from(capsys, tmp_path)
         (["robots", "crazyfly"], "robot must be one of paper-catcher, .*did you mean crazyflie"),
         (["sweep", "hit", "--robot", "crazyfly"], "--robot must be one of paper-catcher"),
         (["sweep", "hit", "--robot", "crazyflie"], "--robot must carry a racket, got 'crazyflie'"),
-        (["sweep", "catch", "--robot", "x500"], "--robot must carry a net, got 'x500' with a rac"),
-        (["fly", "hit", "--robot", "x500-net"], "--robot must carry a racket, got 'x500-net'"),
         (["fly", "catch", "--robot", "no.yaml"], "--robot must be a file that can be read, got"),
         (["fly", "catch", "--robot", "BAD"], "--robot must be a sound one: .*bad.yaml: mass must"),
     ],

@@ -205,7 +205,6 @@ def test_the_gradient_at_an_optimum_matches_differences_of_optima(name, float64)
 
     @jax.jit
     def refine(case, point):
-        """Move a point near the optimum to it, and return the number of the plan."""
         context, objective = objective_of(case)
         point, _ = newton_refine(objective, point, max_steps=60, stationarity=1e-15)
         return point, quantity(planner.decode(point, context))

@@ -63,7 +63,6 @@ def batch(*trees):
 
 
 def plans(*motions, contact, status=None):
-    """Return plans of motions with one contact time."""
     num = len(motions)
     none: Any = np.zeros(num, np.float32)
     states: Any = np.zeros(num, np.int32) if status is None else np.array(status, np.int32)
@@ -307,7 +306,6 @@ def test_shapes_are_placed_at_the_links():
 
 @pytest.fixture(scope="module")
 def recorded():
-    """Return task, flights and recording of four arms; one arm blocks its ball."""
     task = BlockFly(num=LANES).flight()
     places = [(0.05, 0.0)] + [(0.0, 0.3)] * (LANES - 1)
     cases = Throws(np.arange(LANES), jax.tree.map(np.asarray, throw_at_shield(places)))
@@ -372,33 +370,6 @@ def test_observed_balls_are_blocked_from_the_command_line(tmp_path, capsys):
     summary = json.loads((out / "manifest.json").read_text())["summary"]
     assert summary["motions"] >= 4 and summary["blocked"] >= 3
     assert summary["last_fit_error_median"] < summary["fit_error_median"]
-
-
-@pytest.mark.parametrize(
-    ("build", "message"),
-    [
-        (
-            lambda: BlockFly(replan=10.0),
-            "replan must be >= 0, and 0 without perception: a block is planned once, got 10",
-        ),
-        (lambda: BlockFly(perception=True, noise=-1.0), "noise must be finite and >= 0, got -1"),
-        (
-            lambda: BlockFly(perception=True, frame_rate=0.0),
-            "frame_rate must be finite and > 0, got 0",
-        ),
-        (
-            lambda: BlockFly(perception=True, planner="library:some.lib"),
-            "planner must be one other than 'library' with perception, got 'library:some.lib'",
-        ),
-        (lambda: BlockFly(encoders="no"), "encoders must be one of none, fine, coarse, got 'no'"),
-        (lambda: BlockFly(observe=-0.1), "observe must be finite and >= 0, got -0.1"),
-        (lambda: BlockFly(mass_error=-1.0), "mass_error must be > -1 and < 1, got -1"),
-    ],
-)
-def test_settings_that_break_a_rule_are_refused_in_one_line(build, message):
-    with pytest.raises(ArgumentError) as error:
-        build()
-    assert str(error.value) == message
 
 
 def test_flights_take_a_library_of_their_limits_and_scene_alone(tmp_path):

@@ -38,7 +38,6 @@ def evaluate_contact_positions(flown):
 
 
 def contact_errors(flown):
-    """Return distance [m] and time [s] between planned and simulated contacts of the first ball."""
     places = flown.contact.robot_pos[:, 0] - evaluate_contact_positions(flown)
     times = flown.contact.time - flown.contact.planned_time
     return np.linalg.norm(places, axis=1), np.abs(times[:, 0])
@@ -113,20 +112,6 @@ def test_a_world_other_than_the_planned_one_is_refused(fly, world, message):
         f"{name} must be the same in plan and flown world, "
         f"got {planned} in the plan's case and {flown} in the world"
     )
-
-
-@pytest.mark.parametrize(
-    ("build", "message"),
-    [
-        (lambda: throws(1, 0), "num_balls must be >= 1, got 0"),
-        (lambda: throws(1, drag_error=-0.1), "drag_error must be >= 0 and < 1, got -0.1"),
-        (lambda: volleys(1, drag_error=1.5), "drag_error must be >= 0 and < 1, got 1.5"),
-    ],
-)
-def test_cases_out_of_range_are_refused(build, message):
-    with pytest.raises(ValueError) as error:
-        build()
-    assert str(error.value) == message
 
 
 WIDER = [bounds(Loop(CATCH_WORLD), distance) for distance in LIMITS]

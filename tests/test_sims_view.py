@@ -179,7 +179,6 @@ def test_an_address_that_cannot_be_served_is_refused_in_one_line():
 
 @pytest.fixture
 def run_folder(tmp_path):
-    """Return a folder in the form of a run of flights."""
     folder = RunFolder(tmp_path / "run")
     settings = dataclasses.asdict(CatchFly())
     manifest = {

@@ -56,7 +56,6 @@ BATCH = 48
 
 
 def pad(*problems):
-    """Pad problems to the batch size of the compiled program."""
     rows = [*problems, *[problems[-1]] * (BATCH - len(problems))]
     return jax.tree.map(lambda *leaves: np.stack(leaves), *rows)
 

@@ -1,28 +1,24 @@
 """Sweeps of hits: run folder, resuming, tables, figures, clocks and rates."""
 
-from types import SimpleNamespace
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pyarrow as pa
 import pytest
-from matplotlib.figure import Figure
+from referees import flight
 from sweeps import RunTests, columns, quick_hit, stop_after
 
 import planner_jax as pj
 from planner_jax.baselines.hit.published import read_published_rates
 from planner_jax.core.errors import ArgumentError
-from planner_jax.planning import programs
 from planner_jax.planning.plan import plan
 from planner_jax.referee.hit import referee_hits
 from planner_jax.robot import quadrotor
 from planner_jax.runs.dataset import ROW_GROUP, Dataset, encode
-from planner_jax.runs.run_folder import RunFolder, RunRows
+from planner_jax.runs.run_folder import RunFolder
 from planner_jax.runs.summary import percent, wilson_interval
 from planner_jax.runs.timing import CompileClock
 from planner_jax.sweep import run
-from planner_jax.sweep.hit.figures import motion_figure
 from planner_jax.sweep.hit.settings import HitSettings
 from planner_jax.sweep.hit.sweep import HitSweep
 from planner_jax.sweep.quadrotor import body_rate, net_thrust, sample_motion
@@ -89,41 +85,21 @@ def test_the_rows_alone_lead_the_referee_to_the_same_verdict(finished):
     rows, setting = columns(out), manifest["setting"]
     head = np.zeros((NUM, 4, 3))
     head[:, 0] = rows["start"]
-
-    def same(*names, **others):
-        values = {name: np.tile(setting[name], (NUM, 1)).squeeze() for name in names}
-        return SimpleNamespace(**values, **others)
-
-    physics = vars(same("drag", "gravity", "restitution", "racket_height"))
-    cases = SimpleNamespace(
-        ball=SimpleNamespace(pos=rows["ball_pos"], vel=rows["ball_vel"]),
-        head_state=head,
-        target=rows["target"],
-        limits=same(
-            *("speed", "acceleration", "body_rate", "min_height"),
-            **{"min_thrust": None, "max_thrust": None, "rotors": None},
-        ),
-        hit_limits=same("hitting_speed", "min_apex", "max_apex"),
-        racket_radius=None,
-        extras=(),
-        **physics,
-    )
-    pieces = rows["durations"].shape[1]
-    trajectory = SimpleNamespace(
-        durations=rows["durations"], coeffs=rows["coeffs"].reshape(NUM, pieces, -1, 3)
-    )
-    plans = SimpleNamespace(
-        trajectory=trajectory, stroke=SimpleNamespace(time=rows["contact_time"]), recovery=None
-    )
-    verdict = referee_hits(cases, plans)
+    leaves = {"head_state": head, "target": rows["target"], "durations": rows["durations"]}
+    leaves |= {"ball.pos": rows["ball_pos"], "ball.vel": rows["ball_vel"]}
+    leaves["coeffs"] = rows["coeffs"].reshape(*rows["durations"].shape, -1, 3)
+    leaves["stroke.time"] = rows["contact_time"]
+    for part, names in (
+        ("", ("drag", "gravity", "restitution", "racket_height")),
+        ("limits.", ("speed", "acceleration", "body_rate", "min_height")),
+        ("hit_limits.", ("hitting_speed", "min_apex", "max_apex")),
+    ):
+        leaves |= {part + name: np.tile(setting[name], (NUM, 1)).squeeze() for name in names}
+    found = flight(leaves, racket_radius=None)
+    verdict = referee_hits(found, found)
     np.testing.assert_array_equal(verdict.success, rows["success"])
     np.testing.assert_array_equal(verdict.failed_limit, rows["failed_limit"])
     np.testing.assert_allclose(verdict.max_speed, rows["max_speed"], rtol=1e-5)
-
-
-def test_rows_are_picked_across_parts(finished):
-    picked = RunFolder(finished[0]).plans.pick([BATCH, 0, NUM - 1, BATCH], ["index"])
-    assert [row["index"] for row in picked] == [0, BATCH, NUM - 1]
 
 
 def test_rows_are_picked_across_the_row_groups_of_parts(tmp_path):
@@ -199,8 +175,8 @@ def test_published_outcomes_stand_beside_the_plans_of_the_same_serves(tmp_path, 
     assert table.rows[0][-1] == "66.7" and table.rows[1][-1] == "" and table.rows[-1][-1] == "66.67"
 
 
-def test_a_single_chunk_is_timed_warm_too(tmp_path, no_report):
-    programs._solve_on_devices.clear_cache()  # no program of another kind
+def test_a_single_chunk_is_timed_warm_too(tmp_path, no_report, monkeypatch):
+    monkeypatch.setattr(HitSweep, "planner", lambda *_: pj.hit.planner("juggle", nodes=5))
     serves = trial_files(tmp_path / "serves")
     manifest = start_sweep(TASK, HitSettings(serves=serves), tmp_path / "run", progress=False)
     times = manifest["times"]
@@ -265,9 +241,6 @@ def test_a_percentage_is_100_or_0_only_where_it_is_exact():
     assert percent(10**6, 10**6) == "100.00" and percent(0, 10**6) == "0.00"
     assert percent(10**6 - 1, 10**6) == "99.99" and percent(1, 10**6) == "0.01"
     assert percent(1, 3) == "33.33"
-
-
-def test_the_interval_without_trials_says_nothing():
     assert wilson_interval(0, 0) == (0.0, 1.0)
 
 
@@ -307,15 +280,6 @@ def test_sampled_motion_agrees_with_the_trajectory(float64):
     squared = quadrotor.body_rate_squared(acc, jerk, jnp.asarray(9.8))
     np.testing.assert_allclose(body_rate(motion, 9.8) ** 2, squared, rtol=1e-8)
     np.testing.assert_allclose(net_thrust(motion, 9.8), quadrotor.net_thrust(acc, 9.8))
-
-
-def test_hover_is_named_where_no_curve_runs(finished):
-    out, manifest = finished
-    figure = Figure()
-    motion_figure(figure, RunRows(RunFolder(out), manifest, []))
-    thrust = next(axes for axes in figure.axes if axes.get_title().startswith("Thrust"))
-    assert "dotted: hover" in thrust.get_title()
-    assert all("hover" not in text.get_text() for text in thrust.texts)
 
 
 def test_the_truer_model_is_for_the_exact_planner_alone():

@@ -1,11 +1,10 @@
 """Sweeps of catches: rows, tables and figures, resuming, and rejected settings."""
 
-from types import SimpleNamespace
-
 import jax
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from referees import flight
 from sweeps import RunTests, columns, quick_catch
 
 import planner_jax as pj
@@ -71,41 +70,21 @@ def test_a_planner_that_decides_itself_has_no_optimal_time_ratio(finished):
 def test_the_rows_alone_lead_the_referee_to_the_same_verdict(finished):
     out, manifest = finished
     rows, setting = columns(out), manifest["setting"]
-
-    def same(*names, prefix=""):
-        values = {name: np.full(NUM, setting[prefix + name]) for name in names}
-        return SimpleNamespace(**values)
-
     head = np.zeros((NUM, 4, 3))
     head[:, 0] = rows["start"]
-    by_target = {name: rows[name].reshape(NUM, 2, 3) for name in ("ball_pos", "ball_vel", "drag")}
-    ball = SimpleNamespace(pos=by_target["ball_pos"], vel=by_target["ball_vel"])
-    cases = SimpleNamespace(
-        targets=SimpleNamespace(ball=ball, drag=by_target["drag"], gravity=rows["ball_gravity"]),
-        present=rows["present"],
-        horizon=rows["horizon"],
-        head_state=head,
-        gravity=np.full(NUM, setting["gravity"]),
-        net=SimpleNamespace(
-            **vars(same("height", "radius", prefix="net_")),
-            max_angle=np.full(NUM, setting["net_max_angle"]),
-        ),
-        limits=SimpleNamespace(
-            **vars(same("speed", "min_thrust", "max_thrust", "body_rate", "min_height")),
-            acceleration=None,
-            rotors=None,
-        ),
-        optional=None,
-        extras=(),
-    )
-    coeffs = rows["coeffs"].reshape(NUM, rows["durations"].shape[1], -1, 3)
-    plans = SimpleNamespace(
-        trajectory=SimpleNamespace(coeffs=coeffs, durations=rows["durations"]),
-        order=rows["order"],
-        times=rows["catch_times"],
-        recovery=None,
-    )
-    verdict = referee_catches(cases, plans)
+    leaves = {name: rows[name] for name in ("present", "horizon", "durations", "order")}
+    leaves |= {"head_state": head, "times": rows["catch_times"]}
+    leaves["coeffs"] = rows["coeffs"].reshape(*rows["durations"].shape, -1, 3)
+    leaves["targets.gravity"] = rows["ball_gravity"]
+    for path, name in (("ball.pos", "ball_pos"), ("ball.vel", "ball_vel"), ("drag", "drag")):
+        leaves[f"targets.{path}"] = rows[name].reshape(NUM, 2, 3)
+    limits = ("speed", "min_thrust", "max_thrust", "body_rate", "min_height")
+    constants = {f"limits.{name}": setting[name] for name in limits}
+    constants |= {f"net.{name}": setting[f"net_{name}"] for name in ("height", "radius")}
+    constants |= {"net.max_angle": setting["net_max_angle"], "gravity": setting["gravity"]}
+    leaves |= {name: np.full(NUM, value) for name, value in constants.items()}
+    found = flight(leaves, optional=None)
+    verdict = referee_catches(found, found)
     np.testing.assert_array_equal(verdict.success, rows["success"])
     np.testing.assert_array_equal(verdict.failed_limit, rows["failed_limit"])
     np.testing.assert_allclose(verdict.net_distance, rows["net_distance"], atol=1e-5)

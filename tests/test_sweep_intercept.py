@@ -1,32 +1,26 @@
 """Sweeps of interceptions: rows that hold a case and its drive, figures, counts."""
 
 import dataclasses
-from types import SimpleNamespace
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from flax import struct
-from jax import Array
-from jax.typing import ArrayLike
+from closed_forms import positions_on
+from referees import tree
 from sweeps import RunTests, columns
 
 import planner_jax as pj
-from planner_jax.plane.obstacles import Obstacles
 from planner_jax.plane.reach import Lattice
-from planner_jax.plane.target import PointState, PolynomialPath
+from planner_jax.plane.target import PolynomialPath
 from planner_jax.referee.intercept import referee_intercepts
 from planner_jax.robot.car import CarBody, CarLimits
 from planner_jax.runs.columns import RefereedBatch
-from planner_jax.runs.manifest import Entries, Row
 from planner_jax.runs.source import Chunk
 from planner_jax.sweep.intercept.columns import COLUMNS, WAY_POINTS
 from planner_jax.sweep.intercept.figures import instants, sample_drive
 from planner_jax.sweep.intercept.settings import InterceptSettings
 from planner_jax.sweep.intercept.sweep import InterceptSweep
-from planner_jax.task.intercept.case import InterceptCase
 from planner_jax.task.intercept.searches import Search
 
 TASK = pj.task_named("intercept")
@@ -43,54 +37,26 @@ BODY = [field.name for field in dataclasses.fields(CarBody)]
 LIMITS = [field.name for field in dataclasses.fields(CarLimits)]
 
 
-@struct.dataclass
-class SampledTarget:
-    places: Array  # (M, 2) [m], the first at time 0
-    end: Array  # () [s], the time of the last
-
-    def at(self, time: Array) -> PointState:
-        num = self.places.shape[0] - 1
-        share = jnp.clip(time / self.end * num, 0.0, num)
-        k = jnp.clip(share.astype(jnp.int32), 0, num - 1)
-        step = self.places[k + 1] - self.places[k]
-        share = share - k.astype(share.dtype)
-        return PointState(pos=self.places[k] + share * step, vel=step * (num / self.end))
-
-
-def case_of(row: Row, setting: Entries) -> InterceptCase:
-    """Return the case of a row with the manifest's `setting` and a `SampledTarget`."""
-
-    def leaf(value: ArrayLike, *shape: int) -> Array:
-        return jnp.asarray(np.reshape(value, shape), jnp.float32)
-
-    due = leaf(row["due_time"])
-    still = 0.0 * np.array(row["wall_present"], float)
-    return InterceptCase(
-        start=leaf(row["start"], 3),
-        speed=leaf(row["initial_speed"]),
-        curvature=leaf(row["initial_curvature"]),
-        target=SampledTarget(places=leaf(row["target_way"], -1, 2), end=due),
-        time=due,
-        walls=_obstacles(row, "wall", np.repeat(still, 2)),
-        movers=_obstacles(row, "mover", row["mover_velocity"]),
-        lower=leaf(setting["lower"], 2),
-        upper=leaf(setting["upper"], 2),
-        body=CarBody(**{name: leaf(setting[f"body_{name}"]) for name in BODY}),
-        limits=CarLimits(**{name: leaf(setting[name]) for name in LIMITS}),
-        **{n: leaf(row[n]) for n in ("tolerance", "end_heading", "heading_tolerance")},
-    )
-
-
-def _obstacles(row: Row, kind: str, velocity: ArrayLike) -> Obstacles:
-    present = np.array(row[f"{kind}_present"], bool)
-    corners = np.reshape(row[f"{kind}_corners"], (len(present), -1, 2))
-    centre = corners.mean(axis=1, keepdims=True)
-    return Obstacles(
-        centre=jnp.asarray(centre[:, 0], jnp.float32),
-        corners=jnp.asarray(corners - centre, jnp.float32),
-        velocity=jnp.asarray(np.reshape(velocity, (-1, 2)), jnp.float32),
-        present=jnp.asarray(present),
-    )
+def leaves_of(found, setting):
+    """Return the leaves of cases and plans, by name, of the rows' columns and the manifest."""
+    due = found["due_time"]
+    leaves = {"time": due, "speed": found["initial_speed"], "curvature": found["initial_curvature"]}
+    names = ("start", "tolerance", "end_heading", "heading_tolerance")
+    leaves |= {name: found[name] for name in names}
+    constants = {f"body.{name}": setting[f"body_{name}"] for name in BODY}
+    constants |= {f"limits.{name}": setting[name] for name in LIMITS}
+    constants |= {name: setting[name] for name in ("lower", "upper")}
+    leaves |= {name: np.broadcast_to(x, (NUM, *np.shape(x))) for name, x in constants.items()}
+    for kind in ("wall", "mover"):
+        present = found[f"{kind}_present"]
+        corners = found[f"{kind}_corners"].reshape(*present.shape, -1, 2)
+        centre = corners.mean(axis=2)
+        group = {"centre": centre, "corners": corners - centre[:, :, None], "present": present}
+        speeds = found["mover_velocity"].reshape(centre.shape) if kind == "mover" else 0.0 * centre
+        leaves |= {f"{kind}s.{name}": leaf for name, leaf in (group | {"velocity": speeds}).items()}
+    plan = {name: found[name] for name in ("start", "speed", "curvature")}
+    plan["time"] = found["meeting_time"]
+    return leaves | {f"plan.{name}": leaf for name, leaf in plan.items()}
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -128,15 +94,12 @@ def test_the_example_is_a_success_near_a_mover_if_there_is_one(finished):
     assert near.any() and manifest["example"] == np.flatnonzero(near)[0]
 
 
-def test_the_rows_alone_lead_the_referee_to_the_same_verdict(finished, rows):
+def test_the_rows_alone_lead_the_referee_to_the_same_verdict(finished):
     out, manifest = finished
     found = columns(out)
-    cases = [case_of(row, manifest["setting"]) for row in rows]
-    cases = jax.tree.map(lambda *leaves: np.stack(leaves), *cases)
-    plans = SimpleNamespace(**{name: found[name] for name in ("start", "speed", "curvature")})
-    plans.time = found["meeting_time"]
-    end = cases.target.places[:, -1]
-    verdict = referee_intercepts(cases, plans, target_positions=lambda *_: end)
+    case = tree(leaves_of(found, manifest["setting"]), target=None)
+    end = found["target_way"].reshape(NUM, -1, 2)[:, -1]
+    verdict = referee_intercepts(case, case.plan, target_positions=lambda *_: end)
     np.testing.assert_array_equal(verdict.success, found["success"])
     np.testing.assert_array_equal(verdict.failed_limit, found["failed_limit"])
     np.testing.assert_allclose(verdict.miss, found["miss"], atol=1e-5)
@@ -159,20 +122,19 @@ def test_a_row_s_drive_ends_where_the_referee_sees_it(finished, rows):
         )
 
 
-def test_a_case_comes_back_from_its_row(finished, rows):
-    drawn = pj.take(pj.intercept.draw(1, "hard", 0, first=7), 0)
-    back = case_of(rows[7], finished[1]["setting"])
-    for name in ("walls", "movers"):
-        own, other = getattr(drawn, name), getattr(back, name)
+def test_a_case_comes_back_from_its_row(finished):
+    out, manifest = finished
+    drawn, found = pj.intercept.draw(NUM, "hard", 0), columns(out)
+    back = tree(leaves_of(found, manifest["setting"]))
+    for own, other in ((drawn.walls, back.walls), (drawn.movers, back.movers)):
         there = np.asarray(own.present)
         np.testing.assert_array_equal(there, other.present)
-        for time in (0.0, 10.0):
-            np.testing.assert_allclose(
-                own.vertices(time)[there], other.vertices(time)[there], atol=1e-5
-            )
-    own, other = (jax.jit(case.target.at)(jnp.float32(4.3)) for case in (drawn, back))
-    np.testing.assert_allclose(own.pos, other.pos, atol=1e-3)
-    np.testing.assert_allclose(own.vel, other.vel, atol=1e-2)
+        np.testing.assert_array_equal(own.velocity, other.velocity)
+        corners = (each.centre[:, :, None] + each.corners for each in (own, other))
+        np.testing.assert_allclose(*(np.asarray(each)[there] for each in corners), atol=1e-5)
+    times = np.linspace(0.0, found["due_time"], WAY_POINTS, axis=1)
+    way = found["target_way"].reshape(NUM, WAY_POINTS, 2)
+    np.testing.assert_allclose(positions_on(drawn.target, times), way, atol=1e-4)
 
 
 def test_a_target_of_another_class_has_a_way_and_no_leaves():

@@ -39,7 +39,6 @@ def hasty() -> Policy:
 
 @pytest.fixture(scope="module")
 def asked(hasty, tmp_path_factory) -> Any:
-    """Return a training by the estimate that starts from the hasty policy."""
     path = tmp_path_factory.mktemp("hasty") / "hasty.npz"
     save_checkpoint(path, hasty.params, hasty.network, {})
     return training.Training(

@@ -43,7 +43,6 @@ def build(kind, tree, out):
 
 
 def python_files(folder):
-    """Return paths of modules and data below a folder, without caches."""
     paths = [Path(top) / name for top, _, names in os.walk(folder) for name in names]
     kept = [path for path in paths if "__pycache__" not in path.parts]
     return {path.relative_to(folder).as_posix() for path in kept}
