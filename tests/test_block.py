@@ -28,9 +28,8 @@ from tests.derivatives import double
 SMALL = OnlineBlock(
     pieces=6, points=10, searches=(Search(straight=12, tries=3, solver=LevenbergConfig(8)),)
 )
-# A planner that tries only straight motions of the joints. It compiles much faster than the planner
-# with a search by least squares.
-STRAIGHT = dataclasses.replace(SMALL, searches=(Search(straight=60, tries=0),))
+# Quickest straight motions of the joints, which compile much faster than a search.
+STRAIGHT = dataclasses.replace(SMALL, searches=(Search(straight=60, tries=0),), brisk=True)
 
 
 def throw(**options):
@@ -255,10 +254,10 @@ def test_brisk_motions_end_before_the_ball_is_there():
     """
     cases = jax.tree.map(np.array, pj.block.draw(8, seed=8))
     cases.ends_at_rest[4] = False
-    plans, quick = (pj.plan(dataclasses.replace(STRAIGHT, brisk=b), cases) for b in (False, True))
+    resident = jax.tree.map(jnp.asarray, cases)  # like the batch of SMALL above: one program
+    plans, quick = jax.device_get((pj.plan(SMALL, resident), pj.plan(STRAIGHT, cases)))
     some = pj.are_solved(quick)
-    np.testing.assert_array_equal(some, pj.are_solved(plans))
-    assert some.sum() >= 4 and some[4]
+    assert pj.are_solved(plans)[some].all() and some.sum() >= 4 and some[4]
     verdict: Any = pj.block.judge(cases, quick)
     assert verdict.success[some].all()
     durations = quick.motion.durations.sum(axis=1)

@@ -264,7 +264,7 @@ def with_nan(tree, name, k):
     return dataclasses.replace(tree, **{first: leaf})
 
 
-@every
+@entries(slow=(*LIKE_OTHERS, "intercept spacetime"))
 def test_a_nan_lane_says_so_and_leaves_its_neighbours_bits_alone(entry):
     one = with_nan(entry.batch, entry.broken, 1)
     broken = jax.tree.map(np.array, one)
@@ -446,7 +446,7 @@ def test_a_derivative_is_refused_with_the_names_of_what_has_one(entry, call):
     assert "\n" not in str(caught.value)
 
 
-@entries(slow=(*LIKE_OTHERS, "intercept spacetime"))
+@entries(slow=(*LIKE_OTHERS, *OF_THEIR_OWN))
 def test_a_gradient_is_there_where_it_is_promised_and_refused_elsewhere(entry):
     planner = entry.planner.inner
     searches_first = isinstance(planner, SpacetimeIntercept)  # plans are then settled anew

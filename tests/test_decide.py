@@ -88,7 +88,7 @@ def pairs():
     cases = hanging([*places, (FAR, NEAR)], [(4.0, 4.0), (4.0, 1.15)] + 3 * [(4.0, 4.0)])
     ball = cases.targets.ball
     rising = ball.replace(vel=ball.vel.at[4, 0].set(jnp.array([0.2, 0.0, 1.0])))
-    return cases.replace(targets=cases.targets.replace(ball=rising))
+    return jax.tree.map(np.asarray, cases.replace(targets=cases.targets.replace(ball=rising)))
 
 
 @pytest.fixture(scope="module")
@@ -381,7 +381,7 @@ def test_a_claimed_catch_of_an_optional_target_has_to_hold(swarm, caught):
     assert (verdict.num_caught < caught.num_taken).all()
 
 
-def test_a_search_takes_more_of_a_swarm_than_greed(swarm):
+def test_a_search_takes_more_of_a_swarm_than_greed(swarm, caught):
     """Check that the beam search chooses more targets of a swarm than the greedy decision.
 
     Plans that catch more targets must have a better rank.
@@ -392,15 +392,13 @@ def test_a_search_takes_more_of_a_swarm_than_greed(swarm):
     assert number[:, 0].mean() > np.asarray(greedy(swarm).taken.sum(axis=1)).mean()
     times = np.asarray(found.times)
     assert (np.diff(times, axis=2) > 0.0).all()
-    decided = swarm.with_choice(jax.tree.map(lambda leaf: leaf[:, 0], found))
-    plans = plan(by(Given()), decided)
-    kept = Best().rank(plans)
-    fewer = Best().rank(dataclasses.replace(plans, times=np.maximum(plans.times, 0) * 0.0))
-    assert (kept < fewer).all()
+    fewer = dataclasses.replace(caught, times=np.maximum(caught.times, 0) * 0.0)
+    assert (Best().rank(caught) < Best().rank(fewer)).all()
 
 
 def test_random_orders_are_permutations_and_the_same_for_equal_cases(triangles):
-    orders = [jax.vmap(Random(seed).propose)(triangles).order[:, 0] for seed in (0, 0, 1)]
+    propose = [jax.jit(jax.vmap(Random(seed).propose)) for seed in (0, 1)]
+    orders = [propose[k](triangles).order[:, 0] for k in (0, 0, 1)]
     np.testing.assert_array_equal(np.sort(orders[0], axis=1), np.tile(np.arange(3), (NUM, 1)))
     np.testing.assert_array_equal(orders[0], orders[1])
     assert (orders[0] != orders[2]).any() and len(np.unique(orders[0], axis=0)) > 1

@@ -131,12 +131,15 @@ def test_derivatives_with_drag_are_those_of_finite_differences(float64, function
         return jnp.sum(found * jnp.arange(1.0, found.size + 1.0))
 
     at = np.array([*(-2.0, 0.4, 1.5), *(4.0, -0.5, 3.0), *(1.7, 0.0616, 9.8)])
-    slopes, bends = jax.jit(jax.grad(value)), jax.jit(jax.hessian(value))
-    values, steps = jax.jit(value), 1e-5 * np.eye(9)
-    numeric = [(values(at + step) - values(at - step)) / 2e-5 for step in steps]
-    np.testing.assert_allclose(slopes(at), numeric, rtol=1e-4, atol=1e-6)
-    numeric = [(slopes(at + step) - slopes(at - step)) / 2e-5 for step in steps]
-    np.testing.assert_allclose(bends(at), numeric, rtol=1e-3, atol=1e-5)
+    derivatives = jax.jit(lambda x: (*jax.value_and_grad(value)(x), jax.hessian(value)(x)))
+    _, slopes, bends = derivatives(at)
+    ahead, behind = (
+        [np.array(found) for found in zip(*map(derivatives, at + h * np.eye(9)), strict=True)]
+        for h in (1e-5, -1e-5)
+    )
+    numeric = [(after - before) / 2e-5 for after, before in zip(ahead, behind, strict=True)]
+    np.testing.assert_allclose(slopes, numeric[0], rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(bends, numeric[1], rtol=1e-3, atol=1e-5)
 
 
 def test_falling_ball_is_highest_now():
@@ -184,17 +187,20 @@ def test_with_zero_offsets_of_velocities_a_point_is_the_same_plan(cases):
 
 def test_velocities_as_variables_have_exact_derivatives(float64, cases):
     lane = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), pj.take(cases, 2))
-    context = SUPPLE.prepare(lane)
-    guess = SUPPLE.guesses(context, 1)[0]
-    random = np.random.default_rng(2)
-    point, direction = guess + 0.2 * random.normal(size=guess.size), random.normal(size=guess.size)
-    cost = jax.jit(lambda x: SUPPLE.objective(x, context).cost)
-    curved = SUPPLE.curvature_at(point, context)
-    np.testing.assert_allclose(
-        curved.gradient, jax.jit(jax.grad(cost))(point), rtol=1e-6, atol=1e-9
-    )
-    numeric = (cost(point + 1e-6 * direction) - cost(point - 1e-6 * direction)) / 2e-6
-    np.testing.assert_allclose(curved.gradient @ direction, numeric, rtol=1e-5)
+    random, size = np.random.default_rng(2), len(SUPPLE.scale)
+    shift, direction = 0.2 * random.normal(size=size), random.normal(size=size)
+
+    @jax.jit
+    def evaluate_at(shift):
+        context = SUPPLE.prepare(lane)
+        point = SUPPLE.guesses(context, 1)[0] + shift
+        cost = jax.value_and_grad(lambda x: SUPPLE.objective(x, context).cost)
+        return SUPPLE.curvature_at(point, context).gradient, *cost(point)
+
+    mine, _, slopes = evaluate_at(shift)
+    np.testing.assert_allclose(mine, slopes, rtol=1e-6, atol=1e-9)
+    ahead, behind = (evaluate_at(shift + h * direction)[1] for h in (1e-6, -1e-6))
+    np.testing.assert_allclose(mine @ direction, (ahead - behind) / 2e-6, rtol=1e-5)
 
 
 def test_all_guesses_but_the_first_pass_the_ball_as_fast_as_the_way_there_asks(cases):

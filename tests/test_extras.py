@@ -107,7 +107,7 @@ def hits():
 
 @pytest.fixture(scope="module")
 def free(hits):
-    return pj.plan(FREE, hits)
+    return pj.plan(pj.hit.planner(), hits)  # compiled by test_exact
 
 
 @pytest.fixture(scope="module")
