@@ -75,7 +75,7 @@ def assert_drivable(path, meeting, polygons=(), start=START):
     aside = np.cos(half) * np.diff(y) - np.sin(half) * np.diff(x)
     assert (np.abs(aside) <= 0.25 * CURVATURE * spacing**2).all()
     many = np.resize(np.float32(path.poses), (256, 3))  # repeated to a fixed size, for one program
-    assert len(x) <= 256 and gaps(many, obstacles(polygons, room=(4, 4))).min() > 0.0
+    assert len(x) <= 256 and gaps(many, obstacles(polygons)).min() > 0.0
     least = np.hypot(x[-1] - x[0], y[-1] - y[0])
     assert path.cost >= path.length >= least - 1e-9
 

@@ -9,6 +9,7 @@ import pytest
 
 import planner_jax as pj
 from planner_jax.benchmarks.latency import begin_replans
+from planner_jax.cli.compilation import record_programs
 from planner_jax.optimise.levenberg import LevenbergConfig
 from planner_jax.plane.reach import Lattice
 from planner_jax.robot.car import pose_at
@@ -174,9 +175,7 @@ HALF = [[3.9, -0.5], [4.1, -0.5], [4.1, 5.5], [3.9, 5.5]]
 
 
 def scene(target, walls=(), **settings):
-    """Make a case of the shapes of drawn cases, so that all share a compiled program."""
-    walls, movers = pj.obstacles(walls, room=(12, 6)), pj.obstacles([], room=(4, 6))
-    return pj.intercept.case(still(*target), walls=walls, movers=movers, **settings)
+    return pj.intercept.case(still(*target), walls=walls, **settings)
 
 
 def stack(cases):
@@ -212,6 +211,59 @@ def test_an_unsolvable_case_has_a_status_and_others_are_solved(scenes, name):
     assert pj.Status(plan.status).message
     verdict = pj.intercept.judge(case, plan)
     assert verdict.success == (status == pj.Status.CONVERGED), verdict.sentence()
+
+
+def widen(obstacles, num, size):
+    """Add entries that are absent, at the front, and repeat corners, to N = `num`, V = `size`."""
+    corners = np.asarray(obstacles.corners)
+    more = size - corners.shape[2]
+    wide = obstacles.replace(corners=np.concatenate([corners, *[corners[:, :, -1:]] * more], 2))
+
+    def pad(leaf):
+        leaf = np.asarray(leaf)
+        return np.concatenate([np.zeros_like(leaf[:, :1])] * (num - leaf.shape[1]) + [leaf], axis=1)
+
+    return jax.tree.map(pad, wide)
+
+
+def test_absent_obstacles_and_repeated_corners_change_no_plan(planned, scenes):
+    cases, plans = planned
+    groups = {name: getattr(cases, name) for name in ("walls", "movers")}
+    wide = cases.replace(**{name: widen(group, 16, 8) for name, group in groups.items()})
+    found = pj.plan(PLANNER, wide)
+    np.testing.assert_array_equal(found.status, plans.status)
+    # The order of sums differs. Rounding can lead least squares elsewhere (not so with float64).
+    assert np.isclose(found.cost, plans.cost, rtol=1e-3).mean() >= 0.8
+    ours, theirs = (pj.intercept.judge(each, plans) for each in (wide, cases))
+    for name in ("success", "wall_clearance", "mover_clearance"):
+        np.testing.assert_array_equal(getattr(ours, name), getattr(theirs, name))
+    # An absent wall has no effect wherever it is.
+    batch, expected = scenes
+    walls, across = batch.walls, np.array(WALL + WALL[-1:] * 4, np.float32)
+    corners = np.where(walls.present[..., None, None], walls.corners, across)
+    batch = batch.replace(walls=walls.replace(corners=corners))
+    again = pj.plan(PLANNER, jax.tree.map(jnp.asarray, batch))
+    np.testing.assert_array_equal(again.status, expected.status)
+    np.testing.assert_allclose(again.cost, expected.cost, rtol=1e-5)
+
+
+def test_other_numbers_of_obstacles_and_corners_compile_nothing(scenes):
+    target = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (10, *leaf.shape)), still(7.0, 4.0))
+
+    def plan(num):
+        sides = 3 + np.arange(num) % 4
+        circles = [2.0 * np.pi * np.arange(each)[:, None] / each for each in sides]
+        polygons = [0.2 * np.hstack([np.cos(angle), np.sin(angle)]) for angle in circles]
+        walls, movers = ([p + [2.0 + 0.5 * k, y] for k, p in enumerate(polygons)] for y in (2, 6))
+        cases = pj.intercept.case(
+            target, np.full(10, 10.0), walls=walls, movers=movers, mover_velocities=(0.0, -0.1)
+        )
+        return pj.intercept.judge(cases, pj.plan(PLANNER, cases))
+
+    assert plan(1).success.all()
+    with record_programs() as programs:
+        assert all(plan(num).success.all() for num in (3, 5, 9))
+    assert not programs
 
 
 @pytest.fixture(scope="module")

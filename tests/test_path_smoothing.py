@@ -25,7 +25,7 @@ GOALS = np.array([[6.0, 2.5, -0.4], [6.0, 4.5, 1.0], [5.5, 0.8, -2.0], [3.5, 6.0
 
 
 def walls_of(polygons=WALLS):
-    return obstacles(polygons, room=(2, 4), dtype=jnp.result_type(float))
+    return obstacles(polygons, dtype=jnp.result_type(float))
 
 
 def paths(goals):

@@ -41,10 +41,7 @@ def still(x, y):
 
 def scene(target=(6.0, 4.0), movers=(), velocities: Any = 0.0, walls=(), **settings):
     return pj.intercept.case(
-        still(*target),
-        walls=obstacles(walls, room=(12, 6)),
-        movers=obstacles(movers, velocities, room=(4, 6)),
-        **settings,
+        still(*target), walls=walls, movers=movers, mover_velocities=velocities, **settings
     )
 
 

@@ -9,8 +9,10 @@ from jax import Array
 from jax.typing import ArrayLike
 
 from planner_jax.core.checks import floating, numeric, shape_of
-from planner_jax.core.choices import require_size
 from planner_jax.core.errors import ArgumentError, ArgumentTypeError
+
+_COUNTS = (16, 32, 64)  # numbers of entries of `obstacles`; then multiples of the last
+_CORNERS = 8  # least number of corners of an entry of `obstacles`; then its doubles
 
 
 @struct.dataclass
@@ -32,32 +34,31 @@ class Obstacles:
 
 
 def obstacles(
-    polygons: object, velocities: object = 0.0, *, room: object = None, dtype: object = jnp.float32
+    polygons: object, velocities: object = 0.0, *, dtype: object = jnp.float32
 ) -> Obstacles:
     """Make the obstacles of one case from lists of corners.
+
+    The arrays are padded to 16, 32, 64, 128, 192, ... obstacles of 8, 16, 32, 64, ... corners.
+    Cases whose arrays have equal sizes share a compiled program.
 
     Args:
         polygons: a sequence with an array of corners (V, 2) [m] at time 0 for each obstacle. Each
             obstacle is convex and has its own number V of corners, in either orientation.
         velocities: (2,) [m/s] for all obstacles, or (N, 2), one for each of N obstacles.
-        room: capacity of the arrays, a pair (number of obstacles, number of corners). By default
-            it is what the polygons need. Cases of equal capacity share a compiled program.
         dtype: floating type of the arrays.
 
     Raises:
         TypeError: an argument has a wrong type.
-        ValueError: a polygon is empty or not convex, or the polygons exceed the capacity `room`.
-            The message names the polygon, and proposes to divide it into convex parts.
+        ValueError: a polygon is empty or not convex. The message names the polygon, and proposes
+            to divide it into convex parts.
     """
     dtype = floating(dtype)
     if isinstance(polygons, str) or not isinstance(polygons, Sequence | np.ndarray):
         raise ArgumentTypeError("polygons", "a sequence of corners (V, 2)", polygons)
     checked = [_check_polygon(k, corners) for k, corners in enumerate(polygons)]
-    most = max((len(each) for each in checked), default=3)
-    num, size = _check_room(room) or (max(len(checked), 1), most)
-    if len(checked) > num or most > size:
-        shown = f"{len(checked)} of up to {most}: give more room"
-        raise ArgumentError("polygons", f"at most {num} of at most {size} corners", shown=shown)
+    num, most = len(checked), max((len(each) for each in checked), default=3)
+    num = next((count for count in _COUNTS if num <= count), -(-num // _COUNTS[-1]) * _COUNTS[-1])
+    size = max(_CORNERS, 1 << (most - 1).bit_length())
     shape = shape_of("velocities", velocities)
     if shape not in ((), (2,), (len(checked), 2)):
         rule = f"the shape (2,) or ({len(checked)}, 2)"
@@ -76,16 +77,6 @@ def obstacles(
         velocity=jnp.asarray(velocity, dtype),
         present=jnp.asarray(np.arange(num) < len(checked)),
     )
-
-
-def _check_room(room: object) -> tuple[int, int] | None:
-    if room is None:
-        return None
-    if not isinstance(room, tuple | list) or len(room) != 2:
-        raise ArgumentTypeError("room", "two whole numbers", room)
-    for value in room:
-        require_size("room", value)
-    return room[0], room[1]
 
 
 def _check_polygon(k: int, corners: object) -> np.ndarray:
