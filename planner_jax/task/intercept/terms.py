@@ -17,7 +17,7 @@ from planner_jax.plane.distance_field import DistanceField
 from planner_jax.plane.obstacles import Obstacles, distances, separation
 from planner_jax.robot.car import CarBody
 from planner_jax.task.intercept.case import InterceptCase
-from planner_jax.task.intercept.motion import C_LEFT, C_RIGHT, TIME, V_LEFT, V_RIGHT, Motion
+from planner_jax.task.intercept.motion import Motion
 
 _HIGHEST = lax.Precision.HIGHEST
 
@@ -65,45 +65,58 @@ def limit_terms(
     """
     limits, dtype = case.limits, speed.dtype
     rate = (speed.shape[0] - 1) / time
-    none = jnp.zeros_like(speed[1:])
-    v, c = speed[1:], curvature[1:]
-    acceleration = (v - speed[:-1]) * rate
+    v, c = speed[None, 1:], curvature[None, 1:]
+    v0, c0 = speed[None, :-1], curvature[None, :-1]
+    acceleration, bending = (v - v0) * rate, (c - c0) * rate
     # For a given rate of curvature the steering angle changes fastest where |curvature| is least.
-    flat = jnp.where(c * curvature[:-1] > 0.0, jnp.minimum(c**2, curvature[:-1] ** 2), 0.0)
-    gain = case.body.wheelbase / (1.0 + case.body.wheelbase**2 * flat) * rate
-    steering = gain * (c - curvature[:-1])
-    excesses, squares = [], SumOfSquares(6)
+    flat = jnp.where(c * c0 > 0.0, jnp.minimum(c**2, c0**2), 0.0)
+    gain = case.body.wheelbase / (1.0 + case.body.wheelbase**2 * flat)
+    steering = gain * bending
+    share = jnp.asarray((np.arange(points) + 1.0) / points, dtype)[:, None]
+    fast, bend = share * v + (1.0 - share) * v0, share * c + (1.0 - share) * c0
+    by_speed, by_curvature = 2.0 * fast * bend, fast**2
+    # Limited values: speed, curvature, acceleration, steering rate, and the lateral acceleration at
+    # `points` positions. The limits 0 <= v <= v_max are written as |v - v_max / 2| <= v_max / 2.
+    values = jnp.concatenate(
+        [v - 0.5 * limits.speed, c, acceleration, steering, by_curvature * bend]
+    )
+    lateral = jnp.full(points, limits.lateral_acceleration)
+    others = [0.5 * limits.speed, limits.curvature, limits.acceleration, limits.steering_rate]
+    bounds = jnp.concatenate([jnp.stack(others), lateral])[:, None]
+    none, rates = jnp.zeros_like(v), jnp.full_like(v, rate)
+    slopes = jnp.stack(  # derivatives of the values by the five variables of a piece, (5, R, K)
+        [
+            jnp.concatenate([none, none, -rates, none, (1.0 - share) * by_speed]),
+            jnp.concatenate([none + 1.0, none, rates, none, share * by_speed]),
+            jnp.concatenate([none, none, none, -gain * rate, (1.0 - share) * by_curvature]),
+            jnp.concatenate([none, none + 1.0, none, gain * rate, share * by_curvature]),
+            jnp.concatenate(
+                [none, none, -acceleration / time, -steering / time, jnp.zeros_like(fast)]
+            ),
+        ]
+    )
+    excess = jnp.abs(values) / bounds - 1.0
+    inside = jnp.maximum(excess + weights.slack, 0.0)
+    sign = jnp.where(inside > 0.0, jnp.sign(values), 0.0) / bounds
+    hinges = jnp.concatenate([sign[None] * slopes, inside[None]])
+    smooth = jnp.stack(  # residuals of acceleration and rate of curvature
+        [
+            jnp.concatenate([-rates, none]),
+            jnp.concatenate([rates, none]),
+            jnp.concatenate([none, -rates]),
+            jnp.concatenate([none, rates]),
+            jnp.concatenate([acceleration, bending]) * (-0.5 / time),
+            jnp.concatenate([acceleration, bending]),
+        ]
+    )
+    factors = jnp.stack([weights.effort / rate, weights.turning / rate])[None, :, None]
+    squares = _sum_squares(hinges, weights.limit) + _sum_squares(smooth, factors)
+    return jnp.moveaxis(squares, -1, 0), jnp.max(excess)
 
-    def hinge(value: Array, limit: Array, by: Mapping[int, Array | float]) -> None:
-        excess = jnp.abs(value) / limit - 1.0
-        inside = jnp.maximum(excess + weights.slack, 0.0)
-        sign = jnp.where(inside > 0.0, jnp.sign(value), 0.0) / limit
-        excesses.append(excess)
-        squares.add({**{k: sign * each for k, each in by.items()}, 5: inside}, weights.limit)
 
-    # The limits 0 <= v <= v_max of the speed v are written as |v - v_max / 2| <= v_max / 2.
-    hinge(v - 0.5 * limits.speed, 0.5 * limits.speed, {V_RIGHT: 1.0})
-    hinge(c, limits.curvature, {C_RIGHT: 1.0})
-    by = {V_LEFT: -rate, V_RIGHT: rate, TIME: -acceleration / time}
-    hinge(acceleration, limits.acceleration, by)
-    hinge(steering, limits.steering_rate, {C_LEFT: -gain, C_RIGHT: gain, TIME: -steering / time})
-    for share in (np.arange(points) + 1.0) / points:  # positions on every piece, from 0 to 1
-        fast, bend = (share * each[1:] + (1.0 - share) * each[:-1] for each in (speed, curvature))
-        by_speed, by_curvature = 2.0 * fast * bend, fast**2
-        by = {
-            V_LEFT: (1.0 - share) * by_speed,
-            V_RIGHT: share * by_speed,
-            C_LEFT: (1.0 - share) * by_curvature,
-            C_RIGHT: share * by_curvature,
-        }
-        hinge(fast**2 * bend, limits.lateral_acceleration, by)
-    for value, weight, left, right in (
-        (acceleration, weights.effort, V_LEFT, V_RIGHT),
-        ((c - curvature[:-1]) * rate, weights.turning, C_LEFT, C_RIGHT),
-    ):
-        by = {left: -rate, right: rate, TIME: -0.5 * value / time, 5: value}
-        squares.add(by, weight / rate)
-    return squares.matrix(none), jnp.max(jnp.stack(excesses)).astype(dtype)
+def _sum_squares(rows: Array, weight: Array | float) -> Array:
+    """Return (G, G, K): sums over R residuals of w g g^T, for `rows` (G, R, K) and weights w."""
+    return jnp.sum((weight * rows)[:, None] * rows[None], axis=2)
 
 
 class SumOfSquares:
