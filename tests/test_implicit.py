@@ -61,18 +61,6 @@ def test_gradients_match_differences_of_optima(study, name):
             np.testing.assert_allclose(slope / scale, numeric / scale, rtol=2e-3, atol=2e-4)
 
 
-@pytest.mark.slow
-def test_only_an_active_limit_has_a_price(study):
-    lanes, along = study
-    with jax.enable_x64(True):
-        slopes = []
-        for case in lanes:
-            unit = jax.tree.map(lambda a, b: a - b, MOVES["speed limit"](case, 1.0), case)
-            slopes.append(float(along(case, unit)[1][0][0]))
-    active, inactive = slopes
-    assert active < 0.0 and inactive == 0.0
-
-
 def test_newton_finds_the_minimum_of_a_curved_valley_and_stands_still_at_a_minimum(float64):
     def objective(x):
         cost = 100.0 * (x[1] - x[0] ** 2) ** 2 + (1.0 - x[0]) ** 2

@@ -132,9 +132,3 @@ def test_an_optimal_plan_has_the_same_gradient(float64):
     smooth, case = planner.settle(case)
     found = differentiate(smooth, duration, BY, 1)(move_to_optimum(smooth, case))
     assert slope == pytest.approx(float(found.by["limits.acceleration"]), rel=1e-3)
-
-
-@pytest.mark.parametrize("name", ["lattice", "constant"])
-def test_planners_that_split_path_and_speed_have_no_gradient(name):
-    with pytest.raises(TypeError, match="minimises nothing"):
-        pj.gradient(pj.intercept.planner(name), crossing(jnp.float32), of="cost", by="limits")

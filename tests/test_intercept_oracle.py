@@ -72,14 +72,6 @@ def test_on_an_open_map_a_chase_takes_the_time_of_its_closed_form(rules, away):
 
 
 @both
-def test_a_drive_to_the_side_is_no_shorter_than_an_arc_and_a_tangent(rules):
-    found = Lattice(scene((START[0] + MIDDLE, START[1] + 2.0)), rules).reach()
-    straight = earliest_bound(scene((START[0] + MIDDLE, START[1] + 2.0)))[1]
-    quarter = 0.5 * np.pi / np.sqrt(0.8 * 2.0)  # [s], at the greatest yaw rate there is
-    assert max(straight, quarter) < found.earliest < 5.0
-
-
-@both
 def test_no_path_leads_through_a_wall_across_the_map(rules):
     parted = scene((6.0, 4.0), walls=[box(3.0, -0.5, 3.1, 8.5)])
     found = Lattice(parted, rules).reach()

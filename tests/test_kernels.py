@@ -46,7 +46,6 @@ def kernels_in(function, *args):
 
 
 def round_of(planner):
-    """Return a new function, which nothing has traced, that makes plans of one round."""
     attempt = Round(1, LbfgsConfig(max_steps=2))
     return lambda cases: solve_batch(planner, attempt, cases)
 
@@ -56,7 +55,6 @@ def serves():
 
 
 def small():
-    """Return a new function, which nothing has traced, of one lane with one kernel."""
     return over_lanes(lambda x: positive_inverse(x))
 
 

@@ -23,7 +23,6 @@ def solve(head_state, tail_state, duration):
 
 
 def axes_of(coeffs):
-    """Return one NumPy polynomial for each axis of coefficients (D + 1, 3)."""
     return [np.polynomial.Polynomial(c) for c in np.asarray(coeffs, np.float64).T]
 
 

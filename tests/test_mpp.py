@@ -21,7 +21,6 @@ MPP = MppCatch()
 
 @pytest.fixture(scope="module")
 def throws():
-    """Draw throws of two suites, half of them hard, with two absent targets each; plan them."""
     suites = [draw(NUM // 2, name, 4, num_targets=3) for name in ("throws", "hard")]
     cases = jax.tree.map(lambda *leaves: np.concatenate(leaves), *suites)
     return cases, plan(MPP, cases)
@@ -37,7 +36,6 @@ def pairs():
 
 
 def heights(cases, plans):
-    """Return the heights [m] of the targets at the catches, in their order."""
     ordered = jax.vmap(order_targets)(cases).targets
     return np.asarray(jax.jit(jax.vmap(targets_at))(ordered, plans.times).pos)[..., 2]
 

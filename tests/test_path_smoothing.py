@@ -70,8 +70,6 @@ def descend(points, walls):
 
 @jax.jit
 def gaps(poses, walls):
-    """Return the distances of the body from walls, (B, N, NUM) [m], along paths."""
-
     def one(poses):
         x, y, heading = poses.T
         return separation(walls.vertices(0.0), walls.present, x[None], y[None], heading, BODY)

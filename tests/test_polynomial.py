@@ -1,7 +1,5 @@
 """Piecewise polynomials: evaluation, continuation past the ends, and energy."""
 
-import math
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -38,12 +36,6 @@ def exact(piece, local, order=0):
     return [p.deriv(order)(local) if order else p(local) for p in polynomials]
 
 
-def test_derivative_factors_are_falling_factorials():
-    for order in range(7):
-        expected = [math.perm(k, order) for k in range(6)]
-        np.testing.assert_array_equal(polynomial.derivative_factors(5, order), expected)
-
-
 @float64
 @pytest.mark.parametrize("order", range(5))
 def test_every_piece_is_evaluated_in_its_own_time(order):
@@ -69,13 +61,6 @@ def test_the_slope_in_time_is_the_next_derivative():
     for time in (-0.1, 0.2, 1.2, 2.5):
         expected = values_at(trajectory(), time)[2]
         np.testing.assert_allclose(rate_of(time, trajectory()), expected, rtol=1e-12)
-
-
-@float64
-def test_the_durations_add_up_in_one_trajectory_and_in_many():
-    assert float(polynomial.total_duration(trajectory())) == pytest.approx(2.2, rel=1e-15)
-    many = jax.tree.map(lambda x: np.stack([x, 2.0 * x]), trajectory())
-    np.testing.assert_allclose(polynomial.total_duration(many), [2.2, 4.4], rtol=1e-15)
 
 
 @float64

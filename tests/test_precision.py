@@ -28,7 +28,6 @@ def custom_derivative(product):
 
 
 def proportional_values(rows, offsets, duration):
-    """Return the sum of all numbers that the maps of fixed proportions compute."""
     args = proportional_minco(4, (1.0,) * 4), rows, offsets, duration
     parts = (
         proportional_trajectory(*args),

@@ -150,7 +150,6 @@ def test_the_gradient_in_ball_drag_gravity_and_time_matches_finite_differences(p
 
 
 def kernel_arguments(lanes=32):
-    """Return position, velocity, resolution, drag and gravity of random balls, lanes last."""
     random = np.random.default_rng(5)
     pos, vel = random.uniform(-3.0, 3.0, (2, 3, lanes))
     vel[:, 3] = 0.0  # a ball at rest

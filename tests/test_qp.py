@@ -22,7 +22,6 @@ float64 = pytest.mark.usefixtures("float64")
 
 
 def draw_programs(lanes=LANES):
-    """Draw right sides and bounds of programs with a solution; some bounds are infinite."""
     point = RNG.normal(size=(lanes, UNKNOWNS))
     point -= point @ ZEROS.T @ ZEROS / np.sum(ZEROS**2)
     value, width = point @ MATRIX.T, RNG.exponential(0.5, (2, lanes, ROWS))
@@ -63,16 +62,6 @@ def test_single_precision_is_as_cheap_to_a_millionth_and_keeps_the_bounds(solved
     assert single.point.dtype == jnp.float32 and (single.status == Status.CONVERGED).all()
     np.testing.assert_allclose(single.cost, solved.cost, rtol=1e-5, atol=1e-5)
     assert np.max(single.violation) < 1e-5
-
-
-@float64
-def test_without_bounds_the_solution_needs_no_step():
-    right_side = PROGRAMS[0][0]
-    free = one(right_side, np.full(ROWS, -np.inf), np.full(ROWS, np.inf))
-    matrix = np.block([[HESSIAN, BOTH.T], [BOTH, np.zeros((3, 3))]])
-    known = np.concatenate([np.zeros(UNKNOWNS), right_side, [0.0]])
-    np.testing.assert_allclose(free.point, np.linalg.solve(matrix, known)[:UNKNOWNS], atol=1e-9)
-    assert free.steps == 0 and free.status == Status.CONVERGED and free.violation == 0.0
 
 
 @float64

@@ -111,16 +111,7 @@ def test_the_body_rate_is_right_to_rounding_in_float32(float64):
     np.testing.assert_allclose(single, exact, rtol=2e-5)
 
 
-def test_scaled_limits_keep_the_ground():
-    limits = quadrotor.QuadrotorLimits(speed=5.0, acceleration=15.0, body_rate=4.0, min_height=0.25)
-    half = limits.scale(0.5, 9.81)
-    assert (half.speed, half.acceleration, half.body_rate) == (2.5, 7.5, 2.0)
-    assert half.min_height == limits.min_height
-    assert limits.speed == 5.0
-
-
 def plan_of(coeffs, durations):
-    """Return a plan, or a batch, in float64 where that is enabled."""
     coeffs, durations = np.asarray(coeffs, float), np.asarray(durations, float)
     blank = np.zeros(coeffs.shape[:-3])
     return quadrotor.QuadrotorPlan(

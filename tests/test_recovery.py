@@ -62,7 +62,6 @@ def assert_refused(rule, function, *arguments, **options):
 
 
 def states(path, time=None):
-    """Return the state (4, 3), position to jerk, at a time or at the end of a trajectory."""
     time = total_duration(path) if time is None else time
     return np.stack([evaluate(path, time, order) for order in range(4)])
 

@@ -157,34 +157,38 @@ PEAK = 2.0 * abs(CHANGE[STEEPEST])  # final rate x duration of a motion by FROM_
 JOINT = DELAY + PIECES[0]  # time at which the two pieces join
 STEEPEST_ACCELERATION = 10.0 / np.sqrt(3.0) * abs(CHANGE[STEEPEST]) / SPAN**2
 STEEP, FAST = f"joint {STEEPEST + 1}", f"joint {FASTEST + 1}"
+
+
+def spoil(edits, *found, **options):
+    return failure(edit(good(), edits), *found, **options)
+
+
 FAILURES = {
-    "time: before the arm may start": failure(
-        edit(good(), {"plan.contact_time": 0.07, "plan.motion.durations": 0.0}), 0.03, 0.07
+    "time: before the arm may start": spoil(
+        {"plan.contact_time": 0.07, "plan.motion.durations": 0.0}, 0.03, 0.07
     ),
-    "time: motion too long": failure(edit(good(), {"plan.contact_time": 0.9}), 0.1, 0.9),
-    "time: negative": failure(
-        edit(good(), {"plan.motion.durations": [[-0.25, 0.6]]}), 0.25, CONTACT_TIME
+    "time: motion too long": spoil({"plan.contact_time": 0.9}, 0.1, 0.9),
+    "time: negative": spoil({"plan.motion.durations": [[-0.25, 0.6]]}, 0.25, CONTACT_TIME),
+    "time: an hour": spoil({"plan.contact_time": 3600.0}, 3540.0, 3600.0),
+    "start: angle": spoil({("angles", 2): add(0.02)}, 0.02, DELAY, part="joint 3"),
+    "start: rate": spoil({("rates", 4): add(0.3)}, 0.3, DELAY, part="joint 5"),
+    "continuity: angle": spoil(
+        {("plan.motion.coeffs", 1, 0, 3): add(0.01)}, 0.01, JOINT, part="joint 4"
     ),
-    "time: an hour": failure(edit(good(), {"plan.contact_time": 3600.0}), 3540.0, 3600.0),
-    "start: angle": failure(edit(good(), {("angles", 2): add(0.02)}), 0.02, DELAY, part="joint 3"),
-    "start: rate": failure(edit(good(), {("rates", 4): add(0.3)}), 0.3, DELAY, part="joint 5"),
-    "continuity: angle": failure(
-        edit(good(), {("plan.motion.coeffs", 1, 0, 3): add(0.01)}), 0.01, JOINT, part="joint 4"
-    ),
-    "continuity: rate": failure(
-        edit(good(), {("plan.motion.coeffs", 1, 1, 0): add(-0.1)}), 0.1, JOINT, part="joint 1"
+    "continuity: rate": spoil(
+        {("plan.motion.coeffs", 1, 1, 0): add(-0.1)}, 0.1, JOINT, part="joint 1"
     ),
     "position: above": failure(
         overshoot(upper=HOME[5] + 0.35), 0.05, DELAY + SPAN / 3.0, part="joint 6"
     ),
     "position: below": failure(overshoot(lower=HOME[5] + 0.1), 0.1, part="joint 6"),
-    "velocity: 4/5": failure(
-        edit(good(), {"limits.velocity": lambda limit: 0.8 * judge(good()).velocity_share * limit}),
+    "velocity: 4/5": spoil(
+        {"limits.velocity": lambda limit: 0.8 * judge(good()).velocity_share * limit},
         *(0.25, DELAY + 0.5 * SPAN),
         part=FAST,
     ),
-    "acceleration: 2/3": failure(
-        edit(good(), {"limits.acceleration": STEEPEST_ACCELERATION / 1.5}), 0.5, part=STEEP
+    "acceleration: 2/3": spoil(
+        {"limits.acceleration": STEEPEST_ACCELERATION / 1.5}, 0.5, part=STEEP
     ),
     "rest: required": failure(good(FROM_REST, regime="R3"), PEAK / SPAN, part=STEEP),
     "rest: stops at once": failure(
@@ -194,19 +198,13 @@ FAILURES = {
     "ball: beside": failure(good(at=CONTACT + 0.01 * ROTATION[:, 2]), 0.01, CONTACT_TIME),
     "ball: in front": failure(good(at=CONTACT + 0.005 * ROTATION[:, 0]), 0.005, CONTACT_TIME),
     "tilt: by TURN": failure(good(velocity=TURN @ INCOMING), 0.1, CONTACT_TIME),
-    "tunnel: not yet": failure(
-        edit(good(), {"scene.outer.upper": [0.6, 1.0, 1.85]}), 0.1 / 7.0, CONTACT_TIME
-    ),
-    "tunnel: too late": failure(
-        edit(good(), {"scene.inner.upper": [[0.75, 0.55, 0.8]]}), 0.05 / 7.0, CONTACT_TIME
-    ),
-    "tunnel: through and out again": failure(
-        edit(good(), {"scene.inner.lower": [0.8, 0.4, 0.6], "scene.inner.upper": [0.9, 0.6, 1.2]}),
+    "tunnel: not yet": spoil({"scene.outer.upper": [0.6, 1.0, 1.85]}, 0.1 / 7.0, CONTACT_TIME),
+    "tunnel: too late": spoil({"scene.inner.upper": [[0.75, 0.55, 0.8]]}, 0.05 / 7.0, CONTACT_TIME),
+    "tunnel: through and out again": spoil(
+        {"scene.inner.lower": [0.8, 0.4, 0.6], "scene.inner.upper": [0.9, 0.6, 1.2]},
         *(0.2 / 7.0, CONTACT_TIME),
     ),
-    "tunnel: never": failure(
-        edit(good(), {"scene.outer.lower": [[-1.0, 0.9, 0.0]]}), np.inf, CONTACT_TIME
-    ),
+    "tunnel: never": spoil({"scene.outer.lower": [[-1.0, 0.9, 0.0]]}, np.inf, CONTACT_TIME),
 }
 NEARER = {
     "floor": ("scene.floor", ...),

@@ -300,7 +300,6 @@ def test_a_ball_with_linear_drag_is_where_integration_puts_it(drag):
 
 
 def with_targets(leaves, targets):
-    """Return the leaves with targets of another class, built from the fields of one target."""
     others = {name: leaf for name, leaf in leaves.items() if not name.startswith("targets.")}
     return others | {f"targets.{k}": np.asarray(v, float)[None, None] for k, v in targets.items()}
 

@@ -76,13 +76,6 @@ def assert_one_line(call, rule, kind=UnknownName):
 TASKS = ["hit", "catch", "intercept", "group", "block"]
 
 
-def test_tasks_of_the_library_have_their_names_and_summaries():
-    assert list(all_tasks()) == TASKS
-    for name, task in all_tasks().items():
-        assert task_named(name) is task and task.name == name
-        assert task.summary[0].islower() and not task.summary.endswith(".")
-
-
 @pytest.mark.parametrize("name", TASKS)
 def test_every_planner_of_a_task_can_be_made_and_the_first_is_the_default(name):
     task = task_named(name)

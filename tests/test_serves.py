@@ -83,13 +83,6 @@ def test_published_rates_have_the_known_means():
     np.testing.assert_allclose(rates.paper[court.SCENARIOS.index("FLR")], [0.3, 60.6, 85.4])
 
 
-@pytest.mark.parametrize("half", [1.0, -1.0])
-def test_a_point_lies_in_the_same_region_of_either_half(half):
-    x = np.array([1.0, 4.0, 2.0, 4.9, 0.4, 5.1, 2.0, np.nan])
-    y = np.array([0.8, -0.8, 0.9, -2.4, 0.0, 0.0, 2.6, 0.0])
-    np.testing.assert_array_equal(region_of(half * x, y), [1, 2, 3, 4, 0, 0, 0, 0])
-
-
 def test_each_target_lies_in_the_region_that_its_scenario_names():
     target = court.target_of(np.arange(36))
     named = [1 + court.REGIONS.index(name[2]) for name in court.SCENARIOS]

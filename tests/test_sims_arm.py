@@ -83,7 +83,6 @@ MOTIONS = (STILL, motion(TURN), motion(-0.3 * TURN), motion(0.6 * TURN, ends_at_
 
 
 def execute_motions(drives=IDEAL, **options):
-    """Return the courses of MOTIONS, which start after 0.05 s, and their execution."""
     begin: Any = np.full(LANES, 0.05, np.float32)
     braking: Any = np.full((LANES, 6), 30.0, np.float32)
     courses = Course(motion=batch(*MOTIONS), begin=begin, braking=braking)
@@ -97,16 +96,10 @@ def ideal():
     return execute_motions()
 
 
-@pytest.mark.slow
-def test_the_arm_holds_its_home_against_gravity_without_drift(ideal):
-    _, flown = ideal
-    assert np.abs(flown.angles[0] - HOME).max() < 1e-5
-    assert flown.torque_rms[0, 1] > 100.0  # [N m], load of joint 2 at home
-    assert flown.tracking[0].max() < 1e-5
-
-
 def test_a_plan_is_tracked_within_a_milliradian_by_ideal_drives(ideal):
     _, flown = ideal
+    assert np.abs(flown.angles[0] - HOME).max() < 1e-5  # the home, against gravity
+    assert flown.torque_rms[0, 1] > 100.0  # [N m], load of joint 2 at home
     assert np.abs(flown.angles - flown.wanted).max() < 1e-3
     assert flown.error_worst.max() < 1e-3 and flown.error_rms[1:].min() > 0.0
     assert np.abs(flown.angles[1, -1] - HOME - TURN).max() < 1e-3
@@ -177,7 +170,6 @@ def throw_at_shield(places, speed=8.0):
 
 
 def score_standstill(cases, angles, end=0.8):
-    """Return the score of arms that stand still at angles (6,)."""
     times = FRAME * np.arange(round(end / FRAME) + 1)
     num = len(cases.gravity)
     held = np.broadcast_to(angles, (num, times.size, 6)).astype(float)
@@ -346,21 +338,6 @@ def test_the_viewer_places_the_links_of_the_arm(recorded):
 
 
 @pytest.mark.slow
-def test_four_balls_are_blocked_from_the_command_line(tmp_path, capsys):
-    out = tmp_path / "run"
-    command = ["fly", "block", "--num", "4", "--regime", "R1", "--suite", "open"]
-    assert main([*command, "--observe", "0.1", "--planning-budget", "0.2", "--out", str(out)]) == 0
-    assert "of 4 flights blocked the ball" in capsys.readouterr().out
-    manifest = json.loads((out / "manifest.json").read_text())
-    assert manifest["kind"] == "fly block"
-    assert (out / "figures" / "budget.png").exists()
-    page = (out / "index.html").read_text()
-    assert "Joints, from the start" in page and "budget.png" in page
-    assert main(["report", str(out)]) == 0
-    assert (out / "index.html").read_text() == page
-
-
-@pytest.mark.slow
 def test_observed_balls_are_blocked_from_the_command_line(tmp_path, capsys):
     out = tmp_path / "run"
     command = ["fly", "block", "--num", "4", "--regime", "R1", "--suite", "open", "--wide"]
@@ -370,6 +347,7 @@ def test_observed_balls_are_blocked_from_the_command_line(tmp_path, capsys):
     summary = json.loads((out / "manifest.json").read_text())["summary"]
     assert summary["motions"] >= 4 and summary["blocked"] >= 3
     assert summary["last_fit_error_median"] < summary["fit_error_median"]
+    assert (out / "figures" / "budget.png").exists()
 
 
 def test_flights_take_a_library_of_their_limits_and_scene_alone(tmp_path):

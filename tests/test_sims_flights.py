@@ -32,7 +32,6 @@ TRACES = []
 
 
 def evaluate_contact_positions(flown):
-    """Return positions (B, 3) [m] of the last plans at the contact times of the first ball."""
     times = flown.contact.planned_time[:, 0] - flown.began
     return np.asarray(jax.vmap(evaluate)(flown.plan.trajectory, times))
 

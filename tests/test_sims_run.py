@@ -92,14 +92,6 @@ def test_mp4_without_ffmpeg_is_refused(tmp_path, monkeypatch):
         require_film(tmp_path / "flights.mp4")
 
 
-def test_a_run_describes_its_robot_and_conditions():
-    exact, noisy = (CatchFly(noise=noise).flight().simulated for noise in ("none", "lab"))
-    assert "motion capture without errors or latency" in exact
-    assert "motion capture with noise, dropout and latency" in noisy
-    suites = [CatchFly(balls=balls).flight().suite for balls in (1, 2)]
-    assert suites == ["1 ball", "2 balls"]
-
-
 @pytest.mark.slow
 def test_a_run_of_flights_writes_all_its_files(tmp_path, capsys):
     out = tmp_path / "run"

@@ -3,15 +3,13 @@
 import dataclasses
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from derivatives import assert_gradient_matches_differences
 
-from planner_jax.baselines.intercept.bezier import BezierCurve, bernstein, hodograph
+from planner_jax.baselines.intercept.bezier import bernstein, hodograph
 from planner_jax.baselines.intercept.speed import (
     SPEED_PLANNERS,
-    SpeedPlanner,
     plan_speed,
     speed_bounds,
     speed_matrices,
@@ -144,22 +142,3 @@ def test_the_planners_of_the_table_differ_in_cost():
     order = ["trapezoid", "trapezoid-edges", "em", "rectangle"]
     assert sorted(mean, key=mean.__getitem__) == order
     assert planned["trapezoid"][0].mean() > planned["trapezoid-edges"][0].mean()
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("float64")
-def test_a_soft_end_trades_station_for_acceleration_and_a_stiff_one_is_exact():
-    problems = speed_problems(8, dtype=np.float64)
-    costs, ends = [], []
-    for weight in (300.0, 1e7, None):
-        planner = SpeedPlanner(end_weight=weight)
-        found = jax.jit(jax.vmap(lambda p, planner=planner: plan_speed(p, planner)))(problems)
-        costs.append(np.asarray(found.cost))
-        ends.append(np.asarray(found.curve.points[:, -1, -1]))
-    assert (costs[0] < costs[2]).all() and np.abs(ends[0] - 6.0).max() > 0.1
-    np.testing.assert_allclose(costs[1], costs[2], rtol=1e-3)
-    np.testing.assert_allclose(ends[1], 6.0, atol=1e-3)
-    squared = dense(np.asarray(found.curve.points), 10.0, 2, TIMES) ** 2
-    np.testing.assert_allclose(costs[2], np.trapezoid(squared, TIMES), rtol=1e-5)
-    single = BezierCurve(found.curve.points[0], found.curve.horizon[0])
-    np.testing.assert_allclose(single.at(jnp.asarray(10.0)), 6.0)

@@ -230,13 +230,6 @@ def test_a_published_planner_stands_beside_its_own_rates(finished):
     ]
 
 
-def test_the_table_says_which_rates_are_compared_and_how_many_serves_are_distinct(finished):
-    text = (finished[0] / "table.md").read_text()
-    assert "Table I of the paper" in text and "trial files" in text
-    assert f"{NUM} distinct balls" in text
-    assert "ame serves" not in text  # known of no drawn serve: neither a column nor its note
-
-
 def test_a_percentage_is_100_or_0_only_where_it_is_exact():
     assert percent(10**6, 10**6) == "100.00" and percent(0, 10**6) == "0.00"
     assert percent(10**6 - 1, 10**6) == "99.99" and percent(1, 10**6) == "0.01"

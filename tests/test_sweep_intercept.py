@@ -29,7 +29,6 @@ SETTINGS = InterceptSettings(suite="hard", num=NUM, batch=BATCH, seed=0)  # some
 
 
 def one_search():
-    """Return the planner with one search: one program, shared with test_intercept."""
     return pj.intercept.planner(searches=(Search(12, lattice=Lattice(layers=22)),))
 
 

@@ -95,7 +95,6 @@ def test_a_case_can_be_made_inside_a_compiled_function():
 
 
 def swing(times, order=0):
-    """Return positions (K, 3) of a smooth target, or their derivatives."""
     phase = np.array([0.0, 0.7, 1.9]) + 0.5 * order * np.pi
     return 1.3**order * np.sin(1.3 * np.asarray(times)[:, None] + phase)
 

@@ -29,7 +29,6 @@ PART = training.Part(steps=ROWS * LANES, learning_rate=1e-3)
 
 @pytest.fixture(scope="module")
 def hasty() -> Policy:
-    """Return a policy whose times are a quarter too early."""
     network = Mlp()
     params: Any = network.init(jax.random.key(0), jnp.zeros((1, 3, FEATURES)))
     params = jax.tree.map(np.array, params)

@@ -35,7 +35,6 @@ def run(*command, cwd, **environment):
 
 
 def build(kind, tree, out):
-    """Return the file that hatchling builds from a source tree: "sdist" or "wheel"."""
     done = run(sys.executable, "-m", "hatchling", "build", "-t", kind, "-d", out, cwd=tree)
     assert done.returncode == 0, done.stderr
     (file,) = out.iterdir()
