@@ -92,10 +92,7 @@ def test_slopes_and_curvature_are_those_of_finite_differences(float64):
 
 
 def test_the_greatest_of_every_limit_is_the_peak_between_the_samples(float64):
-    """Compare the greatest excess over the limits of speed and height with 100 times finer samples.
-
-    The body rate is left out, because its peaks are too narrow even for the finer samples.
-    """
+    """Leave out the body rate: its peaks are too narrow even for 100 times finer samples."""
     columns, durations, given = jax.tree.map(lambda x: x[0], cases(dtype=np.float64))
     along, finer = dataclasses.replace(ALONG, nodes=20), 100
 
@@ -117,7 +114,6 @@ def test_the_greatest_of_every_limit_is_the_peak_between_the_samples(float64):
 
 
 def test_the_crest_is_the_peak_of_a_parabola_between_three_samples(float64):
-    """Check samples at unequal distances. A peak outside of the three samples adds nothing."""
     before, after = 0.3, 0.5
     for peak, height in ((0.02, 1.0), (-0.29, 2.0), (0.49, 0.5), (-0.31, 3.0), (0.51, 1.0)):
         left, middle, right = (height - 7.0 * (t - peak) ** 2 for t in (-before, 0.0, after))
@@ -203,10 +199,6 @@ def test_the_kernel_gives_the_same_numbers(mode):
 
 @pytest.mark.slow
 def test_derivatives_in_lanes_are_those_without_a_kernel(monkeypatch):
-    """Compare gradients and second derivatives by kernels with those by automatic differentiation.
-
-    Kernels are also batched by `vmap`, and differentiated in reverse mode.
-    """
     used = []
 
     def in_lanes(along, mode):
@@ -266,10 +258,7 @@ def test_the_kernel_declines_types_and_sizes_that_it_does_not_support():
 
 
 def test_the_name_of_a_kernel_does_not_depend_on_earlier_kernels(monkeypatch):
-    """Check names of kernels, on which the keys of compiled programs in JAX's cache depend.
-
-    If names depended on the order of creation, another process would not find the programs.
-    """
+    """Another process finds compiled programs by the names of their kernels."""
     lane = jax.tree.map(lambda leaf: leaf[0], cases())
     others = [dataclasses.replace(ALONG, margins=(0.1, 0.1, 0.1, margin)) for margin in (0.2, 0.3)]
 

@@ -75,10 +75,7 @@ many_at = jax.jit(jax.vmap(everything_at, in_axes=(None, 0, 0, 0)))
 
 
 def everything(arm, angles, velocity=0.0, acceleration=0.0):
-    """Compute `Everything` for an arm without capsules at N <= NUM joint positions (N, 6).
-
-    The inputs are repeated to NUM positions, so that all calls use one compiled program.
-    """
+    """Compute `Everything` at N <= NUM joint positions, repeated to NUM: one program."""
     motion = np.broadcast_arrays(angles, velocity, acceleration)
     rows = (np.resize(each, (NUM, 6)).astype(angles.dtype) for each in motion)
     found = many_at(without_capsules(arm), *rows)
@@ -87,11 +84,7 @@ def everything(arm, angles, velocity=0.0, acceleration=0.0):
 
 @jax.jit
 def move_branches(arm, rotation, middle, velocity, spin):
-    """Return the inverse kinematics of N moving poses, and their joint rates [rad/s].
-
-    The poses move with `velocity` (N, 3) [m/s] and turn with `spin` (N, 3) [rad/s]. A branch is one
-    of up to eight solutions of the inverse kinematics.
-    """
+    """Return the inverse solutions of N moving poses, and their joint rates [rad/s]."""
 
     def move(rotation, middle, velocity, spin):
         solve = lambda rotation, middle: inverse_kinematics(arm, rotation, middle)  # noqa: E731
@@ -123,10 +116,7 @@ def test_at_home_the_shield_is_low_in_front_and_the_motors_hold_the_weight():
 @float64
 @of_each_arm
 def test_the_jacobian_is_that_of_the_moving_shield(model):
-    """Compare the Jacobian with central differences of the shield's pose.
-
-    The angular velocity omega of a joint rate follows from the skew matrix [omega] = dR/dq R^T.
-    """
+    """The angular velocity omega of a joint rate is in the skew matrix [omega] = dR/dq R^T."""
     arm, step = read_arm(model, dtype=np.float64), 1e-6
     angles = some_angles(arm, 1)[0]
     steps = step * np.concatenate([np.zeros((1, 6)), np.eye(6), -np.eye(6)])
@@ -140,10 +130,7 @@ def test_the_jacobian_is_that_of_the_moving_shield(model):
 
 @pytest.fixture(scope="module", params=MODELS.values(), ids=MODELS)
 def simulated(request):
-    """Load an arm in MuJoCo and in this library, and draw nine states of its joints.
-
-    Returns the module mujoco, its model, the arm, and angles, velocities, accelerations (9, 6).
-    """
+    """Load an arm in MuJoCo and here, and draw angles, velocities, accelerations (9, 6)."""
     mujoco = pytest.importorskip("mujoco", reason="the extra `sims` is not installed")
     arm, rng = read_arm(request.param, dtype=np.float64), np.random.default_rng(1)
     motion = some_angles(arm, 9), *rng.normal(scale=(3.0, 20.0), size=(9, 6, 2)).transpose(2, 0, 1)

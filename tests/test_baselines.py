@@ -63,10 +63,7 @@ def serves_gone_wrong():
 
 
 def generic_hits():
-    """Draw 32 impacts without a singularity: balls, targets, and two given components.
-
-    The components are of the racket's velocity [m/s] and of the thrust [m/s^2], (32, 2) each.
-    """
+    """Draw 32 impacts: balls, targets, two components of racket velocity and of thrust."""
     rng = np.random.default_rng(1)
     ball = BallState(
         pos=rng.uniform([-4.0, -2.0, 0.5], [-1.0, 2.0, 2.5], (32, 3)),
@@ -164,11 +161,7 @@ def test_a_ball_aimed_at_an_angle_leaves_at_it_and_arrives():
 
 
 def test_transition_point_of_an_example_by_hand():
-    """Compare with a transition point that was computed by hand, in the symbols of [Yu2023bat].
-
-    Here s_mid = (2, 0, 0), the ray to p_h is along -x, p_alpha = (-3, 1.5, 0), and the foot of
-    p_alpha on the ray is (-3, 0, 0).
-    """
+    """In the symbols of [Yu2023bat]: s_mid = (2, 0, 0) and p_alpha = (-3, 1.5, 0)."""
     points = jnp.array([[-4.0, 3.0, 0.0], [-2.0, 0.0, 0.0], [4.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
     point = transition_point(**dict(zip(("start", "hit", "origin", "target"), points, strict=True)))
     np.testing.assert_allclose(point, [-3.0, 1.0, 0.0], atol=1e-6)

@@ -31,10 +31,7 @@ def of_polynomial(polynomial):
 
 @jax.jit
 def values(points, times):
-    """Return the curve and its first three derivatives at times (M,) [s], (4, M).
-
-    Their derivatives by time, from automatic differentiation, are returned too, (4, M).
-    """
+    """Return the curve and its first three derivatives at M times, and their slopes, (4, M)."""
     curve = BezierCurve(points=points, horizon=jnp.asarray(HORIZON, points.dtype))
     both = [jax.vmap(jax.value_and_grad(lambda t, k=k: curve.at(t, k)))(times) for k in range(4)]
     return tuple(jnp.stack(each) for each in zip(*both, strict=True))

@@ -53,16 +53,11 @@ def test_balls_come_into_both_boxes_past_the_pole(suite, farthest):
     at = jax.jit(jax.vmap(jax.vmap(drag_free_flight, (None, 0, None))))
     times = np.linspace(0.0, 1.0, 400)[None] * flights.latest[:, None]
     path = at(cases.ball, times, cases.gravity).pos
-    path = at(cases.ball, times, cases.gravity).pos
     gaps = np.linalg.norm(path[..., :2] - np.array([[[0.806, 0.0]]]), axis=-1)
     assert suite == "open" or gaps.min() > 0.099
 
 
 def test_a_ball_gets_into_a_box_when_it_is_there(float64):
-    """Check the time at which a ball enters a box through a side or the top.
-
-    Three other balls do not enter: they pass the box, fly away, or come from below.
-    """
     box = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), paper_scene().outer)
 
     def entry(pos, vel):
@@ -141,10 +136,6 @@ def test_clearances_change_with_the_joints_as_their_slopes_say(float64):
 
 
 def test_no_pose_is_freer_than_the_referee_says(float64):
-    """Compare the planner's clearance with the referee's, at random poses and obstacle positions.
-
-    A pose that keeps the planner's margin must not collide according to the referee.
-    """
     rng, num = np.random.default_rng(3), 2000
     arm, scene = irb1600(), paper_scene()
     moved = {"pole": rng.uniform(-1.2, 1.2, (num, 2)), "floor": rng.uniform(-0.6, -0.3, num)}
@@ -167,7 +158,6 @@ def test_no_pose_is_freer_than_the_referee_says(float64):
 
 
 def test_end_poses_meet_the_ball(float64):
-    """Check that end poses meet the ball frontally, at the shield's middle, between the boxes."""
     case = throw(dtype=jnp.float64)
 
     @jax.jit
@@ -186,10 +176,7 @@ def test_end_poses_meet_the_ball(float64):
 @pytest.mark.slow
 @pytest.mark.parametrize("regime", ["R1", "R2"])
 def test_slopes_of_least_squares_are_those_of_the_cost(regime, float64):
-    """Compare the gradient of the least-squares cost with central differences.
-
-    The joints have an initial velocity, and the contact is too late, so that all residuals count.
-    """
+    """The joints move at first, and the contact is too late, so that all residuals count."""
     case = throw(regime=regime, rates=(0.3, -0.2, 0.1, 0.2, -0.4, 0.5), dtype=jnp.float64)
     flight = flight_of(case)
     poses = end_poses(case, flight, SMALL.points, SMALL.pieces)
@@ -209,10 +196,6 @@ def test_slopes_of_least_squares_are_those_of_the_cost(regime, float64):
 
 @pytest.mark.slow
 def test_claims_are_confirmed_by_the_referee():
-    """Check that most balls are blocked, for three kinds of joint limits.
-
-    The referee must accept exactly the plans that the planner reports as solved.
-    """
     planner = pj.block.planner()
     for regime, wide, least in (("R1", True, 0.95), ("R2", False, 0.8), ("R3", False, 0.9)):
         cases = pj.block.draw(60, seed=5, regime=regime, wide=wide)
@@ -247,11 +230,7 @@ def test_plans_of_a_batch_say_what_became_of_each_ball():
 
 
 def test_brisk_motions_end_before_the_ball_is_there():
-    """Check the planner option `brisk`, with which a motion to rest takes the least time.
-
-    Such a motion reaches a limit of velocity or acceleration, ends before the contact, and is
-    accepted by the referee.
-    """
+    """With `brisk` a motion to rest takes the least time, and reaches a limit of the joints."""
     cases = jax.tree.map(np.array, pj.block.draw(8, seed=8))
     cases.ends_at_rest[4] = False
     resident = jax.tree.map(jnp.asarray, cases)  # like the batch of SMALL above: one program

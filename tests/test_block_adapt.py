@@ -75,10 +75,6 @@ def test_the_cells_around_a_point_are_the_nearest_of_its_face():
 
 @pytest.mark.slow
 def test_warped_motions_meet_the_ball_and_open_ones_keep_their_limits():
-    """Warp motions that were stored for another ball, and check contact and joint limits.
-
-    Candidates that are marked as open must keep the joint limits at all knots.
-    """
     own = planner(has_pole=False)
     scene = paper_scene(has_pole=False)
     case = pj.block.case((9.0, 0.45, 0.35), BALL[1], scene=scene)
@@ -107,7 +103,6 @@ def test_warped_motions_meet_the_ball_and_open_ones_keep_their_limits():
 
 @pytest.mark.slow
 def test_a_stored_motion_for_the_same_ball_is_not_warped():
-    """Check that a motion stored for this ball is used unchanged, except for its duration."""
     own = planner(has_pole=False)
     case = pj.block.case(*BALL, scene=paper_scene(has_pole=False))
     same = dataclasses.replace(EFFORT, points=10)
@@ -167,10 +162,6 @@ def test_invalid_files_and_cases_are_rejected(tmp_path):
 
 @pytest.mark.slow
 def test_the_referee_confirms_warped_and_refined_motions(tmp_path):
-    """Check that the referee accepts every solved plan, with the short and with both searches.
-
-    With both searches more balls are blocked than with the short search alone.
-    """
     path = tmp_path / "a.lib"
     layout = Layout((Face(0, 1, (4, 4)),), (Face(0, 1, (3, 3)),))
     building.build(path, setting(), irb1600().home, layout, progress=False)

@@ -55,7 +55,6 @@ def test_planners_get_the_fitted_ball_and_the_delay():
 
 
 def test_an_unseen_ball_is_a_status_of_fit_and_plan():
-    """Let the camera look away: fit and plan report a failure, and the referee rejects the plan."""
     cases = pj.block.draw(6, seed=5, regime="R1", wide=True)
     away = looking_at((0.0, 0.0, 1.0), (-5.0, 0.0, 1.0), size=(64, 64), field_of_view=1.0)
     seen = see(cases, eye(camera=away), 0.25)

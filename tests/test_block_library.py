@@ -80,10 +80,7 @@ def tunnels_of(layout):
 
 
 def ball_through(outer, inner, speed=8.0, before=0.6):
-    """Return position and velocity of a ball that flies through two points.
-
-    The ball is first seen `before` [s] before it passes the first point.
-    """
+    """Return a ball that passes two points, the first of them `before` [s] later."""
     outer, inner = np.asarray(outer), np.asarray(inner)
     span = np.linalg.norm(inner - outer) / speed
     vel = (inner - outer) / span + (0.0, 0.0, 0.5 * GRAVITY * span)
@@ -125,7 +122,6 @@ def test_points_on_edges_are_in_exactly_one_cell():
 
 
 def test_tunnels_are_cut_off_where_no_ball_can_come_from():
-    """Check that a tunnel has exactly the points of the outer cell in front of the inner cell."""
     layout, tunnel = LAYOUTS["full"], tunnels_of(LAYOUTS["full"])
     assert len(tunnel.outer) == layout.num_pairs == 21504
     assert (tunnel.is_feasible | ~tunnel.is_centred).all()
@@ -170,7 +166,6 @@ def test_a_shield_as_large_as_the_farthest_crossing_blocks_the_tunnel():
 
 
 def test_a_lookup_returns_the_stored_motion_and_its_contact():
-    """Look up balls from both home poses; check motions, and contacts on the ball's parabola."""
     library, tunnel = make_library(homes=2), tunnels_of(TINY)
     pairs = np.flatnonzero(tunnel.is_feasible)[:-1]
     shots = [ball_through(tunnel.outer[p].mean(0), tunnel.inner[p].mean(0)) for p in pairs]
@@ -301,10 +296,7 @@ def test_damaged_files_are_rejected_in_one_line(tmp_path, monkeypatch):
 
 @pytest.fixture
 def counted(monkeypatch):
-    """Replace planning by a stub, whose rows tell the pair of cells and the home pose.
-
-    Returns a list to which every call appends its pairs.
-    """
+    """Replace planning by rows that hold pair and home; return the list of planned pairs."""
     calls = []
 
     def plan_pairs(setting, home, tunnel, pairs, old=None):
@@ -457,10 +449,7 @@ def test_a_planner_of_a_file_needs_the_file_and_others_take_none():
 @pytest.mark.slow
 @pytest.mark.parametrize("regime, starts", [("R1", 1), ("R2", 1), ("R2", 16)])
 def test_the_referee_confirms_a_built_library(regime, starts, tmp_path, monkeypatch):
-    """Build a small library; check its coverage, and that every claimed block is accepted.
-
-    The starting points of the search are tried one after another, as on a CPU, or all at once.
-    """
+    """Try the starting points of the search one after another, as on a CPU, or all at once."""
     monkeypatch.setattr(building, "_ON_CPU", building.Portions(256, (16, 16), starts))
     path = tmp_path / "a.lib"
     layout = Layout((Face(0, 1, (4, 4)),), (Face(0, 1, (2, 2)),))

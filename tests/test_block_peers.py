@@ -33,10 +33,7 @@ def require_peers(*packages):
 
 @jax.jit
 def quickest(turn, rate, stretch):
-    """Sample the bang-bang motion that takes `stretch` times the least duration of all joints.
-
-    Returns angles, rates and accelerations (400, 3, 6), and the least time of each joint (6,) [s].
-    """
+    """Sample (400, 3, 6) the bang-bang motion of `stretch` times the least time of all joints."""
     times = least_times(turn, rate, LIMITS.velocity, LIMITS.acceleration)
     duration = stretch * jnp.max(times)
     motion = bang_bang(jnp.zeros(6), rate, turn, duration, jnp.asarray(LIMITS.acceleration))
@@ -59,10 +56,7 @@ def test_joints_from_rest_take_the_times_of_closed_forms(float64):
 
 @pytest.mark.parametrize("stretch", [1.0, 1.3, 3.0])
 def test_joints_arrive_together_at_rest_within_their_limits(stretch, float64):
-    """Check ends and limits of motions of several joints that arrive at the same time.
-
-    The joints start at rest, towards the goal, away from it, or too fast to stop before it.
-    """
+    """The joints start at rest, towards the goal, away from it, or too fast to stop before it."""
     rng = np.random.default_rng(0)
     for scale in (0.0, 1.0):
         turn = rng.uniform(-1.5, 1.5, 6) * np.array([1, 1, 1, 1, 0.01, 0.0])
@@ -94,10 +88,7 @@ def test_an_arm_at_rest_exerts_the_torque_of_gravity(float64):
 
 
 def test_constant_acceleration_takes_the_torque_of_inertia(float64):
-    """Compare the torque of joint 1 with its inertia times its acceleration, without gravity.
-
-    The joint accelerates during the first half of the motion and brakes during the second half.
-    """
+    """Joint 1 accelerates for the first half and brakes for the second, without gravity."""
     arm: Any = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), irb1600())
     acceleration, half = 3.0, 0.2
     rows = np.zeros((2, 3, 6))

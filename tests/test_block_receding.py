@@ -51,7 +51,6 @@ def test_a_perfect_camera_gives_the_plans_of_no_camera(cases):
 
 @pytest.mark.slow
 def test_with_exact_fits_deciding_again_changes_nothing(cases):
-    """Check that an arm keeps its motion if later, exact observations confirm the ball's flight."""
     once, again = (
         decide(SMALL, cases, eye(std=1e-6), moments, aims=AIMS[:1])
         for moments in ([0.2], [0.2, 0.3, 0.4])
@@ -164,7 +163,6 @@ def test_sweeps_report_observations_and_planning_times(tmp_path):
 
 
 def test_a_replanned_case_has_the_ball_of_the_original_case(cases):
-    """Check that the ball's path is the same in both cases, although their times 0 differ."""
     plans = pj.plan(SMALL, cases)
     task = AGAIN.begin(cases, plans, 0.2)
     here = jax.vmap(drag_free_flight)(task.case.ball, task.case.delay, task.case.gravity)

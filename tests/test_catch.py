@@ -52,7 +52,6 @@ def test_easy_throws_and_pairs_of_them_are_caught_and_confirmed_by_the_referee(c
 
 
 def test_any_decision_vector_has_every_ball_in_the_net(cases):
-    """Check that random decision variables, without optimisation, put every ball into the net."""
     pairs = pj.take(cases, slice(THROWS, None))
     random = np.random.default_rng(0)
 
@@ -83,10 +82,7 @@ def test_absent_targets_have_no_flight_and_the_plan_stays_at_the_last_catch(plan
 
 @pytest.mark.slow
 def test_one_throw_planned_alone_equals_its_lane_in_a_batch_for_more_targets(cases, plans):
-    """Compare the plan of one case alone with its plan in a batch of cases with two targets.
-
-    The network for initial guesses is switched off, because it is used for single targets only.
-    """
+    """Switch off the network for first guesses, which is for single targets only."""
     wide = pj.take(cases, 0)
     each_target = ("targets", "present", "horizon", "order", "times")
     fields = {name: pj.take(vars(wide)[name], slice(1)) for name in each_target}
@@ -118,7 +114,6 @@ def cost_and_slopes(shift, case):
 
 
 def test_absent_targets_cost_nothing_and_have_no_slope(float64):
-    """Check that random decision variables of an absent target change neither cost nor gradient."""
     size = len(PLANNER.scale)
     shifts = 0.5 * np.random.default_rng(2).normal(size=(2, 2 * size))
     shifts[1, :size] = shifts[0, :size]
@@ -231,10 +226,7 @@ def test_a_round_after_stages_solves_the_problem_of_its_own_settings():
 
 
 def test_axes_nearest_to_upright_lean_from_the_way_back_as_far_as_they_may():
-    """Check the thrust directions for catching targets that fall, fly level, rise, or rest.
-
-    The direction is as upright as possible within 0.5 rad of the target's reversed velocity.
-    """
+    """Lean at most 0.5 rad from the reversed velocity of targets."""
     vel = jnp.array(
         [[0.1, 0.0, -2.0], [2.0, 0.0, 0.0], [1.0, 1.0, -1.0], [0.0, 1.0, 3.0], [0.0] * 3]
     )

@@ -52,10 +52,7 @@ def ahead(cases, elapsed, noise=0.0):
 
 
 def assert_same_flight(old, new, elapsed, until, atol):
-    """Assert that `new` plans continue the `old` plans from the time `elapsed` for `until` [s].
-
-    Position, velocity and acceleration are compared.
-    """
+    """Assert that `new` plans continue the `old` ones at `elapsed` for `until` [s]."""
     for share in np.linspace(0.0, 1.0, 23):
         times = share * until
         found, expected = (

@@ -51,10 +51,7 @@ def away(pos):
 
 
 def test_a_suite_is_a_matter_of_its_name_and_the_seed_alone():
-    """Compare some drawn numbers of three suites with fixed values.
-
-    If such a number changes, then the published benchmark cases change.
-    """
+    """If a number changes, then the published benchmark cases change."""
     np.testing.assert_allclose(draw(1, "throws").targets.ball.vel[0, 0, 1], -0.10602945, rtol=1e-5)
     np.testing.assert_allclose(draw(1, "hexagon6").targets.ball.pos[0, 0, 2], 2.3829162, rtol=1e-5)
     heptagon = draw(1, "heptagon7").targets.ball.pos[0, 0]

@@ -44,11 +44,7 @@ class RayTaskError(RayError):
 
 
 class StandIn:
-    """Stand-in for the module ray, with the functions that a sweep uses.
-
-    Tasks run in this process, in reverse order. `deaths` maps a chunk to the number of workers that
-    die while they compute it.
-    """
+    """Stand-in for the module ray: tasks run here, in reverse order, and `deaths` workers die."""
 
     exceptions = SimpleNamespace(RayError=RayError, RayTaskError=RayTaskError)
 
@@ -120,10 +116,7 @@ def quick():
 
 @pytest.fixture(autouse=True)
 def ray(monkeypatch, request):
-    """Replace the module ray by the stand-in, except in tests of a real cluster.
-
-    Sweeps write no report, and changed environment variables are restored after the test.
-    """
+    """Replace the module ray by the stand-in, except in tests of a real cluster."""
     monkeypatch.delenv("RAY_ADDRESS", raising=False)
     told = ("RAY_USAGE_STATS_ENABLED", "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER")
     changed = ("XLA_PYTHON_CLIENT_PREALLOCATE", "XLA_CLIENT_MEM_FRACTION", "CUDA_VISIBLE_DEVICES")
@@ -315,7 +308,6 @@ def test_a_worker_whose_jax_has_no_device_ends_a_run_that_can_be_finished(
 
 @pytest.mark.slow
 def test_a_run_with_a_real_cluster_survives_the_death_of_a_worker(tmp_path):
-    """Kill a worker process after the first chunk is written; the rows must not change."""
     pytest.importorskip("ray")
     plain, out = tmp_path / "plain", tmp_path / "run"
     options = "--num 64 --batch 2 --planner juggle --out".split()
@@ -343,10 +335,7 @@ def test_a_run_with_a_real_cluster_survives_the_death_of_a_worker(tmp_path):
 def test_workers_of_a_real_cluster_that_hold_shares_of_gpus_make_the_same_rows(
     tmp_path, monkeypatch
 ):
-    """Let the cluster pretend that it has one GPU, shared by two workers; the rows must not change.
-
-    The workers compute on the CPU with four threads each, as does the sweep without a cluster.
-    """
+    """Let the cluster pretend that it has one GPU, shared by two workers on the CPU."""
     ray = pytest.importorskip("ray")
     init = ray.init
     monkeypatch.setattr(ray, "init", lambda **how: init(**{**how, "num_cpus": 4, "num_gpus": 1}))
@@ -368,7 +357,7 @@ def test_workers_of_a_real_cluster_that_hold_shares_of_gpus_make_the_same_rows(
 
 @pytest.mark.slow
 def test_a_bad_case_of_a_worker_of_a_real_cluster_is_one_line_and_leaves_nothing(tmp_path):
-    """Plan so late that serves of a later chunk have landed; the sweep must report one error."""
+    """Plan so late that serves of a later chunk have landed."""
     pytest.importorskip("ray")
     options = "--num 40 --batch 4 --delay 1.56 --planner juggle --workers ray --out run".split()
     command = [sys.executable, "-m", "planner_jax", "sweep", "hit", *options]

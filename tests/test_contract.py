@@ -62,10 +62,7 @@ def places(num):
 
 @struct.dataclass
 class LibraryPlanner(pj.Planner):
-    """A planner that selects the stored point nearest to the goal.
-
-    The first attempt searches only the first 8 points, the second attempt 64 points.
-    """
+    """A planner that selects the nearest of the first 8 stored points, and then of 64."""
 
     points: Array  # (K, 2), stored points
     attempts: ClassVar[tuple[Attempt, ...]] = (Attempt(1), Attempt(2))
@@ -82,10 +79,7 @@ class LibraryPlanner(pj.Planner):
 
 @dataclasses.dataclass(frozen=True)
 class NumpyPlanner(pj.Planner):
-    """A planner in NumPy, which makes a step towards the goal, of 0.5 in the first attempt.
-
-    The step of the second attempt has a length of 1. No step goes beyond the goal.
-    """
+    """A planner in NumPy, which steps 0.5 towards the goal, and in its second attempt 1."""
 
     attempts: ClassVar[tuple[Attempt, ...]] = (Attempt(1), Attempt(2))
     case_type: ClassVar[type] = Place
@@ -223,10 +217,7 @@ LIKE_OTHERS = (
 
 
 def entries(*, on_host=True, slow=()):
-    """Return a decorator that runs a test for every planner.
-
-    `on_host` includes planners in NumPy. The planners named in `slow` run in slow tests only.
-    """
+    """Return a decorator that runs a test for every planner, for some in slow tests only."""
     rows = [
         pytest.param(entry, id=name, marks=[pytest.mark.slow] if name in slow else [])
         for name, entry in ENTRIES.items()
@@ -242,10 +233,7 @@ OF_THEIR_OWN = ("hit exact", "intercept spacetime")
 
 
 def assert_close(ours, theirs, tolerance=1e-3):
-    """Assert that plans have equal statuses and nearly equal arrays.
-
-    The tolerance is relative to the largest finite number of each array.
-    """
+    """Assert equal statuses, and arrays equal relative to their largest finite number."""
     np.testing.assert_array_equal(ours.status, theirs.status)
     for a, b in zip(jax.tree.leaves(ours), jax.tree.leaves(theirs), strict=True):
         # NaN and infinity do not count for the tolerance; the assertion requires them to be equal.
@@ -319,10 +307,7 @@ def test_every_matrix_product_asks_for_full_precision(entry, monkeypatch):
 
 @pytest.fixture
 def traces(monkeypatch):
-    """Return a function that counts how often JAX traces a planner.
-
-    The function takes a planner, and returns a list to which every later trace is appended.
-    """
+    """Return a function that lists how often JAX traces a planner from now on."""
     found = []
 
     def count(planner):

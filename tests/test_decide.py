@@ -80,10 +80,7 @@ NEAR, FAR = (-1.0, 0.0, 1.2), (2.0, 0.0, 1.2)  # [m] Targets; the quadrotor star
 
 @pytest.fixture(scope="module")
 def pairs():
-    """Return five cases with a near target and a second target.
-
-    The second target is farther, due soon, too far away, too low, or rising.
-    """
+    """Return five pairs; the second target is farther, due soon, too far, too low, or rising."""
     places = [(FAR, NEAR), (NEAR, FAR), ((100.0, 0.0, 1.2), NEAR), ((2.0, 0.0, 0.3), NEAR)]
     cases = hanging([*places, (FAR, NEAR)], [(4.0, 4.0), (4.0, 1.15)] + 3 * [(4.0, 4.0)])
     ball = cases.targets.ball
@@ -117,10 +114,7 @@ def test_best_catches_first_what_is_due_first(pairs):
 
 
 def test_times_are_those_of_a_point_that_accelerates_evenly(pairs):
-    """Compare a chosen time with 0.2 s plus the time for one metre at 7 m/s^2 from standstill.
-
-    The chosen time is the next of 64 equally spaced times.
-    """
+    """One metre at 7 m/s^2 from standstill, after 0.2 s; 64 equally spaced times are tried."""
     found = greedy(pairs)
     arrival = 0.2 + np.sqrt(2.0 * 1.0 / 7.0)
     assert arrival <= found.times[0, 0] <= arrival + 4.0 / 64.0 + 1e-6
@@ -218,11 +212,7 @@ class LongFirst(ExactCatch):
     [(ExactCatch, 2, [(1, 10), (1, 2)]), (LongFirst, 3, [(1, 10), (1, 2), (1, 2)])],
 )
 def test_later_rounds_are_for_cases_without_any_solved_order(kind, num, calls, pairs, monkeypatch):
-    """Check which cases are planned again with the planner's later rounds.
-
-    Case 0 is solved in one order, and case 2 is too far away. Therefore only case 1 is planned
-    again: with the last round, or with all rounds but the first if the planner `starts_long`.
-    """
+    """Only case 1 is planned again: case 0 is solved in one order, and case 2 is too far away."""
     horizon = np.array(pairs.horizon)
     horizon[1, 1] = 0.7
     pairs = dataclasses.replace(pairs, horizon=horizon)
@@ -269,10 +259,7 @@ def test_fewer_finalists_are_the_first_of_more_and_one_is_needed(triangles):
 
 
 def test_the_time_ratio_is_that_of_the_present_targets(pairs):
-    """Compare the optimal time ratio with [Yu2023catch, eq. 29], evaluated by hand.
-
-    The second target of the last case is absent and must not count.
-    """
+    """Evaluate [Yu2023catch, eq. 29] by hand, without the absent target of the last case."""
     present = np.ones((5, 2), bool)
     present[4, 1] = False
     order = np.array([[0, 1], [1, 0], [0, 1], [1, 0], [0, 1]])
@@ -297,10 +284,7 @@ def test_a_given_order_that_is_no_permutation_is_refused(pairs, order):
 
 
 def test_closest_approach_is_what_the_greatest_speed_leaves(pairs):
-    """Compare the closest approach to a target 100 m away with a formula.
-
-    The robot flies 4 s at 5 m/s. The net's size and a 64th of the way are subtracted as reserves.
-    """
+    """Fly 4 s at 5 m/s; the net's size and a 64th of the way are reserves."""
     gap = np.array(jax.jit(closest_approach)(pairs))
     left = np.hypot(100.0, 0.2) - 5.0 * 4.0 - (0.2 + 0.125) - 5.0 * 4.0 / 64.0
     assert gap[2, 0] == pytest.approx(left, rel=1e-4)
@@ -382,10 +366,6 @@ def test_a_claimed_catch_of_an_optional_target_has_to_hold(swarm, caught):
 
 
 def test_a_search_takes_more_of_a_swarm_than_greed(swarm, caught):
-    """Check that the beam search chooses more targets of a swarm than the greedy decision.
-
-    Plans that catch more targets must have a better rank.
-    """
     found = beams(swarm)
     number = np.asarray(found.taken.sum(axis=2))
     assert (number == number[:, :1]).all()

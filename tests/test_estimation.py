@@ -26,10 +26,7 @@ fly_many = jax.jit(jax.vmap(functools.partial(fly, num_steps=80), in_axes=(0, No
 
 
 def filter_path(initial, times, observations, model, *, flight=linear_drag_flight):
-    """Run the Kalman filter; return its state after each of N observations (N, 3) [m].
-
-    The observations are made at `times` (N,) [s], the first one without a prediction before it.
-    """
+    """Return the Kalman filter's states after N observations (N, 3) [m] at `times` (N,) [s]."""
 
     def advance(state, seen):
         duration, observation = seen
@@ -84,10 +81,7 @@ def linear_path(dtype=np.float32, ball=None):
 
 
 def quadratic_path(dtype=np.float32):
-    """Return the states of a ball with quadratic drag at all `times`.
-
-    Eight Runge-Kutta steps lead from each time to the next.
-    """
+    """Return the states of a ball with quadratic drag at all `times`."""
     ball = serve(dtype)
     _, fine = fly_one(ball, PERIOD * (NUM - 1), DRAG, GRAVITY, num_steps=8 * (NUM - 1))
     return jax.tree.map(lambda x0, x: np.concatenate([x0[None], x[7::8]]), ball, fine)
@@ -109,10 +103,7 @@ def without(positions, *rows):
 
 
 def textbook_kalman(mean, covariance, observations, drag, density, std):
-    """Run a textbook Kalman filter in NumPy, with matrix inverses, for a ball with linear drag.
-
-    Returns mean (6,) and covariance (6, 6) of position and velocity after the last observation.
-    """
+    """Return last mean and covariance of a filter in NumPy for a ball with linear drag."""
     e, K = np.exp(-drag * PERIOD), drag
     ramp = (1.0 - e) / K
     F = np.block([[np.eye(3), np.diag(ramp)], [np.zeros((3, 3)), np.diag(e)]])
@@ -162,10 +153,7 @@ def test_exact_observations_give_the_state_in_float32():
 
 
 def test_errors_agree_with_the_covariances():
-    """Check that the squared error, normalised by the covariance, is 6 on average.
-
-    The expected value is the number of dimensions. The balls are drawn from the filter's prior.
-    """
+    """The mean of the squared error, normalised by the covariance, is the number of dimensions."""
     rng = np.random.default_rng(2)
     balls = jax.tree.map(lambda x: (x + rng.normal(size=(100, 3))).astype(x.dtype), serve())
     prior = ekf_init(serve().pos, serve().vel, pos_std=1.0, vel_std=1.0)
@@ -239,10 +227,6 @@ def test_prediction_error_grows_with_the_horizon_and_stays_finite():
 @pytest.mark.slow
 @float64
 def test_filter_gradient_is_finite_from_rest_and_matches_finite_differences():
-    """Compare the gradient of the filter's last mean with finite differences.
-
-    The gradient is by the model's parameters and by the observations, of which three are missing.
-    """
     observations = without(noisy(quadratic_path(np.float64).pos, seed=4), slice(3))
     belief = model(DRAG, density=0.1, dtype=np.float64)
 

@@ -49,7 +49,6 @@ def test_every_easy_serve_is_solved_and_confirmed_by_the_referee(cases, plans):
 
 
 def test_any_decision_vector_meets_the_ball_and_reaches_the_target(cases):
-    """Check that random decision variables, without optimisation, satisfy the impact equations."""
     lane = pj.take(cases, 3)
     context, guess = first_guess(lane)
     points = guess[None] + 0.3 * np.random.default_rng(0).normal(size=(8, guess.size))
@@ -62,10 +61,6 @@ def test_any_decision_vector_meets_the_ball_and_reaches_the_target(cases):
 
 
 def test_the_violation_of_a_plan_is_the_excess_that_the_referee_finds(cases):
-    """Compare the violation of infeasible plans with the excess that the referee measures.
-
-    Excesses between the planner's samples count too.
-    """
     rates = np.linspace(0.2, 0.5, NUM, dtype=np.float32) * cases.limits.body_rate
     limits = cases.limits.replace(speed=0.4 * cases.limits.speed, body_rate=rates)
     found = plan(FIRST_ROUND, cases.replace(limits=limits))
@@ -121,8 +116,6 @@ def test_drag_after_the_impact_is_aimed_for(float64):
 
 @pytest.mark.parametrize("function", [aim_with_drag, apex_with_drag])
 def test_derivatives_with_drag_are_those_of_finite_differences(float64, function):
-    """Compare the first and second derivatives, by all arguments, with finite differences."""
-
     def value(x):
         if function is aim_with_drag:
             found = aim_with_drag(x[:3], x[3:6], *x[6:])

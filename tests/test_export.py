@@ -102,10 +102,7 @@ def test_an_arm_in_a_bag_has_its_six_joints_as_they_are_sampled(tmp_path):
 
 @pytest.mark.parametrize("robot", ["car", "arm"])
 def test_where_ros_is_installed_a_plan_is_an_object_of_its_classes(monkeypatch, robot):
-    """Convert a plan to message objects of ROS 2, whose classes are replaced by stand-ins.
-
-    The stand-ins have exactly the fields of the message definitions.
-    """
+    """Replace the classes by stand-ins with the fields of the message definitions."""
     with pytest.raises(MissingExtra, match="^trajectory_message needs trajectory_msgs of ROS 2"):
         ros2.trajectory_message(arm())
     for kind, definition in ros2.TYPES.items():

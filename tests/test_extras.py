@@ -51,11 +51,7 @@ def having(
     point=-FAR,
     normal=(0.0, 0.0, 1.0),
 ):
-    """Return cases with five extras, such as a forbidden sphere, set by the arguments.
-
-    By default the extras have no effect. All tests use the same kinds of extras, so that one
-    compiled program suffices.
-    """
+    """Return cases with five extras, by default without effect: one compiled program."""
     batch = cases.batch_shape
     full = lambda value: np.broadcast_to(np.asarray(value, np.float32), batch)  # noqa: E731
 
@@ -80,10 +76,7 @@ def way(plans, k, num=200):
 
 
 def straight(path, vel):
-    """Return a trajectory that flies straight from the origin at a velocity (3,) [m/s].
-
-    It has the pieces' durations of the first trajectory in `path`.
-    """
+    """Return a straight trajectory at a velocity (3,) [m/s] with durations as in `path`."""
     coeffs = np.zeros_like(path.coeffs[:1])
     starts = np.cumsum(path.durations[:1], axis=1) - path.durations[:1]
     coeffs[:, :, 0], coeffs[:, :, 1] = starts[..., None] * vel, vel
@@ -263,10 +256,7 @@ def test_another_value_compiles_nothing_anew(hits, around):
 
 
 def test_boxes_and_planes_are_planned_around_and_judged(hits, free, middle):
-    """Put boxes near the middles of two trajectories, and planes across two others.
-
-    The referee must reject the old plans, and accept plans that the planner makes with obstacles.
-    """
+    """Put boxes near the middles of two trajectories, and planes across two others."""
     sides = np.array([0.5, 0.4, 0.6])
     reach = sides * [0.5, 1.0, 0.5] - [0.0, 0.03, 0.0]
     low = np.where(np.arange(NUM)[:, None] < 2, middle - reach, FAR)
@@ -289,10 +279,7 @@ def test_boxes_and_planes_are_planned_around_and_judged(hits, free, middle):
 
 
 def test_the_referee_accepts_all_solved_plans_past_boxes(hits, middle):
-    """Put random boxes near the middle of each trajectory; the referee must accept solved plans.
-
-    Plans pass close to the boxes' edges, where the distance is hard to sample.
-    """
+    """Plans pass close to the boxes' edges, where the distance is hard to sample."""
     random, num_solved = np.random.default_rng(2), 0
     for _ in range(16):  # On some processors only 8 of the first 32 cases are solved.
         half = random.uniform(0.1, 0.3, (NUM, 3))
@@ -340,10 +327,6 @@ def test_a_cost_moves_the_trajectory(hits, free, middle):
 
 @pytest.mark.slow
 def test_catches_stay_inside_a_fence():
-    """Put a fence between the start and the catch of each plan, and plan again inside the fence.
-
-    The fence is at 85 % of the distance along one axis.
-    """
     cases = jax.tree.map(np.asarray, pj.catch.draw(NUM, "throws", seed=3))
     free = pj.plan(CATCH, cases)
     assert pj.catch.judge(cases, free).success.all()

@@ -47,10 +47,7 @@ fall_and_slope = jax.jit(jax.value_and_grad(drag_free_fall_time, argnums=(0, 1, 
 
 @jax.jit
 def linear_drag_and_rates(ball, duration, drag):
-    """Return a ball's state after `duration` [s] with linear drag, and its derivatives.
-
-    The derivatives are by time, and by a change of the drag that is equal on all axes.
-    """
+    """Return a ball's state, and its derivatives by time and by equal drag on all axes."""
     flight = functools.partial(linear_drag_flight, gravity=GRAVITY)
     state, in_time = jax.jvp(lambda t: flight(ball, t, drag), (duration,), (jnp.ones(()),))
     _, in_drag = jax.jvp(lambda k: flight(ball, duration, k), (drag,), (jnp.ones(3),))
@@ -81,10 +78,7 @@ def with_quadratic_drag(vel):
 
 
 def test_a_ball_feels_its_weight_and_a_drag_against_its_velocity():
-    """Check the acceleration of a ball at a speed of |(3, 4, 12)| = 13 m/s, and of a ball at rest.
-
-    The derivative at rest must be zero, not NaN.
-    """
+    """The derivative at rest must be zero, not NaN."""
 
     def accelerate(vel):
         acceleration = ball_acceleration(vel, 0.1, GRAVITY)
@@ -256,7 +250,6 @@ def test_a_falling_ball_is_highest_now_and_the_apex_has_no_kink(vz):
 @float64
 @pytest.mark.parametrize("height", [0.0, 2.0, 3.5])
 def test_a_ball_falls_through_the_plane_at_the_fall_time(height):
-    """Check the time at which a ball falls through a height, and its derivative 1 / v_z."""
     (time, reached), slopes = fall_and_slope(ball(), height, GRAVITY)
     there = drag_free(ball(), float(time), GRAVITY)
     assert reached and there.vel[2] < 0.0

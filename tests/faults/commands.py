@@ -43,16 +43,7 @@ def start(
     blocks: int | None = None,
     cores: int | None = None,
 ) -> subprocess.Popen:
-    """Start a command in a process of its own.
-
-    Args:
-        *arguments: of `planner-jax`.
-        cwd: folder where the command runs.
-        module: that Python runs.
-        cache: folder of compiled programs; the usual one if not given.
-        blocks: greatest size of a file, in units of 1,024 bytes.
-        cores: number of cores that the process may use; all if not given.
-    """
+    """Start a command of `module` on some cores, with files of at most `blocks` KiB."""
     path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
     environment = {"PYTHONFAULTHANDLER": "1", "PYTHONPATH": path}
     if cache:

@@ -12,10 +12,7 @@ from planner_jax.host import signals
 
 @contextlib.contextmanager
 def quick_sweeps(is_reported: bool = False) -> Iterator[None]:
-    """Plan hits and catches in one round, and draw nothing.
-
-    With `is_reported` one case is planned by another planner, and one figure is drawn.
-    """
+    """Plan hits and catches in one round, and draw nothing or, if reported, one figure."""
     import pytest
 
     from planner_jax.sweep.catch.sweep import CatchSweep

@@ -80,21 +80,7 @@ def make_training(out: Path) -> None:
 
 
 def verdict(place: Path, target: str, name: str, random: Any, scratch: Path) -> str:
-    """Damage a file of a copy of a run, read it, and return the outcome.
-
-    Args:
-        place: folder of the runs that `make_runs` wrote.
-        target: the run, and the reader behind a colon.
-        name: file, or a pattern that selects one.
-        random: chooses the damage.
-        scratch: new folder for the copy.
-
-    Returns:
-        `IDENTICAL`, `REFUSED` or `MENDED`.
-
-    Raises:
-        AssertionError: none of these; the text names file and damage.
-    """
+    """Damage a file of a copy of the run in `target`, "RUN:READER", and return the outcome."""
     which, _, reader = target.partition(":")
     shutil.copytree(place / which, scratch)
     path = random.choice(sorted(scratch.glob(name)))
