@@ -413,22 +413,15 @@ def test_invalid_builds_are_rejected(options, says, tmp_path):
         command.build_library(str(tmp_path / "a"), **options)
 
 
-def test_a_library_is_shown_with_a_map(tmp_path, capsys):
+def test_the_command_line_shows_a_library_with_a_map_and_rejects_other_files(tmp_path, capsys):
     path, picture = tmp_path / "a.lib", tmp_path / "a.png"
     save_library(path, make_library())
-    command.show_library(str(path), map=str(picture))
+    assert main(["library", "show", str(path), "--map", str(picture)]) == 0
     told = capsys.readouterr().out
+    assert "Setting " in told and picture.stat().st_size > 10_000
     assert "24 pairs of cells, outer +x 2x2 +z 1x2; inner +x 2x2" in told
-    assert picture.stat().st_size > 10_000
     with pytest.raises(ArgumentError, match=r"^pole must be finite, got \[0\.8, nan\]$"):
         command.repair_library(str(path), pole=[0.8, float("nan")], out=str(tmp_path / "b.lib"))
-
-
-def test_the_command_line_shows_a_library_and_rejects_other_files(tmp_path, capsys):
-    path = tmp_path / "a.lib"
-    save_library(path, make_library())
-    assert main(["library", "show", str(path)]) == 0
-    assert "Setting " in capsys.readouterr().out
     for arguments in (
         ["library", "check", str(tmp_path / "b.lib")],
         ["sweep", "block", "--planner", f"library:{tmp_path / 'b.lib'}"],

@@ -11,7 +11,7 @@ from cflib.crazyflie.mem.trajectory_memory import Poly4D
 from flown_plans import PLANS, arm, bag, car, export_plan, matrices, quadrotor, table
 
 import planner_jax as pj
-from planner_jax.core.errors import ArgumentError, MissingExtra, UnknownName, install_line
+from planner_jax.core.errors import ArgumentError, MissingExtra, install_line
 from planner_jax.export import csv_rows, ros2
 from planner_jax.export.api import stream
 from planner_jax.export.crazyflie import poly4d
@@ -225,14 +225,6 @@ def test_a_format_that_cannot_carry_the_robot_says_so(tmp_path, robot, to):
     says = f"^to must be a format for plans of the {robot}, got '{to}', which is for quadrotor$"
     with pytest.raises(ArgumentError, match=says):
         export_file(tmp_path, PLANS[robot], to=to)
-
-
-def test_an_unknown_format_is_listed_with_the_one_that_is_most_alike(tmp_path):
-    says = "^to must be one of csv, ros2, px4, crazyflie, got 'ros'; did you mean 'ros2'"
-    with pytest.raises(UnknownName, match=says):
-        export_file(tmp_path, to="ros")
-    with pytest.raises(UnknownName, match="got 'step'$"):
-        export_file(tmp_path, to="step")
 
 
 def test_a_file_is_new_whole_and_has_an_ending_of_its_format(tmp_path):

@@ -181,19 +181,6 @@ def test_a_goal_in_a_wall_or_off_the_map_is_blocked(meeting):
     assert path.blocked and not path.found and path.expansions == 0
 
 
-def test_a_mirrored_case_has_the_mirrored_path():
-    """The grid is symmetric, so that cells are rounded alike."""
-    meeting = np.array([6.5, 4.4])
-    flip = np.array([1.0, -1.0, -1.0])
-    path = find_path(meeting, TRAP[:2])
-    upside_down = [[(x, 8.0 - y) for x, y in polygon] for polygon in TRAP[:2]]
-    mirrored = find_path((6.5, 3.6), upside_down)
-    assert mirrored.cost == pytest.approx(path.cost, rel=0.05)
-    assert_drivable(mirrored, (6.5, 3.6), upside_down)
-    if mirrored.cost == pytest.approx(path.cost, rel=1e-9):
-        np.testing.assert_allclose(mirrored.poses - [0, 8, 0], path.poses * flip, atol=1e-6)
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [

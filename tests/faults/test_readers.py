@@ -39,6 +39,14 @@ def manifest_of(out):
     return parse_object((out / "manifest.json").read_text())
 
 
+def assert_resumed(runs, out, *told, planned=None):
+    """Assert that a resumed run has the rows of the undisturbed one, and what it reports."""
+    ended = run("sweep", "hit", "--resume", "--out", out)
+    assert ended.code == 0 and all(part in ended.err for part in told)
+    assert planned is None or ended.err.count("planned again") == planned
+    assert rows_of(out) == rows_of(runs / "whole")
+
+
 def rewritten(out, **entries):
     """Write the manifest with other entries and a fitting digest."""
     folder = RunFolder(out)
@@ -103,9 +111,7 @@ def test_a_part_in_the_place_of_another_is_planned_again(runs, tmp_path):
     out = copy_run(runs, "begun", tmp_path)
     first, *_ = sorted((out / "plans").iterdir())
     first.rename(first.with_name(first.name.replace("000000", "000003")))
-    ended = run("sweep", "hit", "--resume", "--out", out)
-    assert ended.code == 0 and "is of another run or number" in ended.err
-    assert rows_of(out) == rows_of(runs / "whole")
+    assert_resumed(runs, out, "is of another run or number")
 
 
 def test_only_the_damaged_part_of_a_finished_run_is_planned_again(runs, tmp_path, monkeypatch):
@@ -114,9 +120,8 @@ def test_only_the_damaged_part_of_a_finished_run_is_planned_again(runs, tmp_path
     second.write_bytes(second.read_bytes()[:-1])
     real = HitSweep.plan
     monkeypatch.setattr(HitSweep, "plan", lambda *given: drawn.append(1) or real(*given))
-    ended = run("sweep", "hit", "--resume", "--out", out)
-    assert ended.code == 0 and ended.err.count("planned again") == 1 and len(drawn) == 1
-    assert rows_of(out) == rows_of(runs / "whole")
+    assert_resumed(runs, out, planned=1)
+    assert len(drawn) == 1
 
 
 @pytest.mark.parametrize("content", [b"", b"PAR1", b"PAR1\x19\x0c\0\3\0\0\0PAR1"])
@@ -125,9 +130,7 @@ def test_a_part_whose_name_fits_and_whose_footer_does_not_is_planned_again(runs,
     path = sorted((out / "plans").iterdir())[0]
     path.unlink()
     path.with_name(f"part-000000-{zlib.crc32(content):08x}.parquet").write_bytes(content)
-    ended = run("sweep", "hit", "--resume", "--out", out)
-    assert ended.code == 0 and ended.err.count("planned again") == 1
-    assert rows_of(out) == rows_of(runs / "whole")
+    assert_resumed(runs, out, planned=1)
 
 
 @pytest.mark.parametrize("kind", ["pipe", "device", "folder"])
@@ -171,7 +174,4 @@ def test_what_is_no_part_of_the_run_is_removed_from_its_rows(runs, tmp_path):
     names = ("part-999999-00000000.parquet", f"part-{'9' * 200}-00000000.parquet", "notes.txt")
     for name in (*names, f"part-0000000-{crc}.parquet"):
         (out / "plans" / name).write_bytes(part.read_bytes())
-    ended = run("sweep", "hit", "--resume", "--out", out)
-    assert ended.code == 0 and ended.err.count("planned again") == 4
-    assert "is not a part of a run" in ended.err and "is a duplicate" in ended.err
-    assert rows_of(out) == rows_of(runs / "whole")
+    assert_resumed(runs, out, "is not a part of a run", "is a duplicate", planned=4)
