@@ -153,9 +153,9 @@ def test_a_later_round_takes_only_what_is_unsolved(monkeypatch):
     monkeypatch.setattr(batch, "is_one_cpu", lambda mesh: False)
     sizes, solve_on_devices, divide_batch = [], batch.solve_on_devices, searches.divide_batch
 
-    def note_size(planner, attempt, mesh, cases):
+    def note_size(planner, attempt, mesh, cases, **options):
         sizes.append(cases.goal.size)
-        return solve_on_devices(planner, attempt, mesh, cases)
+        return solve_on_devices(planner, attempt, mesh, cases, **options)
 
     def note_divided(planner, attempt, mesh, cases):
         sizes.append(cases.goal.size)

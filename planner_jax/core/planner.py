@@ -112,6 +112,13 @@ class Planner(Generic[CaseT, PlanT]):
         """
         return False
 
+    def compiles_quickly(self, attempt: PyTree, /) -> bool:
+        """Return whether the program of an attempt at one case is compiled in less time on a CPU.
+
+        The program may be slower then. By default this is so if it contains no loop over searches.
+        """
+        return not self.is_sequential
+
     @property
     def inner(self) -> "Planner":
         """The planner inside a planner that wraps another one; otherwise the planner itself."""

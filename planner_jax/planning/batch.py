@@ -8,7 +8,7 @@ other device. A `Watch` reports progress to the caller and ends the attempts at 
 import dataclasses
 import functools
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 import jax
@@ -32,6 +32,7 @@ from planner_jax.core.protocol import (
 )
 from planner_jax.host.machine import as_here, usable_cores
 from planner_jax.planning.programs import (
+    FEW,
     LANES,
     Sizes,
     compiled,
@@ -144,8 +145,8 @@ def plan_batch(
         and the number of unsolved cases, or an array with one such number for each device.
     """
     planner, mesh = on_devices(planner, devices)
-    batch = _Batch(planner, chunk, mesh, watch)
     resident, num = is_resident(cases), count_lanes(cases)
+    batch = _Batch(planner, chunk, mesh, watch, is_one_cpu(mesh) and num <= FEW)
     # One CPU shares its memory with the host. There the chunks are planned by one thread for each
     # core, and NumPy cuts and joins them: a JAX program would be compiled for every new size.
     is_small = is_one_cpu(mesh) and num != batch.sizes(attempts[0]).next(num)
@@ -208,6 +209,8 @@ class _Batch:
     mesh: Mesh
     watch: Watch
 
+    compiles_quickly: bool  # for a batch of few cases on a CPU
+
     def sizes(self, attempt: Attempt) -> Sizes:
         return sizes_of(self.planner, attempt, self.chunk, self.mesh)
 
@@ -266,20 +269,28 @@ class _Batch:
                 lanes, num = call
                 return self._divide(attempt, jax.tree.map(lambda leaf: leaf[lanes[:num]], cases))
             part = jax.device_put(jax.tree.map(lambda leaf: leaf[call[0]], cases), spec)
-            found, _ = solve_on_devices(self.planner, attempt, self.mesh, part)
+            found, _ = self._solve(attempt, part)
             return jax.block_until_ready(found) if threads > 1 or watch.waits else found
 
         if threads == 1:  # JAX returns before a result is ready, so the next call is prepared early
             yield from map(solve, calls) if watch.waits else [solve(call) for call in calls]
             return
         # The first call runs alone, so that its program is compiled once and not in every thread.
-        key = program_key(self.planner, attempt, calls[0][0].size, cases)
+        key = self._key(attempt, calls[0][0].size, cases)
         alone = [] if key in compiled else [solve(calls[0])]
         compiled.add(key)
         with ThreadPoolExecutor(threads) as pool:
             later = pool.map(as_here(solve), calls[len(alone) :])
             yield from alone
             yield from later
+
+    def _solve(self, attempt: Attempt, cases: PyTree) -> tuple[PyTree, Array]:
+        return solve_on_devices(
+            self.planner, attempt, self.mesh, cases, compiles_quickly=self.compiles_quickly
+        )
+
+    def _key(self, attempt: Attempt, num: int, cases: PyTree) -> Hashable:
+        return program_key(self.planner, attempt, num, cases, self.compiles_quickly)
 
     def _divide(self, attempt: Attempt, cases: PyTree) -> PyTree:
         from planner_jax.planning.searches import divide_batch  # few cases need it
@@ -320,7 +331,7 @@ class _Batch:
                     later = jax.tree.map(lambda leaf, row=row: leaf[row], found)
                     later = jax.device_put(later, lane_sharding(mesh))
                 else:
-                    later, _ = solve_on_devices(planner, attempt, mesh, part)
+                    later, _ = self._solve(attempt, part)
                 plans, unsolved = _select_locally(mesh, plans, later, lanes)
         if num % mesh.size:  # JAX cannot shard an axis into unequal parts
             plans = _take(jax.device_put(plans, mesh.devices[0]), np.arange(num))
@@ -330,15 +341,15 @@ class _Batch:
         """Return the first attempt's plans, and the number of unsolved cases on each device."""
         mesh, sizes, share = self.mesh, self.sizes(attempt), count_lanes(cases) // self.mesh.size
         if share == sizes.next(share):
-            return solve_on_devices(self.planner, attempt, mesh, cases)
+            return self._solve(attempt, cases)
         cuts = list(sizes.cuts(share))
 
         def solve(begin: int, size: int) -> PyTree:
             part = _cut(mesh, size, cases, put_number(mesh, begin))
-            return solve_on_devices(self.planner, attempt, mesh, part)[0]
+            return self._solve(attempt, part)[0]
 
         firsts = {size: begin for begin, size in reversed(cuts)}
-        keys = {program_key(self.planner, attempt, size, cases) for size in firsts}
+        keys = {self._key(attempt, size, cases) for size in firsts}
         found: dict[int, PyTree] = {}
         if len(keys - compiled) > 1:  # compile several programs at the same time
             with ThreadPoolExecutor(len(firsts)) as pool:

@@ -156,7 +156,9 @@ def place_lanes(tree: PyTree, mesh: Mesh) -> PyTree:
 # on a GPU, while cuBLAS is as fast for these products. On a CPU the option has no effect.
 COMPILER_OPTIONS: Any = {"xla_gpu_enable_triton_gemm": False}
 # Until version 0.11 of JAX, XLA's older generator of code for a CPU takes 40 % less time. Programs
-# for one hit or catch are as fast with it; large batches, and loops over cases, are slower.
+# for one hit or catch are as fast with it. Batches and loops over cases take about 10 % longer,
+# which is less than the seconds saved for batches of up to `FEW` cases.
+FEW = 256
 _IS_OLD = jax.__version_info__ < (0, 11)
 QUICK_OPTIONS: Any = {"xla_cpu_use_fusion_emitters": False} if _IS_OLD else {}
 _Layout = tuple[tuple[tuple[int, ...], np.dtype], ...]  # shapes and dtypes of a tree's leaves
@@ -176,13 +178,13 @@ def solve_cases(planner: Planner, cases: PyTree, loaded: PyTree) -> PyTree:
 
 
 def solve_on_devices(
-    planner: Planner, attempt: Attempt, mesh: Mesh, cases: PyTree
+    planner: Planner, attempt: Attempt, mesh: Mesh, cases: PyTree, *, compiles_quickly: bool = False
 ) -> tuple[PyTree, Array]:
     """Return plans of all cases, and the number of unsolved cases on each device, (devices,)."""
-    return _solve_on_devices(planner, planner.load_attempt(attempt, cases), mesh, cases)
+    run = _solve_quickly if compiles_quickly and QUICK_OPTIONS else _solve_fast
+    return run(planner, planner.load_attempt(attempt, cases), mesh, cases)
 
 
-@functools.partial(jax.jit, static_argnames="mesh", compiler_options=COMPILER_OPTIONS)
 def _solve_on_devices(
     planner: Planner, loaded: PyTree, mesh: Mesh, cases: PyTree
 ) -> tuple[PyTree, Array]:
@@ -194,6 +196,12 @@ def _solve_on_devices(
         return run_per_device(mesh, solve, *specs)(planner, loaded, cases)
 
 
+_solve_fast, _solve_quickly = (
+    jax.jit(_solve_on_devices, static_argnames="mesh", compiler_options=options)
+    for options in (COMPILER_OPTIONS, COMPILER_OPTIONS | QUICK_OPTIONS)
+)
+
+
 def with_unsolved(plans: PyTree) -> tuple[PyTree, Array]:
     """Return the plans, and the number of unsolved plans among them as an array (1,)."""
     return plans, jnp.sum(is_unsolved(plans.status), keepdims=True)
@@ -203,18 +211,21 @@ def with_unsolved(plans: PyTree) -> tuple[PyTree, Array]:
 compiled: set[Hashable] = set()
 
 
-def program_key(planner: Planner, attempt: Attempt, num: int, cases: PyTree) -> Hashable:
+def program_key(
+    planner: Planner, attempt: Attempt, num: int, cases: PyTree, compiles_quickly: bool
+) -> Hashable:
     """Return the key in `compiled` of the program that solves `num` lanes (cases) of a device."""
     own = tuple((leaf.shape, leaf.dtype) for leaf in jax.tree.leaves(planner))
     lanes = tuple((leaf.shape[1:], leaf.dtype) for leaf in jax.tree.leaves(cases))
     loaded = planner.load_attempt(attempt, cases)
-    return jax.tree.structure((planner, loaded, cases)), own, lanes, num
+    return jax.tree.structure((planner, loaded, cases)), own, lanes, num, compiles_quickly
 
 
 def solve_one(planner: Planner, case: PyTree, attempt: Attempt) -> PyTree:
     """Return the plan of one case, with NumPy leaves; the case is sent as one vector."""
     own = planner, planner.load_attempt(attempt, case)
-    return call_packed(_solve_one, None, own, case, compiles_quickly=not planner.is_sequential)
+    quickly = planner.compiles_quickly(attempt)
+    return call_packed(_solve_one, None, own, case, compiles_quickly=quickly)
 
 
 def _solve_one(_: None, own: PyTree, case: PyTree) -> PyTree:

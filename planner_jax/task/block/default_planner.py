@@ -175,6 +175,10 @@ class OnlineBlock(Planner):
         is_small = cases.batch_shape == () and not attempt.tries
         return place_numbers(StraightSearch(**vars(attempt)) if is_small else attempt)
 
+    def compiles_quickly(self, attempt: Search) -> bool:
+        """Return true for searches by least squares, which few balls need."""
+        return attempt.tries > 0
+
     def solve(self, case: BlockCase, attempt: Search) -> BlockPlan:
         """Return the plan of one case: a straight motion, else least squares from starting points.
 
