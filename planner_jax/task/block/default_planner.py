@@ -198,7 +198,7 @@ class OnlineBlock(Planner):
         def take_turn(turn: tuple[Array, LevenbergState, Array, BlockPlan]) -> tuple:
             k, searches, costs, best = turn
             is_straight, index = k < straight, jnp.maximum(k - straight, 0)
-            is_trial = ~is_straight & ~attempt.in_turn & (index < tries)
+            is_trial = ~is_straight & jnp.logical_not(attempt.in_turn) & (index < tries)
             is_new = is_straight | is_trial | attempt.in_turn
             index = jnp.where(is_new, index, jnp.argmin(costs))
             start = self._encode_start(case, poses, order, attempt.first + index)
