@@ -156,11 +156,6 @@ def test_bound_inner_disc_and_whole_body_are_in_order_of_time(drawn):
     assert earliest == sorted(earliest) and at_end == [True] * 3
 
 
-def test_a_map_without_bounds_is_an_error():
-    with pytest.raises(ValueError, match="must be finite"):
-        Lattice(replace(scene((2.0, 4.0)), upper=np.array([np.inf, 8.0])), MINIMAL)
-
-
 @pytest.mark.parametrize(("ahead", "gets_away"), [(0.1, False), (1.2, True)])
 def test_a_car_escapes_a_wall_ahead_if_it_can_still_turn(ahead, gets_away):
     # The car cannot reverse, and its least turning radius is half a metre.

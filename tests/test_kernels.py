@@ -36,7 +36,6 @@ def gpu(monkeypatch):
 
 
 def kernels_in(function, *args):
-    """Return the number of kernels of each name in the function's program for CUDA."""
     device = jax.sharding.AbstractDevice("NVIDIA H100", None, "gpu")
     mesh = jax.sharding.AbstractMesh((), (), abstract_device=device)
     with jax.sharding.use_abstract_mesh(mesh):  # later versions of JAX need the kind of GPU

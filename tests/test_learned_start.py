@@ -78,10 +78,3 @@ def test_a_shipped_network_is_what_its_archive_holds(task, name, tmp_path):
             np.testing.assert_array_equal(file[f"weight{k}"], weight)
     assert isinstance(network, StartNetwork)
     assert all(np.isfinite(each).all() for each in (*network.weights, *network.biases))
-
-
-def test_other_pieces_begin_at_a_smooth_trajectory():
-    other = pj.hit.ExactHit(proportions=(0.2, 0.5, 1.0, 1.0, 1.0, 1.0))
-    context = other.prepare(pj.take(pj.hit.draw(1, seed=3), 0))
-    plain = dataclasses.replace(other, learned=False)
-    np.testing.assert_array_equal(other.guesses(context, 1), plain.guesses(context, 1))

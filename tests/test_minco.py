@@ -82,7 +82,6 @@ def solve_drawn(order, pieces, dtype=np.float64):
 
 
 def derivative_row(time, derivative, size):
-    """Return the derivatives of 1, t, t^2, ... at a time."""
     return np.array(
         [math.perm(k, derivative) * time ** max(k - derivative, 0) for k in range(size)]
     )
@@ -175,7 +174,6 @@ def test_a_trajectory_in_float32_is_right_to_a_tenth_of_a_millimetre():
 
 
 def weigh_energy_and_coefficients(maps, point):
-    """Return the energy, plus a sum that weighs every coefficient."""
     rows, offsets, duration, weight = point
     trajectory = proportional_trajectory(maps, rows, offsets, duration)
     weights = weight * jnp.cos(jnp.arange(trajectory.coeffs.size, dtype=weight.dtype))

@@ -145,11 +145,3 @@ def test_the_first_fall_of_a_swing_is_found():
     assert found.all()
     turn = np.mod(np.pi - np.asarray(targets.phase), 2.0 * np.pi)  # a sine falls through 0 at pi
     np.testing.assert_allclose(time, turn / np.asarray(targets.rate), atol=1e-4)
-
-
-def test_bad_settings_are_named_in_one_line():
-    with pytest.raises(ValueError, match="height must be > 0 and < 2, got 2"):
-        MppCatch(height=2.0)
-    with pytest.raises(ValueError, match="speeds and thrusts must have an entry, got none"):
-        MppCatch(thrusts=())
-    assert [attempt.starts for attempt in MPP.attempts] == [1]

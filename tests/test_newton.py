@@ -159,8 +159,6 @@ def test_a_batch_equals_its_lanes_and_stragglers_continue():
 
 
 def by_hessian(cost):
-    """Return derivatives preconditioned by the Hessian itself, so that no subspace is needed."""
-
     def expand(x):
         by, hessian = jax.grad(cost)(x), jax.hessian(cost)(x)
 

@@ -30,11 +30,3 @@ def test_a_hopeless_serve_is_infeasible():
     assert finding.verdict == "infeasible"
     assert finding.least_excess > 0.1
     assert finding.coeffs is None
-
-
-def test_starts_are_the_listed_ones_and_then_drawn_by_the_seed():
-    assert search.starting_points(3, 0) == list(search.STARTS[:3])
-    more = search.starting_points(len(search.STARTS) + 2, 1)
-    assert more[: len(search.STARTS)] == list(search.STARTS)
-    assert more == search.starting_points(len(search.STARTS) + 2, 1)
-    assert more[-2:] != search.starting_points(len(search.STARTS) + 2, 2)[-2:]

@@ -39,7 +39,6 @@ def meet():
 
 
 def process(folder, *arguments, path=()):
-    """Start a command in a folder, with the task and further folders on the path of packages."""
     others = [str(OWN_TASK), *map(str, path), os.environ.get("PYTHONPATH", "")]
     return subprocess.Popen(
         [sys.executable, "-m", "planner_jax", *arguments],

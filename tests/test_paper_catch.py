@@ -44,12 +44,7 @@ def rows(name, num=None):
     return cases.replace(times=columns["Tp"][:, None]), columns
 
 
-def run_longer():
-    """Return the planner with enough steps for every row.
-
-    After the earlier stages the slowest of the 240 rows takes 181 to 217 steps, depending on the
-    rounding of the JAX release; the planner's own limit is 185. In float32 more steps gain nothing.
-    """
+def run_longer():  # the slowest of the 240 rows takes 181 to 217 steps, depending on rounding
     (full,) = PLANNER.rounds
     patient = dataclasses.replace(full.solver, max_steps=250)
     return dataclasses.replace(PLANNER, rounds=(dataclasses.replace(full, solver=patient),))

@@ -40,14 +40,12 @@ sighting_one = jax.jit(segment.sighting)
 
 @jax.jit
 def errors(fits, truth):
-    """Return the beliefs of many fits at the time `AHEAD`, their deviations, and their errors."""
     beliefs = jax.vmap(belief_at, (0, None, None))(fits, AHEAD, GRAVITY)
     stds = jax.vmap(across_std)(beliefs)
     return beliefs, stds, jax.vmap(error_across, (0, None))(beliefs, truth)
 
 
 def draw_positions(num, rng, std=STD):
-    """Return noisy positions (num, NUM, 3) of one flight."""
     places = np.asarray(paths(BALL, TIMES, GRAVITY).pos)
     return (places + std * rng.normal(size=(num, *places.shape))).astype(np.float32)
 
@@ -101,21 +99,6 @@ def test_what_is_not_seen_leaves_no_trace():
     assert fit.num == len(keep)
     np.testing.assert_allclose(fit.belief.mean, alone.belief.mean, rtol=1e-5, atol=1e-5)
     np.testing.assert_allclose(fit.belief.covariance, alone.belief.covariance, rtol=1e-3, atol=1e-5)
-
-
-def test_a_batch_is_its_lanes_one_by_one():
-    rng = np.random.default_rng(3)
-    places = draw_positions(4, rng)
-    places[1, 5:] = np.nan
-    places[2] = np.nan
-    weights = rng.uniform(1.0, 50.0, (4, NUM)).astype(np.float32)
-    times = (TIMES + rng.uniform(0.0, 1.0, (4, 1))).astype(np.float32)
-    many = fit_many(times, places, weights, GRAVITY)
-    for k in range(4):
-        one = jax.tree.leaves(fit_one(times[k], places[k], weights[k], GRAVITY))
-        for a, b in zip(one, jax.tree.leaves(many), strict=True):
-            np.testing.assert_allclose(a, b[k], rtol=2e-4, atol=2e-5)
-    assert many.status.tolist() == [Sight.SEEN, Sight.SEEN, Sight.NEVER_SEEN, Sight.SEEN]
 
 
 def test_a_ball_that_is_not_seen_at_two_times_has_a_status_and_a_sentence():

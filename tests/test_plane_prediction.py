@@ -65,7 +65,6 @@ def fits(times, seen, weights):
 
 @jax.jit
 def predict(times, seen, weights, noise, prior, truth):
-    """Return a prediction, and at one time its covariance, chances, mean, and error."""
     chosen = select(times, seen, noise, weights, prior=prior)
     error = jnp.linalg.norm(chosen.path.at(AHEAD).pos - truth)
     radii = jnp.stack([jnp.full_like(error, 0.3), error])
@@ -132,15 +131,6 @@ def test_absent_observations_have_no_effect():
     wild[other == 0.0] = 9.0
     again = predict_one(TIMES[order], wild[order], other[order])
     assert_same(predict_one(times, seen, weights), again, rtol=1e-7, atol=1e-9)
-
-
-@float64
-def test_a_weight_of_two_equals_two_observations():
-    times, seen, weights = TIMES.copy(), noisy(TURN), ONES.copy()
-    times[4], seen[4] = times[3], seen[3]
-    twice = predict_one(times, seen)
-    weights[3], weights[4] = 2.0, 0.0
-    assert_same(predict_one(times, seen, weights), twice, rtol=1e-7, atol=1e-9)
 
 
 @pytest.mark.parametrize("precision", ["single", "double"])

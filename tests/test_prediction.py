@@ -59,11 +59,6 @@ def test_nodes_are_runge_kutta_steps_from_one_before_the_start_to_one_past_the_h
         state = step_once(state, RESOLUTION, DRAG, GRAVITY)
 
 
-def test_a_table_of_too_few_nodes_is_refused():
-    with pytest.raises(ValueError, match=r"^num_nodes must be >= 5, got 4$"):
-        prediction.predict_path(serve(), HORIZON, DRAG, GRAVITY, num_nodes=4)
-
-
 @float64
 def test_the_kernel_reproduces_quadratics_and_reads_nodes_exactly():
     u = np.linspace(0.0, 1.0, 11)

@@ -102,15 +102,6 @@ def test_value_and_gradient_are_finite_wherever_the_thrust_points(thrust, jerk):
     assert all(np.all(np.isfinite(leaf)) for leaf in gradient)
 
 
-def test_the_body_rate_is_right_to_rounding_in_float32(float64):
-    rng = np.random.default_rng(2)
-    acc, jerk = rng.normal(scale=6.0, size=(2, 5, 4, 3)).astype(np.float32)
-    exact = rate_squared(acc.astype(np.float64), jerk.astype(np.float64), GRAVITY)
-    single = rate_squared(acc, jerk, np.float32(GRAVITY))
-    assert single.dtype == np.float32
-    np.testing.assert_allclose(single, exact, rtol=2e-5)
-
-
 def plan_of(coeffs, durations):
     coeffs, durations = np.asarray(coeffs, float), np.asarray(durations, float)
     blank = np.zeros(coeffs.shape[:-3])

@@ -144,7 +144,6 @@ TIP = 27.0 / 4.0 * 0.4  # u (1 - u)^2 has its maximum 4 / 27 at u = 1/3
 
 
 def overshoot(**edits):
-    """Return the leaves of a motion of joint 6 by 0.4 rad and back."""
     leaves = good((0.0, TIP, -2.0 * TIP, TIP), end=HOME + np.eye(6)[5], durations=(SPAN,))
     leaves["rates"][0, 5] = TIP / SPAN
     leaves["limits.velocity"][:] = leaves["limits.acceleration"][:] = np.inf

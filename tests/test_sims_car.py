@@ -82,11 +82,6 @@ def noiseless():
 
 @pytest.fixture(scope="module")
 def open_loop():
-    """Return the physics at the end of every step of two cars with steering commands but no drive.
-
-    The first car drives along a circle, the second is steered from side to side.
-    """
-
     @jax.jit
     def drive(physics, commands):
         def advance(physics, command):
@@ -217,10 +212,6 @@ def test_predictions_use_only_observations_that_have_arrived():
 
 @dataclasses.dataclass
 class StraightOn(pj.Planner):
-    """A planner with constant acceleration along the heading; only the first `solved` plans are
-    solved.
-    """
-
     case_type = intercept.InterceptCase
     attempts = (pj.Attempt(),)
     solved: int

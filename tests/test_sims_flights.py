@@ -162,16 +162,6 @@ def test_the_next_ball_is_given_up_only_where_no_limits_admit_both(
 
 
 @pytest.mark.slow
-def test_a_batch_is_flown_like_its_flights_one_by_one():
-    cases = throws(3, seed=2)
-    together = fly_catches(Loop(CATCH_WORLD), cases)
-    for lane in range(3):
-        alone = fly_catches(Loop(CATCH_WORLD), cases[[lane]])
-        time = together.flown.contact.time[lane]
-        np.testing.assert_allclose(alone.flown.contact.time[0], time, atol=1e-4)
-
-
-@pytest.mark.slow
 def test_with_noise_latency_and_wrong_drag_balls_are_caught_by_replanning():
     flights = fly_catches(
         Loop(CATCH_WORLD, NOISES["lab"], replan=100.0), throws(8, drag_error=0.15)

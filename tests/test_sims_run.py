@@ -142,8 +142,6 @@ DROP = Task(
 
 @dataclasses.dataclass(frozen=True)
 class DropFly(BallFly):
-    """The settings of a user's task: a quadrotor hovers, and a ball falls into its net."""
-
     TASK, FLIGHT, RATE = DROP, "tests.test_sims_run:DropFlight", 0.0
 
 

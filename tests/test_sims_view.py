@@ -35,7 +35,7 @@ from planner_jax.sims.scoring import no_contact
 from planner_jax.sims.settings import CatchFly
 from planner_jax.sims.tasks.catch import CATCH_WORLD
 from planner_jax.sims.tasks.hit import HIT_WORLD
-from planner_jax.sims.view import Viewer, free_address, segments
+from planner_jax.sims.view import Viewer, free_address
 from tests.recordings import recording
 
 GRAVITY, NET = CATCH_WORLD.gravity, CATCH_WORLD.robot
@@ -149,11 +149,6 @@ def test_after_its_end_a_flight_stands_still_and_a_caught_ball_lies_in_the_net()
     inside = [[0.0, 0.0, 1.04 + NET.tool.height - BALL_RADIUS]]
     np.testing.assert_allclose(last.balls, inside)
     assert np.isnan(frame(recording(), HIT_WORLD.robot, 0, 5).balls).all()  # a racket holds none
-
-
-def test_a_path_is_drawn_between_finite_points():
-    path = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [np.nan] * 3, [3.0, 0.0, 0.0]])
-    np.testing.assert_allclose(segments(path), [[[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]])
 
 
 def test_an_address_that_cannot_be_served_is_refused_in_one_line():

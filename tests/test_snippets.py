@@ -1,8 +1,7 @@
 """Python blocks and command lines of README and docs: they run, and they parse.
 
-The blocks of a page run in order, in one namespace and an empty folder. A block that cannot run is
-preceded by the comment `<!-- not run: REASON -->`. A block `text` after a Python block is what the
-latter prints.
+The blocks of a page run in one namespace. Before a block that cannot run is the comment
+`<!-- not run: REASON -->`. A block `text` after a Python block is what the Python block prints.
 """
 
 import contextlib

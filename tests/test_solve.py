@@ -34,8 +34,6 @@ class Reached(Plan):
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class WellPlanner(OptimisedPlanner):
-    """Starts at 0 and 4; only the second start finds goals above 2."""
-
     rounds: tuple[Round, ...] = (
         Round(1, LbfgsConfig(max_steps=40, step_cap=0.2)),
         Round(2, LbfgsConfig(max_steps=40, step_cap=0.2)),

@@ -36,7 +36,6 @@ def plans():
 
 
 def dense(points, horizon, order, times):
-    """Return a derivative (B, M) of curves (B, K, n + 1) at times (M,) in double precision."""
     pieces, degree = points.shape[1], points.shape[2] - 1
     position = times / horizon * pieces
     piece = np.minimum(position.astype(int), pieces - 1)

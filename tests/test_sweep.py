@@ -221,15 +221,6 @@ def test_the_table_has_all_scenarios_beside_both_published_rates(finished):
     assert table.rows[-1][2] == percent(summary["successes"], summary["num"])
 
 
-def test_a_published_planner_stands_beside_its_own_rates(finished):
-    _, manifest = finished
-    manifest = {**manifest, "parameters": {**manifest["parameters"], "planner": "juggle"}}
-    assert HitSweep(TASK).table(manifest).header[-2:] == [
-        "juggle, paper %",
-        "juggle, trial files %",
-    ]
-
-
 def test_a_percentage_is_100_or_0_only_where_it_is_exact():
     assert percent(10**6, 10**6) == "100.00" and percent(0, 10**6) == "0.00"
     assert percent(10**6 - 1, 10**6) == "99.99" and percent(1, 10**6) == "0.01"

@@ -100,7 +100,6 @@ def swing(times, order=0):
 
 
 def uneven(num):
-    """Return times from before 0 to the horizon, every second step half as long."""
     steps = np.where(np.arange(num - 1) % 2, 1.0, 2.0)
     return np.append(0.0, np.cumsum(steps)) / steps.sum() * (HORIZON + 0.1) - 0.1
 
@@ -168,8 +167,6 @@ def test_a_malformed_table_is_rejected_in_one_line(change, message):
 
 @struct.dataclass
 class Falling:
-    """A parabola whose class returns positions only."""
-
     start: BallState
     gravity: Array  # () [m/s^2]
 

@@ -73,7 +73,6 @@ class TwoWays:
 
 @pytest.fixture
 def clock(monkeypatch):
-    """Return a `progress` that stores its reports and advances a fake clock by one second."""
     now, reports = [0.0], []
     monkeypatch.setattr(watch, "time", types.SimpleNamespace(monotonic=lambda: now[0]))
 

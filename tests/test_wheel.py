@@ -1,8 +1,7 @@
 """A built wheel: its contents, and every command run from it in an empty folder.
 
-By default the wheel's dependencies are borrowed from the environment that runs the tests, which
-needs no network. `make test-wheel` sets PLANNER_JAX_WHEEL=whole: then they are installed from the
-package index into an environment of the wheel's own, as a user has it.
+The wheel borrows the dependencies of the tests' environment, which needs no network. `make
+test-wheel` sets PLANNER_JAX_WHEEL=whole, which installs them from the package index.
 """
 
 import os
