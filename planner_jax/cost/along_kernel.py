@@ -99,7 +99,7 @@ def call_on_grid(
 ) -> Callable[..., Sequence[Array]]:
     """Make a function that runs a kernel, whose threads each process a part of the samples.
 
-    The results have a first axis over these parts. `body` takes references to the leaves, to the
+    The results have a first axis over these parts. `body` takes references to the arguments, to the
     `constants`, which every block reads, and to the results. `shapes` are the results' shapes for
     one segment of one lane (problem of the batch).
     """

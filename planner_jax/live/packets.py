@@ -104,7 +104,7 @@ class Answer:
 def request(
     kind: int, sequence: int, sent: float, measured: float, values: tuple, ball: int = 0
 ) -> bytes:
-    """Encode an observed ball or a robot's state; `sent` and `measured` are times [s]."""
+    """Encode the values of a `kind` (BALL or ROBOT), the ball's number, and two times [s]."""
     head = _HEADER.pack(MAGIC, VERSION, kind, ball, sequence, sent)
     return head + _MEASURED.pack(measured) + _VALUES[kind].pack(*values)
 

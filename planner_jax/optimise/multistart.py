@@ -206,7 +206,7 @@ class Searches:
 
 
 def count_guesses(rounds: Sequence[Round], stage: Stage) -> int:
-    """Return how many guesses rounds need that begin with a stage of these settings."""
+    """Return how many guesses (starting points) rounds with such a first stage need."""
     begun = [each for each in rounds if each.all_stages[0].settings == stage.settings]
     return max((each.first + each.starts for each in begun if each.is_divided), default=0)
 
@@ -282,7 +282,7 @@ def divide_round(
 
 
 def solve_divided(planner: "OptimisedPlanner", attempt: Round, cases: PyTree) -> PyTree:
-    """Plan a batch of cases from all starts of a round, in one program; pure."""
+    """Plan each case of a batch from all starts of a round, by searches in one program; pure."""
 
     def search(
         stage: Stage, cases: PyTree, index: Array, points: Array | None

@@ -88,7 +88,7 @@ def thrust_band_excess(acc: Array, gravity: Array, least: Array, most: Array) ->
 
 @struct.dataclass
 class Catch:
-    """The N catches that a vector of decision variables describes."""
+    """Catches of the N targets of one case, described by one vector of decision variables."""
 
     times: Array  # (N,) [s], when the balls are caught
     durations: Array  # (N,) [s], durations of the segments that end with a catch

@@ -72,7 +72,7 @@ def read_serves(folder: str | os.PathLike) -> Serves:
 
 
 def _find_trial_files(folder) -> dict[int, dict[str, Path]]:
-    """Return the paths of trial files by index of the scenario, then by planner (p, l or b)."""
+    """Return paths of trial files by scenario index, then by the planner's letter in the name."""
     folder = Path(folder)
     require(folder.is_dir(), "serves", "an existing folder", str(folder))
     files: dict[int, dict[str, Path]] = {}

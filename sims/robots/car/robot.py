@@ -77,7 +77,7 @@ class Car:
         return np.array([(x, y, vehicle.wheel_radius) for x, y in ends])
 
     def at_rest(self, place: Array, gravity: float) -> tuple[Array, Array, Array]:
-        """Return the state at standstill with the rear axle at `place` (3,) [m] and heading 0."""
+        """Return pose (3,), rates (3,) and controls (2,) of a car at rest at `place` [m]."""
         none = jnp.zeros(3, place.dtype)
         return none.at[:2].set(place[:2]), none, none[:2]
 
