@@ -189,6 +189,7 @@ SCENES = {
     "goal in a wall": (scene((4.0, 4.0), [WALL]), pj.Status.BLOCKED),
     "off the map": (scene((8.5, 4.0)), pj.Status.BLOCKED),
     "too far for the time": (scene((7.8, 4.0), time=3.0), pj.Status.NO_PATH),
+    "NaN": (dataclasses.replace(scene(NEAR), target=still(np.nan, 4.0)), pj.Status.BAD_INPUT),
     "north": (scene((5.0, 5.0), end_heading=0.5 * np.pi), pj.Status.CONVERGED),
     "west": (scene((5.0, 5.0), end_heading=np.pi), pj.Status.CONVERGED),
     "at rest": (scene((5.0, 5.0), initial_speed=0.0), pj.Status.CONVERGED),
@@ -199,7 +200,7 @@ SCENES = {
 @pytest.fixture(scope="module")
 def scenes():
     batch = stack([case for case, _ in SCENES.values()])
-    return batch, pj.plan(PLANNER, batch)
+    return batch, jax.device_get(pj.plan(PLANNER, jax.tree.map(jnp.asarray, batch)))
 
 
 @pytest.mark.parametrize("name", SCENES)
