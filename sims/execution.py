@@ -17,6 +17,7 @@ import numpy as np
 from flax import struct
 from jax import Array, lax
 
+from planner_jax.core.compiled import QUICK_OPTIONS
 from planner_jax.core.errors import ArgumentError
 from planner_jax.sims.model import World, step
 from planner_jax.sims.robot import Physics
@@ -143,33 +144,17 @@ def _start(world: World, setting: _Setting, key: Array) -> ArmState:
 
 @functools.cache
 def _compile(world: World) -> tuple[Callable, Callable, Callable]:
-    options = compiler_options()
+    # On a CPU, XLA's fusion emitters recompute a link's position in every expression that uses the
+    # position. In a chain of six links this causes hundreds of evaluations. Without fusion emitters
+    # a step is 200 times as fast.
     start = jax.jit(jax.vmap(functools.partial(_start, world)))
-    advance = jax.jit(jax.vmap(functools.partial(_frames, world)), compiler_options=options)
+    advance = jax.jit(jax.vmap(functools.partial(_frames, world)), compiler_options=QUICK_OPTIONS)
 
     def angles(course: Course, times: Array) -> Array:
         return _arm(world).references(course, times, world).angles
 
     wanted = jax.jit(jax.vmap(angles, (0, None)))
     return start, advance, wanted
-
-
-@functools.cache
-def compiler_options() -> dict[str, Any] | None:
-    """Return the XLA options with which steps of an arm are compiled; None for the defaults.
-
-    On a CPU, XLA's fusion emitters recompute a link's position in every expression that uses the
-    position. In a chain of six links this causes hundreds of evaluations. Without fusion emitters a
-    step is 200 times as fast.
-    """
-    if jax.default_backend() != "cpu":
-        return None
-    options = {"xla_cpu_use_fusion_emitters": False}
-    try:
-        jax.jit(jnp.negative, compiler_options=options).lower(0.0).compile()
-    except jax.errors.JaxRuntimeError:
-        return None  # this version of XLA has no such option
-    return options
 
 
 def execute(

@@ -163,8 +163,8 @@ class Planner(Generic[CaseT, PlanT]):
         """Return what remains to be planned of cases whose plans are being executed.
 
         The returned cases start at the robot's present state, contain the changed quantities and
-        the previous plans, and leave out what is already done, such as targets caught. The
-        arguments are those of `pj.replan`: the original cases, the previous plans, the time since
+        the previous plans, and leave out what is already done, such as targets caught. The method
+        takes the arguments of `pj.replan`: the original cases, the previous plans, the time since
         the plans started, and changed quantities by name.
 
         Raises:

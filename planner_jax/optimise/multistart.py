@@ -255,9 +255,10 @@ def divide_round(
 ) -> PyTree:
     """Return the best plan of every case of a batch, from all starts and stages of a round.
 
-    `search` runs one stage of L searches. It takes the stage, cases with leaves (L, ...), and
-    indices (L,) and points (L, n) of the starts as in `Searches`; the points are None in the first
-    stage. Its results are as those of `run_searches`. The arrays may be NumPy's or JAX's.
+    The arrays may be NumPy's or JAX's. `search` runs one stage of L searches and returns the end
+    points (L, n) and the plans at these points. It takes the stage and the three fields of
+    `Searches`: cases with leaves (L, ...), indices (L,) and points (L, n) of the starts. In the
+    first stage the points are None.
     """
     xp = numpy_of(*jax.tree.leaves(cases))
     size, num = len(jax.tree.leaves(cases)[0]), attempt.starts

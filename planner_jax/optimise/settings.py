@@ -167,7 +167,7 @@ class Round(Attempt):
 
     @property
     def is_divided(self) -> bool:
-        """Whether each search of each case is a lane (one problem of a batch) of a program.
+        """Whether the searches of one case are run as separate problems of a batch.
 
         This is so if a case has several searches, or a round has its own settings. Rounds whose
         searches have equal settings then share a program, whatever their numbers of starts are.

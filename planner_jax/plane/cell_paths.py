@@ -29,7 +29,7 @@ class CellPath:
 
 @struct.dataclass
 class PathNoise:
-    """Gumbel noise that draws D random paths, of which the smoothest is used; may be batched."""
+    """Gumbel noise for D random paths, of which a search uses the smoothest; may be batched."""
 
     layers: Array  # (layers + 1,), noise for the choice of the last layer
     ends: Array  # (D, levels, headings, 9), noise for the choice of the last cell

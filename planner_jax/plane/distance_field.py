@@ -6,7 +6,8 @@ from jax import Array, lax
 
 from planner_jax.plane.obstacles import Obstacles, distances
 
-_HALF = 4  # least number of corners of which the second half is skipped if it is padding
+# A wall's second half of corners is skipped if it only repeats a corner, and has `_HALF` or more.
+_HALF = 4
 
 
 @struct.dataclass

@@ -297,6 +297,13 @@ class _Batch:
 
         return divide_batch(self.planner, attempt, self.mesh, cases)
 
+    def _divide_resident(self, attempt: Attempt, cases: PyTree, is_case: np.ndarray) -> PyTree:
+        """Return plans of cases in jax arrays; where `is_case` (B,) is false they are padding."""
+        found = self._divide(attempt, jax.tree.map(lambda leaf: np.asarray(leaf)[is_case], cases))
+        row = np.maximum(np.cumsum(is_case) - 1, 0)  # repeats a plan for the padding
+        found = jax.tree.map(lambda leaf: leaf[row], found)
+        return jax.device_put(found, lane_sharding(self.mesh))
+
     def plan_resident(self, attempts: Sequence[Attempt], cases: PyTree) -> tuple[PyTree, Array]:
         """Return plans of cases in jax arrays; the host reads only numbers of unsolved cases."""
         planner, mesh, watch, num = self.planner, self.mesh, self.watch, count_lanes(cases)
@@ -304,7 +311,7 @@ class _Batch:
             cases = _take(cases, np.arange(-(-num // mesh.size) * mesh.size))
         cases = place_lanes(cases, mesh)
         first, *others = attempts
-        num_of_device = count_lanes(cases) // mesh.size
+        share = count_lanes(cases) // mesh.size
         watch.report(planner, first, 0, num)
         plans, unsolved = self._first_plans(first, cases)
         for attempt in others:
@@ -322,14 +329,7 @@ class _Batch:
             for begin, size in self.sizes(attempt).cuts(most):
                 part, lanes = _cut_unsolved(mesh, size, cases, before, put_number(mesh, begin))
                 if planner.divides(attempt):
-                    is_case = np.asarray(lanes) < num_of_device
-                    some = jax.tree.map(
-                        lambda leaf, is_case=is_case: np.asarray(leaf)[is_case], part
-                    )
-                    found = self._divide(attempt, some)
-                    row = np.maximum(np.cumsum(is_case) - 1, 0)  # repeats a plan for the padding
-                    later = jax.tree.map(lambda leaf, row=row: leaf[row], found)
-                    later = jax.device_put(later, lane_sharding(mesh))
+                    later = self._divide_resident(attempt, part, np.asarray(lanes) < share)
                 else:
                     later, _ = self._solve(attempt, part)
                 plans, unsolved = _select_locally(mesh, plans, later, lanes)

@@ -20,7 +20,7 @@ from jax import Array
 from jax.sharding import Mesh, NamedSharding, PartitionSpec, Sharding, SingleDeviceSharding
 from jaxtyping import PyTree
 
-from planner_jax.core.compiled import Fixed, trace_for
+from planner_jax.core.compiled import QUICK_OPTIONS, Fixed, trace_for
 from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import Attempt, is_unsolved, mark_bad_input
 from planner_jax.core.rules import require_shapes
@@ -155,12 +155,9 @@ def place_lanes(tree: PyTree, mesh: Mesh) -> PyTree:
 # XLA would try its own kernels for every matrix product, which takes a third of the compile time
 # on a GPU, while cuBLAS is as fast for these products. On a CPU the option has no effect.
 COMPILER_OPTIONS: Any = {"xla_gpu_enable_triton_gemm": False}
-# Until version 0.11 of JAX, XLA's older generator of code for a CPU takes 40 % less time. Programs
-# for one hit or catch are as fast with it. Batches and loops over cases take about 10 % longer,
-# which is less than the seconds saved for batches of up to `FEW` cases.
+# Batches, and loops over cases, run about 10 % longer with `QUICK_OPTIONS`. For batches of up to
+# `FEW` cases this is less than the seconds of compiling that the options save.
 FEW = 256
-_IS_OLD = jax.__version_info__ < (0, 11)
-QUICK_OPTIONS: Any = {"xla_cpu_use_fusion_emitters": False} if _IS_OLD else {}
 _Layout = tuple[tuple[tuple[int, ...], np.dtype], ...]  # shapes and dtypes of a tree's leaves
 
 

@@ -13,7 +13,7 @@ from jax import Array
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import PyTree
 
-from planner_jax.core.compiled import Fixed, trace_for
+from planner_jax.core.compiled import QUICK_OPTIONS, Fixed, trace_for
 from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import Attempt, mark_bad_input
 from planner_jax.core.rules import require_shapes
@@ -23,7 +23,6 @@ from planner_jax.optimise.settings import Round, Stage, load_stage
 from planner_jax.planning.programs import (
     COMPILER_OPTIONS,
     LANES,
-    QUICK_OPTIONS,
     is_one_cpu,
     lane_sharding,
     on_devices,

@@ -200,9 +200,7 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
         self, case: InterceptCase, attempt: LoadedSearch, found: Reachability, plan: InterceptPlan
     ) -> InterceptPlan:
         reason = plan.status
-        reason = jnp.where(
-            found.is_reached | jnp.logical_not(attempt.is_last), reason, Status.NO_PATH
-        )
+        reason = jnp.where(found.is_reached | ~attempt.is_last, reason, Status.NO_PATH)
         return explain(case, reason, plan, is_time_free=self.problem.is_time_free)
 
 

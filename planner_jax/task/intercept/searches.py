@@ -156,7 +156,7 @@ class Reachability:
 
     @property
     def is_reached(self) -> Array:
-        """Whether a path of reachable grid cells meets the target, () bool."""
+        """True if the car can meet the target along a path of reachable grid cells, () bool."""
         return jnp.any(self.layers)
 
 
