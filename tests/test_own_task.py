@@ -155,8 +155,9 @@ def test_a_broken_package_beside_it_is_named_in_one_line_and_the_rest_works(tmp_
         "planner-jax: warning: task 'broken' of nowhere_at_all:TASK is left out: "
         "ModuleNotFoundError"
     )
-    for words in ("hit ", "catch ", "meet      a point mass in the plane meets a moving point"):
-        assert words in done.out
+    listed = " ".join(done.out.split())  # argparse's columns differ between versions of Python
+    for words in ("hit ", "catch ", "meet a point mass in the plane meets a moving point"):
+        assert words in listed
 
 
 @pytest.mark.slow
