@@ -14,7 +14,7 @@ from numpy.typing import DTypeLike
 
 
 def host_leaf(value: object, dtype: DTypeLike | None = None) -> Array:
-    """Return a value as a NumPy array, declared as a jax array, the declared type of all leaves."""
+    """Return a value as a NumPy array, with the declared type of array fields, a jax array."""
     return np.asarray(value, dtype)  # type: ignore[return-value]
 
 

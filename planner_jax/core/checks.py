@@ -143,10 +143,10 @@ def require_beginning(name: str, tree: PyTree, shape: tuple[int, ...], words: st
 
 @runtime_checkable
 class _Path(Protocol):
-    """A target's path, in space or in the plane."""
+    """The position of a target as a function of time, in two or three dimensions."""
 
     def at(self, time: Numbers, /) -> PyTree:
-        """Return the position at a time, or a state whose `pos` is the position."""
+        """Return the position at a time [s], or an object whose attribute `pos` is the position."""
         ...
 
 

@@ -106,7 +106,7 @@ class Planner(Generic[CaseT, PlanT]):
         return Fixed(attempt)
 
     def divides(self, attempt: PyTree, /) -> bool:
-        """Return whether an attempt consists of searches that `pj.plan` runs one by one.
+        """Return whether `pj.plan` runs each search of an attempt as a separate problem.
 
         Only an `OptimisedPlanner` has such attempts.
         """
@@ -115,7 +115,7 @@ class Planner(Generic[CaseT, PlanT]):
     def compiles_quickly(self, attempt: PyTree, /) -> bool:
         """Return whether the program of an attempt at one case is compiled in less time on a CPU.
 
-        The program may be slower then. By default this is so if it contains no loop over searches.
+        The program may then run slower. By default only a sequential planner compiles slowly.
         """
         return not self.is_sequential
 

@@ -202,7 +202,7 @@ class Decision(Protocol):
         """Raise `ArgumentError` for a batch that the rule cannot decide; called on the host."""
 
     def propose(self, case: PyTree, /) -> PyTree:
-        """Return F choices for a case, best first, in one pytree with leaves (F, ...); pure."""
+        """Return F choices for a case, best first; each array of the pytree is (F, ...); pure."""
         ...
 
     def rank(self, plans: PyTree, /) -> Array:

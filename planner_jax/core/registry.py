@@ -117,7 +117,7 @@ class Task:
 
 
 def require_name(known: Collection[str], kind: str, name: object) -> str:
-    """Return a name if it is among the known names; raise `UnknownName` otherwise."""
+    """Return a name if it is known, else raise `UnknownName` about a `kind` such as "planner"."""
     if not isinstance(name, str):
         raise UnknownName(kind, "a name", name)
     if name not in known:

@@ -197,7 +197,6 @@ def _call(
 
 
 def _result_shapes(mode: str, treedef: Treedef, num_columns: int) -> list[tuple[int, ...]]:
-    """Return the shapes of a kernel's results in a mode, for one segment of one lane (problem)."""
     shapes: list[tuple[int, ...]] = [(), ()]
     if mode != "values":
         shapes += [(num_columns, 3), ()]

@@ -91,7 +91,7 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
 
     @abc.abstractmethod
     def meet(self, natural: Float[Array, "N K"], context: PyTree) -> ChainEnds:
-        """Return durations and final states of N segments from K variables for each end."""
+        """Return durations and final states of N segments from the K end variables of each."""
 
     @abc.abstractmethod
     def guess_ends(self, context: PyTree, num: int) -> Float[Array, "num N K"]:
@@ -113,7 +113,7 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
         return 0.0
 
     def active(self, context: PyTree) -> Bool[Array, " N"]:
-        """Return which of the N segments the case uses: one for each target of a catch."""
+        """Return which of the N segments the case uses, (N,) bool; by default its only one."""
         return jnp.ones(1, bool)
 
     def relative_excess(self, excess: Array) -> Array:
@@ -157,7 +157,7 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
         return proportional_minco(_ORDER, self.proportions)
 
     def guesses(self, context: PyTree, num: int) -> Float[Array, "num n"]:
-        """Return starting points (num, n) on smoothest curves; a network may improve the first."""
+        """Return starting points (num, n), without waypoint offsets unless a network adds them."""
         if num > len(self.guess_table):
             raise ArgumentError("starts", f"<= {len(self.guess_table)}", num)
         natural = self.guess_ends(context, num)
@@ -178,7 +178,7 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
         return offsets, natural[:, self.num_offsets :]
 
     def join(self, offsets: Float[Array, "N O 3"], natural: Float[Array, "N K"]) -> Array:
-        """Return the point (n,) of waypoint offsets and end variables: the inverse of `split`."""
+        """Return the point (n,) with these waypoint offsets and end variables; inverts `split`."""
         together = jnp.concatenate([offsets.reshape(natural.shape[0], -1), natural], axis=1)
         return (together / jnp.asarray(self.scale, together.dtype)[None]).ravel()
 

@@ -72,10 +72,11 @@ def minimise_lanes(
     config: Solver,
     curved: Callable[[Array, PyTree], Curvature] | None = None,
 ) -> Optimum:
-    """Minimise many problems of a batch at once, each with its own start and context.
+    """Minimise B problems of n variables at once, each with its own start and context.
 
-    The starts are (n, B). The B problems are on the last axis of every leaf of contexts and optima.
-    `objective` and `curved` take one point and one context.
+    `starts` is (n, B). A context is the pytree of a problem's data. In all arrays of `contexts` and
+    of the result, the last axis counts problems. `objective` and `curved` take a point (n,) and the
+    context of one problem.
     """
     if _has_steps(config, 0):
         evaluate = lambda x, context: _optimum_at(x, objective(x, context), config)  # noqa: E731
@@ -119,7 +120,6 @@ def minimise_lanes(
 
 
 def _has_steps(config: Solver, num: int) -> bool:
-    """Return whether `config.max_steps` is an integer, not a traced array, and equals `num`."""
     return isinstance(config.max_steps, int) and config.max_steps == num
 
 
@@ -139,7 +139,6 @@ def _step(objective: Objective, curved: Curved | None, state: PyTree, config: So
 
 
 def _with_stragglers(config: NewtonConfig) -> NewtonConfig:
-    """Add the iterations of all groups of stragglers (slow problems) to `max_steps`."""
     if config.stragglers is None:
         return config
     _, steps, groups = config.stragglers
@@ -160,7 +159,7 @@ def _optimum_at(point: Array, evaluation: Evaluation, config: Solver) -> Optimum
 
 
 def solve_round(planner: "OptimisedPlanner", attempt: Round, case: PyTree) -> PyTree:
-    """Return the plan of one case from one start, with the iterations of one round; pure."""
+    """Return the plan of one case that all searches of one round (attempt) find in turn; pure."""
     last = planner.with_settings(attempt.settings)
     context = last.prepare(case)
 
@@ -181,7 +180,7 @@ def solve_round(planner: "OptimisedPlanner", attempt: Round, case: PyTree) -> Py
 
 
 def solve_batch(planner: "OptimisedPlanner", attempt: Round, cases: PyTree) -> PyTree:
-    """Plan a batch of cases from one start each, with the iterations of one round; pure."""
+    """Plan a batch of cases, each from one start by all searches of one round (attempt); pure."""
     last = planner.with_settings(attempt.settings)
     contexts = over_lanes(last.prepare)(_lanes_last(cases))
     first = planner.with_settings(attempt.all_stages[0].settings)
@@ -206,7 +205,10 @@ class Searches:
 
 
 def count_guesses(rounds: Sequence[Round], stage: Stage) -> int:
-    """Return how many guesses (starting points) rounds with such a first stage need."""
+    """Return how many starting points a program for one stage must compute.
+
+    This is the greatest number that a round needs whose first search has the stage's settings.
+    """
     begun = [each for each in rounds if each.all_stages[0].settings == stage.settings]
     return max((each.first + each.starts for each in begun if each.is_divided), default=0)
 
@@ -214,7 +216,7 @@ def count_guesses(rounds: Sequence[Round], stage: Stage) -> int:
 def run_searches(
     planner: "OptimisedPlanner", stage: Stage, num: int, searches: Searches
 ) -> tuple[Array, PyTree]:
-    """Run one stage of many searches, each from one of the first `num` guesses, or a point; pure.
+    """Run L searches, each from its own point or from one of the first `num` guesses; pure.
 
     Returns:
         The points (L, n) at which the L searches end, and the plans at these points.
@@ -253,7 +255,7 @@ def divide_round(
     attempt: Round,
     cases: PyTree,
 ) -> PyTree:
-    """Return the best plan of every case of a batch, from all starts and stages of a round.
+    """Return the best plan of every case of a batch that the searches of one round find.
 
     The arrays may be NumPy's or JAX's. `search` runs one stage of L searches and returns the end
     points (L, n) and the plans at these points. It takes the stage and the three fields of
@@ -283,7 +285,7 @@ def divide_round(
 
 
 def solve_divided(planner: "OptimisedPlanner", attempt: Round, cases: PyTree) -> PyTree:
-    """Plan each case of a batch from all starts of a round, by searches in one program; pure."""
+    """Return each case's best plan from all starts of a round, by one compiled program; pure."""
 
     def search(
         stage: Stage, cases: PyTree, index: Array, points: Array | None

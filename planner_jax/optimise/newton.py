@@ -206,7 +206,7 @@ def _lanczos(
 
 
 def _pivots(diagonal: list[Array], beside: list[Array], shift: Array) -> list[Array]:
-    """Return pivots, none near 0, of T + shift I with the tridiagonal T of `diagonal`, `beside`."""
+    """Return pivots, none near 0, of T + shift I; T has the diagonal and subdiagonal `beside`."""
     scale = functools.reduce(jnp.maximum, [jnp.abs(each) for each in (*diagonal, *beside)])
     least = _LEAST * scale + 1e-30
     found = []
@@ -221,8 +221,8 @@ def _pivots(diagonal: list[Array], beside: list[Array], shift: Array) -> list[Ar
 def _lowest(diagonal: list[Array], beside: list[Array]) -> Array:
     """Return a lower bound of a tridiagonal matrix's least eigenvalue, or 0 if it is >= 0.
 
-    An interval around the eigenvalue is bisected: if elimination of (matrix - x I) has a negative
-    pivot, an eigenvalue is below x (Sturm sequence).
+    The symmetric matrix has `diagonal` and subdiagonal `beside`. An interval around the eigenvalue
+    is bisected: if elimination of (matrix - x I) has a negative pivot, an eigenvalue is below x.
     """
     around = [jnp.abs(each) for each in beside]
     zero = jnp.zeros_like(diagonal[0])
@@ -248,7 +248,7 @@ def _lowest(diagonal: list[Array], beside: list[Array]) -> Array:
 
 
 def _tridiagonal_solve(diagonal: list[Array], beside: list[Array], shift: Array) -> Array:
-    """Solve (T + shift I) x = (1, 0, ..., 0) with the tridiagonal T of `diagonal` and `beside`."""
+    """Solve (T + shift I) x = (1, 0, ..., 0); T has the diagonal and subdiagonal `beside`."""
     pivots = _pivots(diagonal, beside, shift)
     right = [jnp.ones_like(pivots[0])]
     for k in range(1, len(pivots)):

@@ -134,13 +134,13 @@ class OptimisedPlanner(Planner[CaseT, PlanT], abc.ABC):
         return (solve_divided if attempt.is_divided else solve_batch)(self, attempt, cases)
 
     def divides(self, attempt: Round) -> bool:
-        """Return whether `pj.plan` runs the searches of a round one by one; see `is_divided`."""
+        """Return whether `pj.plan` runs each search of a round as a separate problem."""
         return attempt.is_divided
 
     def settle(
         self, cases: PyTree, plan_of: Callable[[Planner, PyTree], PyTree] | None = None
     ) -> tuple[Self, PyTree]:
-        """Return the planner and the cases unchanged: nothing is decided before the search."""
+        """Return the planner and the cases unchanged; this planner decides nothing in advance."""
         return self, cases
 
     def with_settings(self, settings: Settings) -> Self:

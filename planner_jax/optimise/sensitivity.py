@@ -77,7 +77,7 @@ class Differentiated(OptimisedPlanner):
     # The differentiated number: a dotted name in the plan, such as "stroke.time", or a function.
     quantity: Quantity = struct.field(pytree_node=False)
     by: tuple[str, ...] = struct.field(pytree_node=False)  # dotted names in the case
-    # Number of iterations of conjugate gradients; by default 40 for "products" and 1 for "whole".
+    # Number of iterations of conjugate gradients; None: 40, or 1 if `curvature` is "whole".
     steps: int | None = struct.field(pytree_node=False, default=None)
     curvature: str = struct.field(pytree_node=False, default="products")  # see `gradient_at`
 
@@ -115,7 +115,7 @@ class Differentiated(OptimisedPlanner):
         return self.planner.held
 
     def divides(self, attempt: Round) -> bool:
-        """Return false: separate programs for searches would each compute the gradient."""
+        """Return false; the gradient would be computed for every search that is run separately."""
         return False
 
     def objective(self, point: Array, context: _Context) -> Evaluation:
@@ -165,7 +165,7 @@ def gradient_at(
         point: (n,) minimiser of the planner's objective. At another point the result
             is not the gradient at the optimum.
         quantity: dotted name of a number in the plan, or a function of the plan.
-        by: dotted names in the case.
+        by: dotted names of parts of the case, such as "limits.speed".
         steps: iterations of conjugate gradients, each with one product with the Hessian. They stop
             early if the Hessian is not positive. 0 sets the adjoint vector to zero, which is
             correct for "cost": its derivative at an optimum is the derivative at a fixed point

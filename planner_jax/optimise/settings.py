@@ -167,10 +167,10 @@ class Round(Attempt):
 
     @property
     def is_divided(self) -> bool:
-        """Whether the searches of one case are run as separate problems of a batch.
+        """Whether each search of a case, from one starting point, is a problem of its own.
 
-        This is so if a case has several searches, or a round has its own settings. Rounds whose
-        searches have equal settings then share a program, whatever their numbers of starts are.
+        This is so for several starting points, a `first` > 0, or own settings of the round. Rounds
+        with equal settings then share a compiled program, for any number of starting points.
         """
         return self.starts > 1 or self.first > 0 or bool(self.settings)
 
@@ -183,11 +183,11 @@ class CountedLbfgs(LbfgsConfig):
 
 @cached_by_precision
 def load_round(attempt: Round, is_counted: bool) -> Round | Fixed:
-    """Convert a round (attempt) to a program's argument; it is static if a search has 0 iterations.
+    """Convert a round (attempt) to an argument of compiled programs, static if a search is empty.
 
-    Rounds that differ only in L-BFGS's numbers of iterations and tolerances share one program. If
-    `is_counted`, numbers of iterations up to `COUNTED` are static: a GPU then need not ask the host
-    after every iteration whether the loop has ended.
+    A search is empty if it has 0 iterations. Rounds that differ only in L-BFGS's numbers of
+    iterations and tolerances share one program. If `is_counted`, up to `COUNTED` iterations are
+    static: a GPU then need not ask the host after every iteration whether the loop has ended.
     """
     if any(stage.solver.max_steps == 0 for stage in attempt.all_stages):
         return Fixed(attempt)
@@ -199,7 +199,7 @@ def load_round(attempt: Round, is_counted: bool) -> Round | Fixed:
 
 @cached_by_precision
 def load_stage(stage: Stage, is_counted: bool) -> Stage | Fixed:
-    """Convert one stage of a divided round to an argument of programs, as `load_round` does."""
+    """Convert one stage (a search) to an argument of compiled programs, as `load_round` does."""
     stage = dataclasses.replace(stage, keep=None)
     if stage.solver.max_steps == 0:
         return Fixed(stage)

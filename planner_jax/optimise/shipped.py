@@ -33,7 +33,7 @@ class StartNetwork:
     biases: tuple[Array | np.ndarray, ...]  # (outputs,)
 
     def __call__(self, features: Array) -> Array:
-        """Return the correction (n,) of a guessed starting point, from F features of its case."""
+        """Return the correction (n,) of a guessed starting point, from F numbers about its case."""
         cast = functools.partial(jnp.asarray, dtype=features.dtype)
         values = (features - cast(self.mean)) / cast(self.deviation)
         values = jnp.clip(values, -REACH, REACH)

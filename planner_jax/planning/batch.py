@@ -1,4 +1,4 @@
-"""Plans of batches, for `plan`: chunks of a few fixed sizes, spread over the devices.
+"""Plan batches of cases, for `plan`, in chunks of a few fixed sizes on all devices.
 
 A lane is one case of a batch. The cases that an attempt leaves unsolved are gathered into a smaller
 batch for the planner's next attempt. Each device solves its lanes in its own loop and waits for no
@@ -254,7 +254,7 @@ class _Batch:
     def _results(
         self, attempt: Attempt, cases: PyTree, calls: list[_Call], may_end: bool
     ) -> Iterator[PyTree]:
-        """Yield the plans of every call, in order. A single CPU uses one thread for each core.
+        """Yield the plans of each call (one chunk of cases); a CPU has one thread for each core.
 
         One more thread prepares the next call while the others compute. With `may_end`, a call that
         did not start before the time limit yields None.
@@ -298,7 +298,7 @@ class _Batch:
         return divide_batch(self.planner, attempt, self.mesh, cases)
 
     def _divide_resident(self, attempt: Attempt, cases: PyTree, is_case: np.ndarray) -> PyTree:
-        """Return plans of cases in jax arrays; where `is_case` (B,) is false they are padding."""
+        """Return plans of B cases in jax arrays; cases with a false `is_case` (B,) are padding."""
         found = self._divide(attempt, jax.tree.map(lambda leaf: np.asarray(leaf)[is_case], cases))
         row = np.maximum(np.cumsum(is_case) - 1, 0)  # repeats a plan for the padding
         found = jax.tree.map(lambda leaf: leaf[row], found)

@@ -26,7 +26,7 @@ from planner_jax.planning.programs import solve_cases, solve_one
 
 @dataclasses.dataclass(frozen=True)
 class Driver:
-    """Runs the attempts of planners for `pj.plan` or, with `is_pure`, for `pj.solve`."""
+    """The loop over a planner's attempts, for `pj.plan` or, with `is_pure`, for `pj.solve`."""
 
     chunk: int | None = None
     devices: Sequence[jax.Device] | None = None  # pyright: ignore[reportInvalidTypeForm]
@@ -41,7 +41,7 @@ class Driver:
     def __call__(
         self, planner: Planner, cases: PyTree, attempts: Sequence[Attempt] | None = None
     ) -> tuple[PyTree, PyTree]:
-        """Plan by the listed attempts, or by all; return plans, and marks or counts of failures."""
+        """Plan by the listed attempts, or all; return plans, and which or how many are unsolved."""
         if planner.kind is Kind.COMPOSITE:
             plans = planner.plan_by(self, cases)
             return plans, is_unsolved(plans.status)

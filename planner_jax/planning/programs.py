@@ -56,10 +56,10 @@ class Sizes:
         return smaller if smaller >= self.busy and 2 * num <= fits else fits
 
     def cuts(self, num: int) -> Iterator[tuple[int, int]]:
-        """Yield the first lane (case) and the size of every call that is needed for `num` lanes.
+        """Yield first lane (case) and number of lanes of every call that `num` lanes need.
 
-        The last call has the size of the calls before it, because another size needs another
-        program. It is smaller only if this saves more than 1/8 of the work before it.
+        A call has the size of the call before it, because another size needs another program. It is
+        smaller only if this saves more than 1/8 of the lanes before it.
         """
         first = size = 0
         while first < num:

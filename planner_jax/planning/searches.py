@@ -1,8 +1,8 @@
-"""Rounds of an optimising planner whose searches are lanes, that is problems, of one program.
+"""One round (attempt) of a planner that minimises, with each search as a problem of its own.
 
 A case may be searched from several starting points, in stages from an easy to a hard problem. Every
-search of every case is one lane. The host cuts the lanes of a stage into calls of one fixed size,
-so that all rounds and stages with equal settings share one program, for one case or many.
+search of every case is one lane of a batch. The host cuts the lanes of a stage into calls of one
+size. All rounds and stages with equal settings thus share a compiled program.
 """
 
 import functools
@@ -35,7 +35,7 @@ _CPU_LANES, _GPU_LANES = 16, 8192
 
 
 def divide_one(planner: Planner, attempt: Attempt, case: PyTree) -> PyTree:
-    """Return the plan that an attempt finds for one case, NumPy leaves; see `divides`."""
+    """Return the plan, in NumPy arrays, that an attempt finds for one case by all its searches."""
     batch = jax.tree.map(lambda leaf: np.asarray(leaf)[None], case)
     planner, mesh = on_devices(planner, jax.local_devices()[:1])
     size = 1 if is_one_cpu(mesh) else _GPU_LANES
@@ -43,7 +43,7 @@ def divide_one(planner: Planner, attempt: Attempt, case: PyTree) -> PyTree:
 
 
 def divide_batch(planner: Planner, attempt: Attempt, mesh: Mesh, cases: PyTree) -> PyTree:
-    """Return the plans that an attempt finds for a batch, NumPy leaves; see `divides`."""
+    """Return the plans, in NumPy arrays, that an attempt finds for a batch by all its searches."""
     is_cpu = mesh.devices[0].platform == "cpu"
     return _plan(planner, attempt, mesh, _CPU_LANES if is_cpu else _GPU_LANES, cases)
 
