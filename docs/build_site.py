@@ -64,7 +64,7 @@ def stage_pages() -> list[str]:
 def public_names(package: str) -> list[str]:
     """Return the full names of the public functions and classes of a package.
 
-    A function such as `pj.hit.case` whose module has its name is named by the path of the module.
+    If a module has the name of a function, such as `case`, the function's full name has the module.
     """
     module = importlib.import_module(package)
     names = []
