@@ -69,7 +69,7 @@ class Executed:
     angles: np.ndarray  # (B, S, 6) [rad], joint angles of the simulated arms
     wanted: np.ndarray  # (B, S, 6) [rad], planned angles, without the drives' delays
     tracking: np.ndarray  # (B, 2) [m], distance of the shield's centre from its plan: rms and worst
-    # (B, 6) [rad], rms error of each joint from the commanded motion, which may start late.
+    # (B, 6) [rad], rms difference of joint angles and the commanded motion, which may start late.
     error_rms: np.ndarray
     error_worst: np.ndarray  # (B, 6) [rad], greatest error of each joint from the commanded motion
     torque_rms: np.ndarray  # (B, 6) [N m], rms torque of each joint

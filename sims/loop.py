@@ -109,9 +109,9 @@ def predict_balls(loop: Loop, estimates: Estimate, ahead: Any) -> BallState:
 def _pose_problems(
     loop: Loop, pilot: Pilot, flights: FlightState, cases: Any
 ) -> tuple[Outlook, Any]:
-    """Return the expected situation at the end of this period, and the planning problem for it.
+    """Return the situations of B flights at the end of this period, and their planning problems.
 
-    Both results have leaves (B, ...) for B flights.
+    The first axis of every array in both results is B.
     """
 
     def one(flight: FlightState, case: Any) -> tuple[Outlook, Any]:
@@ -164,7 +164,7 @@ def _fly(
 def _with_plans(
     pilot: Pilot, flights: FlightState, outlook: Outlook, asked: Any, found: tuple[Any, ...]
 ) -> FlightState:
-    """Replace plans of flights by the plans `found`, where the task's `Pilot` accepts them."""
+    """Replace plans of flights by newly found plans, where the task's `Pilot` accepts them."""
 
     def one(flight: FlightState, outlook: Outlook, asked: Any, found: tuple) -> FlightState:
         plan, good = pilot.choose(asked, outlook, found)

@@ -65,7 +65,7 @@ class Pilot(Protocol):
 
     @property
     def passage(self) -> Callable[..., tuple[Array, Contact]]:
-        """The function, with the signature of `scoring.passage`, that finds contacts in a step."""
+        """The function, such as `scoring.passage`, that finds contacts with balls in one step."""
         ...
 
 

@@ -96,7 +96,7 @@ class Robot(Protocol):
     def references(self, plan: Any, times: Array, world: Any) -> Any:
         """Return the planned states to track at K times (K,) [s] since a plan's start.
 
-        Leaves are (K, ...). Every such reference has a position `pos`.
+        In every array of the result the first axis is K. One of its fields is the position `pos`.
         """
         ...
 

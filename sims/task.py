@@ -63,7 +63,7 @@ class FlightTask(abc.ABC):
     CONTACT: ClassVar[str]  # participle for a met target in pictures, such as "caught"
     SUCCESS: ClassVar[str]  # predicate of a successful flight in sentences: "caught all balls"
     PUBLISHED: ClassVar[str]  # published result of the task, for the report's table
-    # Columns of this task in the table with one row per flight; every task has further columns.
+    # This task's own columns in the table of flights (one row per flight), beside common columns.
     COLUMNS: ClassVar[Sequence[Column]]
     # Lower and upper corner [m] of the region that pictures show; None to fit all drawn objects.
     BOUNDS: ClassVar[tuple[tuple[float, float, float], tuple[float, float, float]] | None] = None
@@ -120,7 +120,7 @@ class FlightTask(abc.ABC):
         """Return all parameters of the simulation, as plain values for the run's manifest."""
 
     def every_column(self) -> Sequence[Column]:
-        """Return all columns that this task adds to the table with one row per flight."""
+        """Return the columns that this task adds to the common columns of the table of flights."""
         return self.COLUMNS
 
     def surroundings(self, index: int) -> Sequence[Prism]:

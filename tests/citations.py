@@ -1,11 +1,11 @@
-"""The tables of docs/equations.md: which file implements or cites which equation of four papers.
+"""Make docs/equations.md, which lists the files that implement or cite equations of four papers.
 
-    python -m tests.citations            # fails if the page is stale
+    python -m tests.citations            # fails if the page differs from the code
     python -m tests.citations --write    # writes the page
 
-A citation is `[KEY, eq. N]`. A bare `eq. N` counts for the one paper that its file cites.
-`tests/data/equations.toml` states what each equation computes and, if several files cite the
-equation, which file implements it.
+A citation is `[KEY, eq. N]`. In a file that cites a single paper, `eq. N` alone is a citation of
+this paper. `tests/data/equations.toml` states what each equation computes and, if several files
+cite the equation, which file implements it.
 """
 
 import ast
@@ -55,7 +55,7 @@ def expand(text: str) -> list[str]:
 
 
 def equations_of(text: str) -> Iterator[tuple[int, str, str]]:
-    """Yield position, paper and number of each equation that a text cites."""
+    """Yield, for each equation that a text cites, its position, paper and equation number."""
     keyed = list(KEYED.finditer(text))
     papers = {match[1] for match in keyed}
     for match in EQUATIONS.finditer(text):
@@ -67,7 +67,7 @@ def equations_of(text: str) -> Iterator[tuple[int, str, str]]:
 
 
 def name_at(tree: ast.Module, line: int) -> str:
-    """Return the name of the function or class around a line, or "" at the module's level."""
+    """Return the dotted name of the function or class that contains a line, or ""."""
     names = ""
     for node in ast.walk(tree):
         if isinstance(node, ast.FunctionDef | ast.ClassDef):
@@ -77,7 +77,7 @@ def name_at(tree: ast.Module, line: int) -> str:
 
 
 def find_places() -> dict[tuple[str, str], dict[str, set[str]]]:
-    """Return the files, each with its functions and classes, that cite each equation of a paper."""
+    """Return, by (paper, equation), the files that cite it, with their functions and classes."""
     places: dict[tuple[str, str], dict[str, set[str]]] = defaultdict(lambda: defaultdict(set))
     for file in tracked_files("planner_jax/*.py", "sims/*.py", "policies/*.py"):
         path = ROOT / file
@@ -91,7 +91,7 @@ def find_places() -> dict[tuple[str, str], dict[str, set[str]]]:
 
 
 def make_page() -> str:
-    """Return the page, with one table for each paper.
+    """Return the text of docs/equations.md, with one table for each paper.
 
     Raises:
         LookupError: `equations.toml` lacks a cited equation or its implementing file, or has an

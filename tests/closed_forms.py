@@ -1,4 +1,4 @@
-"""Closed forms for comparison with the library."""
+"""Closed forms of court regions and turning paths, with which tests compare the library."""
 
 import numpy as np
 
@@ -6,10 +6,7 @@ from planner_jax.task.hit import court
 
 
 def region_of(x, y):
-    """Return the region of points (...) [m] on the floor of either half of the court.
-
-    Regions N, F, L, R are 1 to 4; 0 is the dead zone, outside the court, or NaN.
-    """
+    """Return the court region (...) of points: 1 near, 2 far, 3 left, 4 right, 0 none of them."""
     depth, aside = np.abs(x), np.abs(y)
     inside = (depth >= court.DEAD_ZONE) & (depth <= court.HALF_LENGTH) & (aside <= court.HALF_WIDTH)
     middle = np.where(depth < court.NEAR_LINE, 1, 2)
@@ -18,7 +15,7 @@ def region_of(x, y):
 
 
 def positions_on(path, times):
-    """Return positions (..., [T,] 2) of `TurningPath`s (...) at a time or at times (..., T)."""
+    """Return positions (..., 2) or (..., T, 2) of `TurningPath`s (...) at one or T times [s]."""
     times = np.asarray(times, float)
     pos, vel = (np.asarray(leaf, float) @ [1.0, 1.0j] for leaf in (path.pos, path.vel))
     rate = np.asarray(path.turn_rate, float)

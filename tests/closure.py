@@ -1,8 +1,8 @@
-"""The files of the library that are imported to draw, plan and judge one hit.
+"""List the files of the library that are imported to draw, plan and judge one hit.
 
     python -m tests.closure
 
-prints them with their lines.
+The program prints each file with its number of lines.
 """
 
 import sys
@@ -14,13 +14,12 @@ LIBRARY = Path(pj.__file__).parent
 
 
 def plan_one_hit() -> None:
-    """Draw, plan and judge one hit."""
     cases = pj.hit.draw(1)
     pj.hit.judge(cases, pj.plan(pj.hit.planner(), cases))
 
 
 def list_imported() -> dict[str, int]:
-    """Return the lines of each imported file of the library, by its path in the library."""
+    """Return the number of lines of each imported file of the library, by its relative path."""
     modules = [module for name, module in sys.modules.items() if name.split(".")[0] == LIBRARY.name]
     paths = sorted({Path(file) for module in modules if (file := module.__file__)})
     return {str(p.relative_to(LIBRARY)): len(p.read_text().splitlines()) for p in paths}

@@ -1,7 +1,7 @@
-"""Settings that every test shares, made before the first import of JAX.
+"""Environment variables, fixtures and the order of all tests.
 
-They are environment variables, so that worker processes and the processes that tests start (the
-command line, the notebooks' kernels) have them too.
+The variables are set before the first import of JAX. Worker processes, and processes that tests
+start (the command line, the notebooks' kernels), inherit them.
 """
 
 import os
@@ -14,8 +14,8 @@ os.environ.setdefault("JAX_PLATFORMS", "cpu")
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(CACHE))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 os.environ.setdefault("MPLBACKEND", "agg")
-# The tests mostly compile, and a third of that time fuses loops, which does not pay for few lanes.
-# XLA ends a process that names an unknown flag, and later versions do not know this one.
+# Without XLA's fusion emitters, tests compile in two thirds of the time. Their small batches gain
+# little from fused loops. Later versions of XLA end the process, as they do not know this flag.
 if version("jaxlib") < "0.11":
     os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false")
 
@@ -28,13 +28,13 @@ pytest.register_assert_rewrite("sweeps", "tests.sweeps")
 accept_leaves()
 install_import_hook([f"planner_jax.{name}" for name in PACKAGES], "typecheck.check")
 
-# Every compiled program takes some of the 65,530 memory mappings that Linux allows a process by
-# default; without a free one a compilation aborts the process.
+# Number of memory mappings above which compiled programs are released. Each program uses some. If a
+# process exceeds Linux's default limit of 65,530, a compilation aborts it.
 MOST_MAPPINGS = 40_000
 
 
 def pytest_runtest_teardown(item, nextitem):
-    """Forget compiled programs if there are many, after a module or a slow test."""
+    """Release all compiled programs after a module or slow test, if they use many mappings."""
     ends_module = nextitem is None or nextitem.path != item.path
     mappings = Path("/proc/self/maps")
     if (ends_module or item.get_closest_marker("slow")) and mappings.exists():
@@ -44,16 +44,16 @@ def pytest_runtest_teardown(item, nextitem):
 
 @pytest.fixture
 def float64():
-    """Use double precision during one test: the reference arithmetic of the suite."""
+    """Let JAX compute in double precision during one test, for accurate reference values."""
     with jax.enable_x64(True):
         yield
 
 
 @pytest.fixture(scope="module", autouse=True)
 def strict_arrays(request):
-    """Raise in default runs where JAX would add axes or convert a type to combine arrays.
+    """Make JAX raise, in default runs, where it would add axes or convert types implicitly.
 
-    Types are converted in modules with MJX or Brax.
+    Conversions are permitted in the modules of `MIXED`, and in tests of simulations.
     """
     stem = request.path.stem.removeprefix("test_")
     options = {"jax_numpy_rank_promotion": "raise"}
@@ -71,7 +71,7 @@ def strict_arrays(request):
 
 @pytest.fixture(scope="module")
 def finished(request, tmp_path_factory):
-    """Return folder and manifest of a complete sweep of the module's TASK and SETTINGS."""
+    """Run a sweep of the test module's TASK and SETTINGS; return its run folder and manifest."""
     from planner_jax.sweep.run import start_sweep
 
     out = tmp_path_factory.mktemp("runs") / "finished"
@@ -79,7 +79,8 @@ def finished(request, tmp_path_factory):
     return out, start_sweep(module.TASK, module.SETTINGS, out, progress=False)
 
 
-# Published baselines, studies, learned policies, stores and clusters: `make test-slow` runs them.
+# Test modules, without "test_", of baselines, studies, policies, clusters and benchmarks, which
+# only `make test-slow` runs.
 SLOW = (
     *("b_spline", "baselines", "bezier", "block_adapt", "block_library", "block_peers"),
     *("catch_peer", "hybrid_astar", "minimum_jerk", "mpp", "paper_catch", "path_smoothing"),
@@ -89,14 +90,14 @@ SLOW = (
     "cluster",
     *("bench", "benchmark_ipopt", "intercept_oracle"),
 )
-# Modules beside `test_sims_*` that convert types implicitly, mostly in MJX, Brax or optax.
+# Test modules beside `test_sims_*` whose code, mostly MJX, Brax or optax, converts array types.
 MIXED = (
     *("policy", "training", "stack", "speed", "bench", "live_loop", "perception"),
     *("plane_prediction", "cli", "snippets", "notebooks"),
 )
-# Modules that take longest, or compile programs that others find in the cache: test_exact the hit
-# planner's, test_decide the catch planner's. Workers get whole modules in this order, so that none
-# ends with a long module, and no two compile the same program.
+# Test modules that start first, because they take longest or fill the compile cache for others:
+# test_exact compiles the planner of hits, test_decide the planner of catches. Worker processes get
+# whole modules in this order, so that no worker ends late, and no two compile the same program.
 FIRST = (
     *("along_curvature", "sims_flights", "exact", "notebooks", "intercept", "decide"),
     *("contract", "block", "own_task", "along", "estimation"),
@@ -105,7 +106,7 @@ FIRST = (
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items):
-    """Mark the modules of SLOW, and put the modules of FIRST before the others."""
+    """Mark tests of modules in SLOW as slow, and move tests of modules in FIRST to the front."""
     places = {f"test_{name}": place for place, name in enumerate(FIRST)}
     items.sort(key=lambda item: places.get(item.path.stem, len(FIRST)))
     for item in items:

@@ -1,8 +1,8 @@
-"""The order at which a numerical method converges, as it is observed."""
+"""Measurement of the order at which a numerical method converges."""
 
 import numpy as np
 
 
 def observed_order(steps, errors):
-    """Slope of log error over log step: p for a method whose error is proportional to step^p."""
+    """Return the exponent p for errors proportional to step^p, by a fit of log(error)."""
     return np.polyfit(np.log(steps), np.log(errors), 1)[0]

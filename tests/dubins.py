@@ -1,9 +1,8 @@
-"""The shortest path of a car that only drives forward and has a greatest curvature.
+"""The shortest path of a car that only drives forward, with bounded curvature.
 
-It is the shortest of Dubins's six words: three arcs, or an arc, a straight line and an arc, at the
-greatest curvature [Dubins1957]. The lengths are closed forms [Shkel2001], computed for all six
-words at once, so that a batch needs no branches. World frame in the plane, SI units, headings
-counter-clockwise from the x axis.
+The path consists of three arcs, or of an arc, a straight line and an arc, at the greatest curvature
+[Dubins1957]. There are six such sequences (words). Their lengths are closed forms [Shkel2001],
+computed for all words at once, so that a batch needs no branches. SI units, headings from x axis.
 """
 
 import jax
@@ -18,7 +17,7 @@ _TURN = 2.0 * jnp.pi
 
 @struct.dataclass
 class DubinsPath:
-    """Three parts, each a straight line or an arc of the greatest curvature."""
+    """A path of three parts, each a straight line or an arc of the greatest curvature."""
 
     start: Array  # (3,) x [m], y [m], heading [rad]
     word: Array  # () int32, index in WORDS
@@ -27,7 +26,7 @@ class DubinsPath:
 
     @property
     def length(self) -> Array:
-        """Length of the whole path, () [m]."""
+        """The length () [m] of the whole path."""
         return self.lengths.sum(axis=-1)
 
 
@@ -39,12 +38,12 @@ def dubins(start: Array, goal: Array, curvature: Array) -> DubinsPath:
     a, b = start[2] - along, goal[2] - along
     sin_a, cos_a, sin_b, cos_b = jnp.sin(a), jnp.cos(a), jnp.sin(b), jnp.cos(b)
 
-    # A word and its mirror image differ by the sign of both headings, so by the sign of their
-    # sines. All closed forms use the vector (x, y) between the centres of two circles.
+    # A word (sequence of arcs) and its mirror image differ by the sign `side` of the headings'
+    # sines. (x, y) is the vector between the centres of the first and the last circle.
     def same_sense(side: float) -> tuple[Array, Array]:
         x, y = far + side * (sin_a - sin_b), cos_b - cos_a
         straight, heading = _root(x**2 + y**2), jnp.arctan2(y, x)
-        # Without a straight line the two arcs are one, and its heading has no meaning.
+        # If the straight line has length zero, its heading is undefined, and both arcs form one.
         is_arc = straight < 8.0 * jnp.finfo(straight.dtype).eps
         first = jnp.where(is_arc, side * (b - a), heading - side * a)
         last = jnp.where(is_arc, 0.0, side * b - heading)

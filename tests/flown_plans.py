@@ -1,4 +1,4 @@
-"""Synthetic plans of each robot, which need no planner, and readers of exported files."""
+"""Plans of quadrotor, car and arm from random numbers, and readers of exported files."""
 
 import io
 
@@ -21,7 +21,7 @@ SOLVED = {
 
 
 def pieces(num, powers, axes, seed=0, duration=0.2):
-    """Return `num` smooth pieces, which do not join."""
+    """Return a `PiecewisePolynomial` of `num` random pieces, which are discontinuous at joints."""
     draw = np.random.default_rng(seed)
     coeffs = 6.0 * draw.normal(size=(num, powers, axes)) / 2.0 ** np.arange(powers)[:, None]
     durations = np.full(num, duration) + 0.01 * np.arange(num)
@@ -53,18 +53,18 @@ PLANS = {"quadrotor": quadrotor(), "car": car(), "arm": arm()}
 
 
 def export_plan(plan, **options):
-    """Export a plan without a recovery trajectory: a synthetic plan has no case with limits."""
+    """Export a plan without a recovery trajectory, which would need the limits of a case."""
     return pj.export(plan, recovery=None, **options)
 
 
 def table(path):
-    """Return the header, and the rows in float64, of a file of comma-separated values."""
+    """Return the column names of a CSV file, and its numbers as a float64 array (rows, columns)."""
     header, *rows = path.read_text().splitlines()
     return header.split(","), np.array([row.split(",") for row in rows], float)
 
 
 def bag(path):
-    """Return the profile of an MCAP file, and schema, channel, record and message of each."""
+    """Return an MCAP file's profile, and (schema, channel, record, message) of each message."""
     reader = make_reader(io.BytesIO(path.read_bytes()), decoder_factories=[DecoderFactory()])
     return reader.get_header().profile, list(reader.iter_decoded_messages())
 

@@ -3,8 +3,8 @@
     python -m tests.golden write DIR [NAME ...]
     python -m tests.golden compare DIR OTHER
 
-A change without effect on plans leaves every row as it is, bit for bit. Rows of two folders are
-comparable if one machine wrote both with the same package versions.
+A row is a file with plans and verdicts of one planner on one suite. Unless a change of code affects
+plans, rows stay equal bit for bit on one machine with the same package versions.
 """
 
 import argparse
@@ -40,7 +40,7 @@ Row = dict[str, np.ndarray]
 
 
 def arrays_of(prefix: str, tree: object) -> Row:
-    """Return the arrays in nested dataclasses, dicts and tuples by their dotted names."""
+    """Return the arrays in nested dataclasses, dicts and tuples, by dotted names after `prefix`."""
     if tree is None or callable(tree):
         return {}
     if dataclasses.is_dataclass(tree):
@@ -59,7 +59,7 @@ def arrays_of(prefix: str, tree: object) -> Row:
 def plan_and_judge(
     name: str, planner: str | None, suite: str | None = None, num: int = NUM, options=None, **draws
 ) -> Row:
-    """Return the plans and verdicts of a batch."""
+    """Draw `num` cases of a task's suite, and return their plans and verdicts, arrays by name."""
     task = getattr(pj, name)
     cases = task.draw(num, suite, SEED, **draws)
     plans = pj.plan(task.planner(*filter(None, [planner]), **(options or {})), cases)
@@ -67,14 +67,14 @@ def plan_and_judge(
 
 
 def differentiate_hits() -> Row:
-    """Return contact times of hits, and their gradients by the height of the racket."""
+    """Return contact times of hits, and their derivatives by the racket's height, by name."""
     cases = pj.hit.draw(NUM, seed=SEED)
     found = pj.gradient(pj.hit.planner(), cases, of="stroke.time", by="racket_height")
     return arrays_of("gradient", found)
 
 
 def replan(name: str, suite: str | None, changed: str) -> Row:
-    """Return plans that start from other plans."""
+    """Return plans by `pj.replan` at time 0 of earlier plans, with `changed` passed as news."""
     task = getattr(pj, name)
     cases, planner = task.draw(NUM, suite, seed=SEED), task.planner()
     news = {changed: getattr(cases, changed)}
@@ -102,7 +102,7 @@ def rows() -> Iterator[tuple[str, Callable[[], Row]]]:
 
 
 def write(folder: Path, names: list[str]) -> None:
-    """Write the rows whose names begin with one of `names`, or all, except existing ones."""
+    """Write missing rows (one file each), all or those whose names begin with one of `names`."""
     folder.mkdir(parents=True, exist_ok=True)
     for name, compute in rows():
         path = folder / f"{name}.npz"
@@ -119,7 +119,7 @@ def write(folder: Path, names: list[str]) -> None:
 
 
 def compare(folder: Path, other: Path) -> bool:
-    """Print each row in which two folders differ; return whether they are equal."""
+    """Print each row (file of plans) in which two folders differ; return whether all are equal."""
     is_same = True
     for path in sorted(folder.glob("*.npz")):
         if not (other / path.name).exists():

@@ -1,4 +1,4 @@
-"""Properties of the equations of a traced function, nested ones included."""
+"""Checks of the operations in the jaxpr of a function, including nested jaxprs."""
 
 import jax
 from jax import lax
@@ -10,9 +10,8 @@ HIGHEST = (lax.Precision.HIGHEST, lax.Precision.HIGHEST)
 def assert_full_precision(function, *args):
     """Assert that every matrix product of `function(*args)` requests `Precision.HIGHEST`.
 
-    With less, a GPU rounds the factors of a float32 product to TF32. Derivatives are functions
-    of their own: check `jax.grad(function)` as well. Returns the number of products, so that a
-    test can assert that there are any.
+    At a lower precision a GPU rounds float32 factors to TF32. Check derivatives, such as
+    `jax.grad(function)`, by calls of their own. The result is the number of products.
     """
     products = [
         equation
@@ -28,7 +27,7 @@ def assert_full_precision(function, *args):
 
 
 def equations(jaxpr):
-    """Yield all equations of a jaxpr and of those inside it: loops, branches, solves, calls."""
+    """Yield all equations of a jaxpr, and of the jaxprs of loops, branches and calls inside it."""
     for equation in jaxpr.eqns:
         yield equation
         for inner in inner_jaxprs(tuple(equation.params.values())):

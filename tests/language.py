@@ -1,14 +1,12 @@
-"""Counts of how the project writes: docstrings, phrases and names.
+"""Check the project's language: first words of docstrings, forbidden phrases, function names.
 
     python -m tests.language [PATH ...]
 
-Prints, for the library, simulations, policies and benchmarks by default:
+The program prints, by default for the library, simulations, policies and benchmarks:
 
 * the share of function docstrings that begin with an imperative verb of `VERBS`, and the others;
-* the phrases of `PHRASES` in code, pages and notebooks;
-* the functions that are named by a bare participle.
-
-Properties and tests are left out: a property's docstring says what it holds, a test's what is true.
+* lines of code, pages and notebooks with a phrase of `PHRASES`;
+* functions whose name is a single participle, such as `found`; properties are not checked.
 """
 
 import ast
@@ -50,12 +48,12 @@ VERBS_IN_ED = {"embed", "exceed", "feed", "need", "proceed", "seed", "shed", "sp
 
 
 def _files(paths: tuple[str, ...], endings: tuple[str, ...]) -> Iterator[Path]:
-    """Yield the tracked files below some paths whose names have one of some endings."""
+    """Yield the files that git tracks below `paths` and whose names end with one of `endings`."""
     yield from (ROOT / name for name in tracked_files(*paths) if name.endswith(endings))
 
 
 def _functions(paths: tuple[str, ...]) -> Iterator[tuple[str, ast.FunctionDef]]:
-    """Yield every function but properties, with its file and line."""
+    """Yield every function except properties and fixtures, as ("file:line", syntax tree)."""
     for path in _files(paths, (".py",)):
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.FunctionDef):
@@ -65,7 +63,7 @@ def _functions(paths: tuple[str, ...]) -> Iterator[tuple[str, ast.FunctionDef]]:
 
 
 def share_of_imperatives(paths: tuple[str, ...] = CODE) -> tuple[float, list[str]]:
-    """Return the share of function docstrings that begin with a verb, and the other ones."""
+    """Return the share of function docstrings that begin with a verb of VERBS, and the others."""
     num, others = 0, []
     for place, node in _functions(paths):
         text = ast.get_docstring(node)
@@ -88,7 +86,7 @@ def find_phrases(paths: tuple[str, ...] = PAGES) -> list[str]:
 
 
 def find_participles(paths: tuple[str, ...] = CODE) -> list[str]:
-    """Return the functions that are named by one word that is a participle."""
+    """Return file, line and name of the functions whose name is a single participle (`found`)."""
     return [
         f"{place} {node.name}"
         for place, node in _functions(paths)
@@ -98,7 +96,7 @@ def find_participles(paths: tuple[str, ...] = CODE) -> list[str]:
 
 
 def main() -> None:
-    """Print the counts, and each finding in a line."""
+    """Print each finding in a line, and then the numbers of findings."""
     given = tuple(sys.argv[1:])
     share, others = share_of_imperatives(given or CODE)
     phrases, participles = find_phrases(given or PAGES), find_participles(given or CODE)

@@ -1,8 +1,8 @@
-"""The packages in the order of their layers, the imports of each, and the table of them.
+"""Check that packages import only packages of lower layers, and make their table.
 
     python -m tests.layers [--write]
 
-prints every import that goes upwards. With `--write` it rewrites the table in CONTRIBUTING.md.
+The program prints forbidden imports. With --write it first rewrites the table in CONTRIBUTING.md.
 """
 
 import argparse
@@ -16,9 +16,9 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "CONTRIBUTING.md"
 BEGIN, END = "<!-- packages: python -m tests.layers --write -->\n", "<!-- end of packages -->\n"
-# Folders beside the library, which a link and the wheel put into its package.
+# Folders at the top of the repository that symbolic links make subpackages of `planner_jax`.
 OUTSIDE = ("sims", "policies", "benchmarks")
-# A module imports its own package and packages that stand before it.
+# All packages. A module may import its own package, and packages that precede it in this list.
 LAYERS = (
     *("host", "core", "lanes", "referee"),
     *("ball", "trajectory", "robot", "space", "plane"),
@@ -27,8 +27,8 @@ LAYERS = (
     *("export", "sweep", "live", "__init__"),
     *("sims", "policies", "cli", "benchmarks", "__main__"),
 )
-# Later packages that a package names in strings, "planner_jax.module:Name". Such a module is
-# imported when a user selects it by name.
+# Package -> later packages whose modules it may name in strings, "planner_jax.module:Name". Such a
+# module is imported only when a user selects it by name.
 BY_NAME = {
     "cli": {"benchmarks"},
     "core": {"runs"},
@@ -40,7 +40,7 @@ REGENERATE = "run `python -m tests.layers --write` and commit CONTRIBUTING.md"
 
 @dataclasses.dataclass(frozen=True)
 class Import:
-    """One import, or one module named in a string, of a module."""
+    """One import statement's module, or one module that a string names, in a source file."""
 
     path: Path
     line: int
@@ -61,7 +61,7 @@ class Import:
 
 
 def list_modules() -> list[Path]:
-    """List all modules of the library and of the folders beside it, stubs included."""
+    """Return the files of all modules and stubs of the library and of the folders OUTSIDE."""
     library = ROOT / "planner_jax"
     inside = [p for p in library.rglob("*.py*") if p.relative_to(library).parts[0] not in OUTSIDE]
     beside = [path for folder in OUTSIDE for path in (ROOT / folder).rglob("*.py*")]
@@ -69,13 +69,13 @@ def list_modules() -> list[Path]:
 
 
 def package_of(path: Path) -> str:
-    """Return the folder or loose module of `planner_jax` that holds a file."""
+    """Return the package of `planner_jax`, or its module such as `__main__`, that holds a file."""
     parts = path.relative_to(ROOT).parts
     return parts[0] if parts[0] in OUTSIDE else parts[1].split(".")[0]
 
 
 def _names_of(statement: ast.AST, package: tuple[str, ...]) -> list[str]:
-    """Return the full names in an import statement of a module in `package`."""
+    """Return the absolute names that an import statement of a module in `package` imports."""
     if isinstance(statement, ast.Import):
         return [alias.name for alias in statement.names]
     if isinstance(statement, ast.ImportFrom):
@@ -105,7 +105,7 @@ def read_imports(path: Path, source: str | None = None) -> Iterator[Import]:
 
 
 def is_allowed(found: Import) -> bool:
-    """Return whether the layers allow this import, or name in a string."""
+    """Return whether the order of layers allows this import, or this module named in a string."""
     own, other = package_of(found.path), found.package
     if own not in LAYERS:
         return False
@@ -118,14 +118,13 @@ def is_allowed(found: Import) -> bool:
 
 
 def _purpose_of(package: str) -> str:
-    """Return the first line of a package's docstring."""
     folder = ROOT / package if package in OUTSIDE else ROOT / "planner_jax" / package
     file = folder / "__init__.py" if folder.is_dir() else folder.with_suffix(".py")
     return (ast.get_docstring(ast.parse(file.read_text())) or "").split("\n")[0]
 
 
 def make_table() -> str:
-    """Return the Markdown table of the packages: purpose, imports, names in strings."""
+    """Return the Markdown table of packages: purpose, imports, packages named in strings."""
     imports = {package: set() for package in LAYERS}
     named = {package: set() for package in LAYERS}
     for found in (found for path in list_modules() for found in read_imports(path)):

@@ -1,4 +1,4 @@
-"""A synthetic recording of one flight, for the tests of pictures and viewer."""
+"""An invented recording of one flight, for the tests of pictures and the flight viewer."""
 
 import numpy as np
 
@@ -6,9 +6,9 @@ from planner_jax.sims.recording import Recording
 
 
 def recording(num=6, met=0.04, target=(np.nan,) * 3):
-    """Return a quadrotor that rises at 1 m/s while a ball falls, in `num` samples 10 ms apart.
+    """Return a `Recording`, `num` samples 10 ms apart: a quadrotor rises at 1 m/s, a ball falls.
 
-    The contact is in the second half, and the quadrotor's last sample is missing.
+    They meet at the time `met` [s]. The quadrotor's last sample is NaN.
     """
     time = 0.01 * np.arange(num)
     pos = np.stack([0.0 * time, 0.0 * time, 1.0 + time], axis=1)

@@ -1,4 +1,4 @@
-"""Helpers of the referees' tests: cases and plans from named leaves, batches, and comparisons."""
+"""Helpers of the referees' tests: cases and plans from arrays by name, batches, comparisons."""
 
 from types import SimpleNamespace
 
@@ -8,7 +8,7 @@ from numpy.polynomial import Polynomial
 
 
 def tree(leaves, root="", **optional):
-    """Build nested objects from leaves by dotted names that start with `root`."""
+    """Build nested objects from arrays with dotted names such as "limits.speed", below `root`."""
     inside = {k.removeprefix(root): v for k, v in leaves.items() if k.startswith(root)}
     parts = {k.split(".")[0] for k in inside if "." in k}
     plain = {k: v for k, v in inside.items() if "." not in k}
@@ -17,7 +17,7 @@ def tree(leaves, root="", **optional):
 
 
 def flight(leaves, **optional):
-    """Build an object with the fields of a quadrotor's case and of its plan from leaves."""
+    """Build one object that has the fields of a quadrotor's case and plan, from arrays by name."""
     case = tree(leaves, extras=(), **optional)
     limits = dict.fromkeys(("acceleration", "min_thrust", "max_thrust", "rotors"))
     case.limits = SimpleNamespace(**limits | vars(case.limits))
@@ -27,7 +27,7 @@ def flight(leaves, **optional):
 
 
 def cut(path, durations, degree=7):
-    """Cut three polynomials, x, y and z, into pieces (M, degree + 1, 3), each in its own time."""
+    """Split x(t), y(t), z(t) into M pieces with own times; coefficients (M, degree + 1, 3)."""
     coeffs = np.zeros((len(durations), degree + 1, 3))
     for piece, start in enumerate(np.cumsum(durations) - durations):
         for axis, line in enumerate(path):
@@ -37,9 +37,10 @@ def cut(path, durations, degree=7):
 
 
 def edit(leaves, edits):
-    """Replace leaves, or their entry (0, *index) of a key (name, *index), and return all leaves.
+    """Change arrays `leaves` in place by a dict `edits`, and return all arrays.
 
-    A replacement is a value, or a function of the leaf or entry.
+    A key of `edits` is the name of an array, or (name, *index) for its entry [0, *index]. The
+    replacement is a value, or a function of the old value.
     """
     for key, change in edits.items():
         name, *index = [key] if isinstance(key, str) else key
@@ -53,7 +54,7 @@ def add(value):
 
 
 def failure(leaves, excess=None, time=None, *accepted, **found):
-    """Return a row of FAILURES: leaves, expected failure, and options that accept the plan."""
+    """Return (arrays, expected failure, options of `judge` that accept the plan) of a bad plan."""
     return leaves, {"excess": excess, "time": time, **found}, accepted
 
 
@@ -66,7 +67,7 @@ def rows(verdict, lanes=slice(None)):
 
 
 def assert_same(left, right):
-    """Compare two verdicts' fields by name: numbers to rounding, everything else exactly."""
+    """Assert that two verdicts are equal: floating-point numbers to 1e-12, other fields exactly."""
     for name, value in left.items():
         if value.dtype.kind == "f":
             np.testing.assert_allclose(value, right[name], rtol=1e-12, atol=1e-12, err_msg=name)
@@ -75,7 +76,7 @@ def assert_same(left, right):
 
 
 def checks(judge):
-    """Return `assert_good` and `assert_fails`, which check the verdict on the first plan."""
+    """Return two functions that assert that `judge` accepts, or rejects, the first plan."""
 
     def assert_good(leaves, **options):
         verdict = judge(leaves, **options)

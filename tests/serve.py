@@ -1,4 +1,4 @@
-"""A served ball, its constants and helpers, for the tests of `planner_jax.ball`."""
+"""States of served balls, drag constants and helpers for the tests of `planner_jax.ball`."""
 
 import jax
 import numpy as np
@@ -18,7 +18,7 @@ def serve(pos=SERVE_POS, vel=SERVE_VEL, dtype=np.float64):
 
 
 def three_balls():
-    """Return a served ball, one at rest and a falling one."""
+    """Return a batch of three balls: a served ball, a ball at rest and a falling ball."""
     positions = np.array([SERVE_POS, (0.0, 0.0, 0.0), (-1.0, 2.0, 0.3)])
     return BallState(positions, np.array([SERVE_VEL, (0.0, 0.0, 0.0), (0.0, -20.0, 1.0)]))
 

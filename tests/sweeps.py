@@ -1,4 +1,4 @@
-"""Helpers and tests that the sweeps of several tasks share, besides the fixture `finished`."""
+"""Quick planners, readers of run folders, and tests that the sweeps of several tasks share."""
 
 import io
 import json
@@ -19,24 +19,24 @@ from planner_jax.task.hit.default_planner import ExactHit
 
 
 def quick_hit(**options):
-    """Return the planner of hits with its first round alone: one program."""
+    """Return the planner of hits with its first round (attempt) alone, so one compiled program."""
     return ExactHit(rounds=ExactHit().rounds[:1], **options)
 
 
 def quick_catch(**options):
-    """Return the planner of catches with one short round: one program for several modules."""
+    """Return the planner of catches with one short round (attempt), so one compiled program."""
     rounds = (Round(1, LbfgsConfig(max_steps=20)),)
     return pj.catch.planner(rounds=rounds, **{"decide": "greedy", **options})
 
 
 def columns(out):
-    """Return the rows of a run as NumPy arrays, lists stacked."""
+    """Return the columns of a run's table of plans by name, as NumPy arrays (rows, ...)."""
     table = pq.read_table(out / "plans")
     return {name: np.array(table[name].to_pylist()) for name in table.column_names}
 
 
 def rows_of(out):
-    """Return the rows of a run bit for bit, without times."""
+    """Return a run's table of plans as bytes, without the measured times in its metadata."""
     table = pq.read_table(out / "plans").replace_schema_metadata(None)
     file = io.BytesIO()
     with pa.ipc.new_file(file, table.schema) as writer:
@@ -45,7 +45,7 @@ def rows_of(out):
 
 
 def stop_after(monkeypatch, sweep, num_chunks):
-    """Raise KeyboardInterrupt in `sweep.plan` after some chunks."""
+    """Make the method `plan` of a class of sweeps raise KeyboardInterrupt after some chunks."""
     calls = iter(range(num_chunks))
 
     def plan(*arguments):
@@ -58,7 +58,7 @@ def stop_after(monkeypatch, sweep, num_chunks):
 
 
 class RunTests:
-    """Tests of a module's finished run; a subclass sets the sweep and its properties."""
+    """Tests of the fixture `finished`, a finished sweep; a subclass sets the class attributes."""
 
     sweep: Sweep
     figures: tuple[str, ...]
@@ -130,7 +130,7 @@ class RunTests:
                 start_sweep(task, settings, out, progress=False)
         folder = RunFolder(out)
         assert folder.read_manifest()["state"] == "interrupted"
-        # Files that a killed process was writing are removed.
+        # `resume_sweep` must remove these temporary files, which a killed process would leave.
         (out / "plans").mkdir(exist_ok=True)
         (out / "plans" / ".4711.tmp.part-000002.parquet").write_bytes(b"half a part")
         (out / ".4711.tmp.table.md").write_bytes(b"half a table")

@@ -1,4 +1,4 @@
-"""Checks of the types and shapes that functions of the library annotate, while tests run."""
+"""Runtime checks of arguments and results against type and shape annotations, for tests."""
 
 import functools
 import inspect
@@ -9,14 +9,14 @@ import numpy as np
 from beartype import BeartypeConf, FrozenDict, beartype
 from beartype.roar import BeartypeDecorHintException
 
-# Packages whose functions are checked. `sims`, `policies` and the command line are not.
+# Packages of `planner_jax` whose functions are checked while tests run.
 PACKAGES = (
     *("core", "lanes", "ball", "trajectory", "robot", "space", "plane"),
     *("cost", "optimise", "planning"),
 )
 is_on = True  # False for tests of the library's own checks, which take arguments of any type
-# A leaf of a pytree is a NumPy array on the host, a shape where nothing is computed, and a number
-# where a test or a constant says so. Numbers may be NumPy's.
+# What an argument annotated as `jax.Array` may be: a JAX or NumPy array, a number, or a
+# `ShapeDtypeStruct` of `jax.eval_shape`. Arguments annotated as numbers may be NumPy's.
 _LEAF = jax.typing.ArrayLike | jax.ShapeDtypeStruct
 _HINTS = {jax.Array: _LEAF, int: int | np.integer, float: float | int | np.floating}
 _check = beartype(conf=BeartypeConf(hint_overrides=FrozenDict(_HINTS)))
@@ -24,7 +24,7 @@ _subscript = type(jaxtyping.Float).__getitem__
 
 
 def accept_leaves() -> None:
-    """Have annotations such as `Float[Array, "n 3"]` accept every leaf of their shape."""
+    """Make annotations such as `Float[Array, "n 3"]` accept NumPy arrays and numbers, too."""
 
     def subscript(cls, item):
         array, shape = item
@@ -34,10 +34,10 @@ def accept_leaves() -> None:
 
 
 def check(function):
-    """Return the function with checks of its arguments and its result.
+    """Return the function with checks of its arguments and its result against its annotations.
 
-    Constructors are not checked: JAX builds pytrees of anything. Annotations with `Self` or with a
-    protocol that is not checkable at run time leave a function as it is.
+    Constructors are not checked, because JAX builds pytrees of objects of any type. Functions with
+    annotations that cannot be checked at run time, such as `Self`, are returned unchanged.
     """
     if function.__name__ == "__init__":
         return function

@@ -28,8 +28,8 @@ TOLERANCE = 1e-3  # The referee accepts an excess up to this value.
 COARSE_PIECES, COARSE_SAMPLES = 20, 3  # Number of pieces, and of samples of each piece, at first.
 FINE_SAMPLES = 4  # Number of samples of each piece after the pieces were halved.
 COARSE_FLOOR, FINE_FLOOR = -0.01, -0.003  # Lower bounds of the excess before and after halving.
-# Excess up to which the pieces of a solution are halved, to refine it. Halving reduces the excess
-# by 0.03 at most.
+# A solution is refined by halving its pieces only if it exceeds limits by less than this relative
+# amount, because halving reduces the excess by at most 0.03.
 REFINED_BELOW = 0.06
 # A solution is refined by halving its pieces only if its excess is lower, by at least this amount,
 # than the excess of every solution whose refinement has failed.

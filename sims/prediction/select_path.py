@@ -215,7 +215,7 @@ def mean_position(prediction: Prediction, time: ArrayLike) -> Array:
 
 
 def covariance(prediction: Prediction, time: ArrayLike) -> Array:
-    """Return the mean square (2, 2) [m^2] of the error of the path's position at a time () [s].
+    """Return the second moment (2, 2) [m^2] of the error of the path's position at a time () [s].
 
     The error is measured from the selected path, not from `mean_position`. The diagonal is infinite
     if there were too few observations.

@@ -137,7 +137,7 @@ def _search_rate(seen: Centred, spacing: Array) -> Array:
 
 
 def path_of(seen: Centred, fit: TurnFit) -> TurningPath:
-    """Return the path of a fit; its times count from time 0, not from the mean time."""
+    """Return the path of a fit, with times from time 0 instead of the observations' mean time."""
     place = jnp.stack(_minus(seen.centre, _times(fit.velocity, fit.lever)))
     start = TurningPath(place, jnp.stack(fit.velocity), fit.rate).at(-seen.middle)
     return TurningPath(start.pos, start.vel, fit.rate)

@@ -280,7 +280,7 @@ def _part(batch: Any, name: str) -> np.ndarray:
 
 
 def _balls(cases: BlockCase, flights: BlockFlights, lanes: np.ndarray) -> np.ndarray:
-    """Return positions of F balls at S times, (F, S, 3) [m], in flight and after a bounce."""
+    """Return positions (F, S, 3) [m] of F balls at S frames, in flight and after their block."""
     case, flown = referee_leaves(cases), flights.flown
     times, met = flown.times, flights.contact[lanes]
     free = np.moveaxis(ball_places(case, times), 0, 2)

@@ -145,7 +145,7 @@ class HitPilot:
 
 
 def replace_ball(case: HitCase, balls: BallState, drag: Array, head: Array) -> HitCase:
-    """Return the case with another ball, drag coefficient and state of the robot."""
+    """Return a case with the ball `balls` (1, 3), its `drag` (1,), and the robot's state `head`."""
     ball = jax.tree.map(lambda leaf: leaf[0], balls)
     return dataclasses.replace(case, ball=ball, drag=drag[0], head_state=head)
 

@@ -1,10 +1,10 @@
-"""Faults on purpose: kills, twins, damaged files, full disks and signals. `make test-faults` tries
-them in numbers; the modules test_*.py hold a short form of each for the default suite."""
+"""Tests that inject faults into runs: kills, two writers, damaged files, full disks and signals.
+`make test-faults` injects each many times; the modules test_*.py have short default tests."""
 
 import os
 from pathlib import Path
 
-# As in tests/conftest.py, for `python -m tests.faults` and the commands that it starts.
+# The variables of tests/conftest.py, for `python -m tests.faults` and the commands it starts.
 CACHE = Path(__file__).resolve().parents[2] / ".cache" / "jax"
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(CACHE))

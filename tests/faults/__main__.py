@@ -1,11 +1,10 @@
-"""Try every fault in numbers, and print how often a run survived it.
+"""Inject every fault many times, and print how often a run survived it.
 
     python -m tests.faults [--share F] [--only NAME,...] [--jobs N] [--out FILE]
 
-Survived means: killed runs are resumed to the rows of an undisturbed run. Of two processes that
-write one folder one is refused, in a line that names the other. Damaged files are refused in one
-line, mended, or read as if whole. A signal ends the command with its own code and a line, without a
-traceback.
+A killed run survives if it is resumed to the rows of an undisturbed run. Of two processes that
+write one folder, one must end with a line that names the other. A damaged file must be refused with
+one line, be planned again, or have no effect. A signal must end a command with one line.
 """
 
 import argparse
@@ -21,7 +20,7 @@ from tests.faults.trials import TRIALS, make_whole, try_some
 
 
 def main() -> int:
-    """Try all faults and print the table; return 1 if a run did not survive."""
+    """Inject all selected faults and print the table; return 1 if a run did not survive."""
     parser = argparse.ArgumentParser("python -m tests.faults", description=__doc__)
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.add_argument("--share", type=float, default=1.0, help="of all trials (default: 1)")

@@ -1,11 +1,11 @@
 # ruff: noqa: E501
 """Bad calls of the library, which it must reject with one line.
 
-A row is a call, as a user writes it, and the start of the message. `test_bad_calls.py` defines
-names such as `hits`.
+A row has a call, as a user writes it, and the start of the expected error message.
+`test_bad_calls.py` defines names in the calls, such as `hits`.
 """
 
-# Values that are malformed for every argument of a kind.
+# Malformed values, as Python text, for arguments that are numbers, sizes, vectors, switches, ...
 NOT_NUMBERS = ("'x'", "None", "(1, 2)", "1j", "[[1.0]]", "b'1'", "object()")
 NOT_SIZES = ("0", "-1", "1.5", "'2'", "None", "nan", "True", "(1,)")
 NOT_VECTORS = ("'abc'", "None", "5.0", "[]", "(1, 2)", "(1j, 0, 1)", "((1, 2), (3,))", "object()")
@@ -19,7 +19,7 @@ TASKS = ("hit", "catch", "intercept", "block")
 PATH, FLY = "pj.predict_path(**{**PATH, **dict(@)})", "pj.fly(**{**FLY, **dict(@)})"
 GRADIENT = "pj.gradient(exact, hits, **{**dict(of='cost', by='target'), **dict(@)})"
 
-# Calls with "@" for `argument=value`, their arguments, and malformed values.
+# Calls in which "@" stands for `argument=value`, names of arguments, and malformed values of them.
 ARGUMENTS = (
     (HIT, ("ball_pos", "ball_vel", "target"), NOT_VECTORS),
     (HIT, ("speed", "acceleration", "body_rate", "min_height"), ("-1", "nan", "inf", "'x'", "1j")),
@@ -61,7 +61,7 @@ ARGUMENTS = (
     (FLY, ("num_steps",), NOT_SIZES[:5]),
 )
 
-# A call, and the start of the message.
+# One row a line: a call, and the start of the expected error message.
 _ROWS = """
 pj.hit.case(**{**HIT, **dict(target=(1e60, 0, 0))}) | target must be finite, got
 pj.hit.case(**{**HIT, **dict(start=(0, 0, 0.2))}) | start must be at a height >= min_height

@@ -1,14 +1,15 @@
 """Malformed options and files, which every command must reject with one line.
 
-A row is a command line, and parts of the line on the standard error stream. The names `pipe`,
-`folder`, `empty`, `junk` and `gone` are paths of these kinds.
+A row has a command line, and parts of the expected error message. The names `pipe`, `folder`,
+`empty`, `junk` and `gone` are paths: a named pipe, a folder, an empty, a damaged, a missing file.
 """
 
 TASKS = ("hit", "catch", "intercept", "block")
 HIT = "plan hit --vel -3 0.2 4 --target 4 0 0"
 CATCH = "plan catch --pos 3 0 1 --vel -3 0.2 4"
 
-# A line each: words of the command, the wrong one last, and parts of the message between dots.
+# One row a line: the words of a command, the wrong word last; and parts of the expected error
+# message, separated by "..".
 _ROWS = """
 sweep hit --num 0                            | --num must be >= 1, got 0
 sweep catch --num 1000000000000000           | --num must be at most
@@ -97,7 +98,7 @@ ROWS = [
     (tuple(words.split()), says.strip().split(" .. "))
     for words, says in (line.split("|") for line in _ROWS.strip().splitlines())
 ]
-# Options that accept a number, or one of several words; Hypothesis draws malformed values.
+# Commands, each with an option that accepts a whole number; Hypothesis draws malformed values.
 WHOLE = (
     *((f"sweep {task}", option) for task in TASKS for option in ("--num", "--batch", "--seed")),
     *((f"fly {task}", option) for task in TASKS for option in ("--num", "--batch", "--record")),

@@ -1,4 +1,4 @@
-"""Commands in this process and in others, and checks of how they end."""
+"""Functions that run commands in this process or in another, and check how the commands end."""
 
 import contextlib
 import io
@@ -17,7 +17,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 class Ended(NamedTuple):
-    """Exit code and output of a command."""
+    """Exit code, standard output and standard error of a command."""
 
     code: int
     out: str
@@ -25,7 +25,7 @@ class Ended(NamedTuple):
 
 
 def run(*arguments: str | Path) -> Ended:
-    """Run a command in this process, which has no signal handlers."""
+    """Run a command of `planner-jax` in this process, without the command's signal handlers."""
     out, err = io.StringIO(), io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         try:
@@ -43,7 +43,7 @@ def start(
     blocks: int | None = None,
     cores: int | None = None,
 ) -> subprocess.Popen:
-    """Start a command of `module` on some cores, with files of at most `blocks` KiB."""
+    """Start `python -m module` with arguments, on random cores, with files of at most some KiB."""
     path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
     environment = {"PYTHONFAULTHANDLER": "1", "PYTHONPATH": path}
     if cache:
@@ -76,7 +76,7 @@ def wait_for(process: subprocess.Popen, within: float = 300.0) -> Ended:
 
 
 def wait_until_listening(process: subprocess.Popen) -> None:
-    """Wait until a command handles SIGTERM, or has ended."""
+    """Wait until a command has installed its handler of SIGTERM, or has ended."""
     caught = 0
     while process.poll() is None and not caught & 1 << signal.SIGTERM - 1:
         time.sleep(0.01)
@@ -86,7 +86,7 @@ def wait_until_listening(process: subprocess.Popen) -> None:
 
 
 def children_of(parent: int, name: str) -> list[int]:
-    """Return child processes of a process whose program has a name with this beginning."""
+    """Return the ids of a process's children whose program's name starts with `name`."""
     found = []
     for process in Path("/proc").glob("[0-9]*"):
         with contextlib.suppress(OSError):  # the process has ended meanwhile
@@ -98,13 +98,13 @@ def children_of(parent: int, name: str) -> list[int]:
 
 
 def is_one_line(ended: Ended) -> bool:
-    """Return whether a command failed with one line of its own as its only output."""
+    """Return whether a command ended with code 1 or 2 and one error line as its only output."""
     said = ended.err.startswith("planner-jax: error: ") and ended.err.count("\n") == 1
     return ended.code in (1, 2) and said and ended.out == ""
 
 
 def is_stopped(ended: Ended, number: int) -> bool:
-    """Return whether a signal ended a command with its code and a line, without a traceback."""
+    """Return whether a command ended by the signal `number` with its exit code and one line."""
     words = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated", signal.SIGHUP: "hung up"}
     last = ended.err.rstrip("\n").rpartition("\n")[2]
     said = last.startswith(f"planner-jax: {words[signal.Signals(number)]}; ")

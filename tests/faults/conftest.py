@@ -1,4 +1,4 @@
-"""Small runs for all modules of the folder."""
+"""Fixtures of the tests that inject faults into small runs."""
 
 from pathlib import Path
 
@@ -14,7 +14,7 @@ set_hypothesis_home_dir(Path(__file__).resolve().parents[2] / ".cache" / "hypoth
 
 @pytest.fixture(scope="package")
 def runs(tmp_path_factory):
-    """Provide the runs of `make_runs`, with quick sweeps as long as they are used."""
+    """Write the runs of `make_runs`, and let sweeps use quick planners while tests use the runs."""
     place = tmp_path_factory.mktemp("faults")
     with quick_sweeps():
         make_runs(place)
@@ -23,5 +23,5 @@ def runs(tmp_path_factory):
 
 @pytest.fixture
 def own_checks(monkeypatch):
-    """Turn off the type checks of the tests, so that the library checks arguments itself."""
+    """Disable the tests' type checks (`typecheck`), so that the library's own checks are tested."""
     monkeypatch.setattr(typecheck, "is_on", False)

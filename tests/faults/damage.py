@@ -1,11 +1,11 @@
-"""Damage to files: flipped bits, cut ends, swapped values, deep nesting."""
+"""Functions that damage a file: flipped bits, cut ends, replaced values, deep nesting."""
 
 import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-# Values that do not fit.
+# Values with which `swap` replaces a value of a JSON file; most have a wrong type or range.
 ODD = (None, True, -1, 0, 10**400, 1.5, float("nan"), float("inf"), "", "x", [], {}, [[]], {"a": 1})
 
 
@@ -22,7 +22,7 @@ def cut(content: bytes, random: Any) -> bytes:
 
 
 def overwrite(content: bytes, random: Any) -> bytes:
-    """Overwrite a stretch with zeros, or with another part of the file."""
+    """Overwrite 1 to 64 bytes with zeros, or with bytes from another part of the file."""
     length = random.randrange(1, 65)
     place, other = (random.randrange(len(content)) for _ in range(2))
     stretch = random.choice((bytes(length), content[other : other + length]))
@@ -39,7 +39,7 @@ def nest(content: bytes, random: Any) -> bytes:
 
 
 def swap(content: bytes, random: Any) -> bytes:
-    """Replace a value of a JSON object at any depth by an odd one, or remove an entry."""
+    """Replace one value, at any depth of a JSON object, by an entry of ODD; or remove an entry."""
     lines = content.decode().splitlines()
     if not _is_json(lines[0]):  # one object in the whole file
         lines = [content.decode()]
@@ -72,7 +72,7 @@ OF_JSON = (*ANY, nest, swap)
 
 
 def damage(path: Path, random: Any) -> str:
-    """Damage a file, and return the name of the damage."""
+    """Damage a file by a random function of this module, and return the function's name."""
     kinds = OF_JSON if path.suffix in (".json", ".jsonl") else ANY
     kind = random.choice(kinds)
     path.write_bytes(kind(path.read_bytes(), random))

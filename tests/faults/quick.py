@@ -1,4 +1,4 @@
-"""The command `planner-jax` whose sweeps compile one small program a task.
+"""The command `planner-jax` with quick planners: a sweep compiles one small program for its task.
 
 python -m tests.faults.quick sweep hit ...
 """
@@ -12,7 +12,7 @@ from planner_jax.host import signals
 
 @contextlib.contextmanager
 def quick_sweeps(is_reported: bool = False) -> Iterator[None]:
-    """Plan hits and catches in one round, and draw nothing or, if reported, one figure."""
+    """Let sweeps plan in one round, with a second planner and a figure only if `is_reported`."""
     import pytest
 
     from planner_jax.sweep.catch.sweep import CatchSweep
@@ -30,7 +30,7 @@ def quick_sweeps(is_reported: bool = False) -> Iterator[None]:
 
 
 def run() -> None:
-    """Carry out the command of the process's arguments by quick planners."""
+    """Run the command that the process's arguments state, with quick planners."""
     signals.listen()  # as the command itself does, before anything large is imported
     from planner_jax.cli import main as cli
 

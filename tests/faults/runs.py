@@ -1,4 +1,4 @@
-"""Small runs to be damaged, and checks of what their readers do with the damage."""
+"""Small runs whose files tests damage, and checks of what readers of the files do then."""
 
 import contextlib
 import dataclasses
@@ -38,7 +38,7 @@ IDENTICAL, REFUSED, MENDED = "identical", "refused", "mended"
 
 
 def make_runs(place: Path) -> None:
-    """Write two finished sweeps, an interrupted one, flights, a training and plans."""
+    """Write run folders: two finished sweeps, an interrupted sweep, flights, a training, plans."""
     start_sweep(TASK, SETTINGS, place / "whole", progress=False)
     other = dataclasses.replace(SETTINGS, seed=4)
     start_sweep(TASK, other, place / "other", progress=False)
@@ -53,7 +53,7 @@ def make_runs(place: Path) -> None:
 
 
 def make_flights(out: Path) -> None:
-    """Write a folder like a run of flights."""
+    """Write a run folder of simulated flights with invented content."""
     manifest = {
         **{"kind": "fly catch", "state": "complete", "seed": 0},
         "parameters": dataclasses.asdict(CatchFly()),
@@ -71,7 +71,7 @@ def make_flights(out: Path) -> None:
 
 
 def make_training(out: Path) -> None:
-    """Write a folder from which curves are drawn."""
+    """Write a folder of a policy's training with invented rows of its learning curve."""
     out.mkdir()
     (out / "training.json").write_text(json.dumps(to_write({"suites": ["throws"], "seed": 0})))
     names = ("per_second", "reward", "solved", "last", "ratio", "violation")
@@ -80,7 +80,10 @@ def make_training(out: Path) -> None:
 
 
 def verdict(place: Path, target: str, name: str, random: Any, scratch: Path) -> str:
-    """Damage a file of a copy of the run in `target`, "RUN:READER", and return the outcome."""
+    """Damage a file, named by a pattern, in a copy of the run of `target`, "RUN:READER".
+
+    Return the reader's outcome, IDENTICAL, REFUSED or MENDED; otherwise raise `AssertionError`.
+    """
     which, _, reader = target.partition(":")
     shutil.copytree(place / which, scratch)
     path = random.choice(sorted(scratch.glob(name)))
@@ -120,7 +123,7 @@ def _resume(place: Path, out: Path) -> str | None:
 
 
 def _view(place: Path, out: Path) -> str | None:
-    """Record what the viewer would show."""
+    """Run the command `view` with a replaced viewer; return the outcome, None for wrong flights."""
     shown: list[Any] = []
     with pytest.MonkeyPatch.context() as patch:
         viewer = SimpleNamespace(Viewer=lambda _, found, *__: shown.append(found) or _Shut())
@@ -137,12 +140,12 @@ def _view(place: Path, out: Path) -> str | None:
 
 
 class _Shut:
-    """A viewer that closes at once."""
+    """A replacement of the flight viewer, which ends immediately."""
 
     url = "nowhere"
 
     def run(self) -> None:
-        """Stop at once."""
+        """Return immediately."""
 
 
 def _curves(place: Path, out: Path) -> str | None:
@@ -171,7 +174,7 @@ def _load(place: Path, out: Path) -> str | None:
 
 
 _READERS = {"report": _report, "resume": _resume, "view": _view, "curves": _curves, "load": _load}
-# Kind of damage -> runs with their reader, and files.
+# Name of the damaged files -> pairs of "RUN:READER" and a pattern of files in the run's folder.
 TARGETS = {
     "manifest": [("whole:report", "manifest.json"), ("whole:resume", "manifest.json")],
     "manifest of an interrupted run": [("begun:resume", "manifest.json")],
@@ -184,5 +187,4 @@ TARGETS = {
 
 
 def copy_run(place: Path, which: str, under: Path) -> Path:
-    """Copy a run into a folder."""
     return Path(shutil.copytree(place / which, under / which))

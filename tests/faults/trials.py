@@ -1,4 +1,4 @@
-"""Trials of faults on runs: each kills, doubles, damages or interrupts a number of them."""
+"""Trials: functions that each inject one kind of fault into a number of runs."""
 
 import contextlib
 import os
@@ -30,7 +30,7 @@ QUICK = "tests.faults.quick"
 SWEEPS = {
     "hit": ("hit", "--num", "200", "--batch", "32", "--seed", "5"),
     "catch": ("catch", "--suite", "parabola2", "--num", "96", "--batch", "16", "--seed", "5"),
-    # Workers of a cluster plan by the real planner.
+    # Ray workers do not use the quick planners of this process, but the library's own planner.
     "many": ("hit", "--planner", "juggle", "--num", "20000", "--batch", "500", "--seed", "5"),
 }
 Outcome = tuple[bool, str]  # whether a run survived, and a word on how
@@ -39,11 +39,11 @@ sweep = partial(start, "sweep", module=QUICK)
 
 
 class Trial(NamedTuple):
-    """One kind of fault."""
+    """One kind of fault: its name, and the function that injects it."""
 
     name: str
     words: str  # of the table
-    # Tries a number of faults in an empty folder, beside the folder of undisturbed runs.
+    # Takes a random generator, a number of faults, an empty folder, and one of undisturbed runs.
     run: Callable[[random.Random, int, Path, Path], Survived]
     num: int
     most: int  # faults that one process tries
@@ -51,7 +51,10 @@ class Trial(NamedTuple):
 
 
 def kill(name: str, moment: random.Random, num: int, place: Path, base: Path) -> Survived:
-    """Send SIGKILL at random moments of a sweep and of what resumes it, until it is finished."""
+    """Kill a sweep, and commands that resume it, `num` times, until it is finished.
+
+    It must then have the rows of an undisturbed run.
+    """
     task, whole, out = SWEEPS[name], rows_of(base / name), place / "run"
     began, tried, took = time.monotonic(), 0, 0.0
     while tried < num or out.exists():
@@ -74,7 +77,7 @@ def kill(name: str, moment: random.Random, num: int, place: Path, base: Path) ->
 
 
 def start_twins(moment: random.Random, num: int, place: Path, base: Path) -> Survived:
-    """Start two sweeps on one folder: one is refused, the rows of the other are right."""
+    """Start two sweeps on one folder: one must be refused, and the other have correct rows."""
     for number in range(num):
         out = place / str(number)
         pair = [sweep(*SWEEPS["hit"], "--out", out, cwd=place)]
@@ -120,7 +123,7 @@ def kill_workers(moment: random.Random, num: int, place: Path, base: Path) -> Su
 
 
 def damage_files(what: str, moment: random.Random, num: int, place: Path, base: Path) -> Survived:
-    """Damage a file of a run, and check what its readers say."""
+    """Damage files of the kind `what` (a key of TARGETS), and yield what a reader does then."""
     from tests.faults.runs import TARGETS, verdict  # needs the simulators
 
     with quick_sweeps():
@@ -133,9 +136,9 @@ def damage_files(what: str, moment: random.Random, num: int, place: Path, base: 
 
 
 def interrupt(moment: random.Random, num: int, place: Path, base: Path) -> Survived:
-    """Send SIGINT, SIGTERM or SIGHUP at random moments, a third of them thrice in a row.
+    """Send SIGINT, SIGTERM or SIGHUP to sweeps at random moments, in a third of trials thrice.
 
-    Every second sweep has to compile. Sweeps that have ended before the signal do not count.
+    Every second sweep compiles its program. Sweeps that end before the signal are not counted.
     """
     tried = 0
     while tried < num:
@@ -166,7 +169,7 @@ def interrupt(moment: random.Random, num: int, place: Path, base: Path) -> Survi
 
 
 def fill_disk(limits: random.Random, num: int, place: Path, base: Path) -> Survived:
-    """Limit the size of files between the smallest and the largest, then lift the limit."""
+    """Run sweeps whose files may not exceed a random size, and resume them without this limit."""
     whole = base / "hit"
     largest = max(path.stat().st_size for path in (whole / "plans").iterdir())
     for number in range(num):
@@ -216,7 +219,7 @@ TRIALS = [
 
 
 def make_whole(name: str, base: Path) -> None:
-    """Write the undisturbed runs that trials compare with; their programs are cached then."""
+    """Write the undisturbed run `name` (all small runs for ""), with which trials compare runs."""
     if not name:
         from tests.faults.runs import make_runs  # needs the simulators
 
@@ -228,7 +231,7 @@ def make_whole(name: str, base: Path) -> None:
 
 
 def try_some(place: int, part: int, num: int, base: Path) -> list[Outcome]:
-    """Return the outcomes of one part of the faults of `TRIALS[place]`."""
+    """Inject `num` faults of the kind `TRIALS[place]`; `part` seeds their random choices."""
     with tempfile.TemporaryDirectory(prefix="faults-") as folder:
         moment = random.Random(f"{TRIALS[place].name} {part}")
         return list(TRIALS[place].run(moment, num, Path(folder), base))

@@ -1,8 +1,8 @@
-"""A task from outside the library: a point mass in the plane meets a point that moves on.
+"""A task from outside the library: a point mass in the plane meets a point in uniform motion.
 
-The robot is a double integrator whose acceleration changes evenly, a(t) = b + c t, and may not
-exceed a limit. To be found are the meeting time and b; c follows from them, so that every plan
-meets the target. The earliest is wanted.
+The robot is a double integrator with the acceleration a(t) = b + c t, whose magnitude is limited.
+The decision variables are the meeting time and b. The vector c follows from them, so that every
+plan meets the target. The planner minimises the meeting time.
 """
 
 import dataclasses
@@ -19,7 +19,7 @@ import planner_jax as pj
 
 @struct.dataclass
 class MeetCase:
-    """One case. World frame in the plane, SI units; times count from the start of planning."""
+    """The states of robot and target at time 0, and the limit; world frame in the plane."""
 
     pos: Array  # (2,) [m], of the robot
     vel: Array  # (2,) [m/s]
@@ -39,7 +39,7 @@ class MeetPlan(pj.Plan):
 
 
 def plan_at(point, case: MeetCase) -> tuple:
-    """Time and acceleration that a point (3,) describes: log time, acceleration at the start."""
+    """Return time, and accelerations (2, 2) at both ends, from log time and first acceleration."""
     time, first = jnp.exp(point[0]), point[1:]
     way = case.target_pos - case.pos + (case.target_vel - case.vel) * time
     last = 6.0 * way / time**2 - 2.0 * first  # way = (2 first + last) time^2 / 6
@@ -47,14 +47,14 @@ def plan_at(point, case: MeetCase) -> tuple:
 
 
 def excess(acc: Array, case: MeetCase) -> Array:
-    """Largest relative excess of the acceleration, (2,): it is largest at one of the ends."""
+    """Return relative excesses (2,) of both ends' accelerations, one of which is the greatest."""
     return jnp.sqrt(jnp.sum(acc**2, axis=1) + 1e-12) / case.most - 1.0
 
 
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class SmoothMeet(pj.OptimisedPlanner):
-    """By the library's L-BFGS, the limit as a penalty with a margin."""
+    """A planner that minimises by L-BFGS, with a penalty that starts a margin below the limit."""
 
     case_type = MeetCase
     weight: float = 30.0
@@ -81,7 +81,7 @@ class SmoothMeet(pj.OptimisedPlanner):
 
 @dataclasses.dataclass(frozen=True)
 class ScipyMeet(pj.Planner):
-    """By SciPy's SLSQP on the host, one case after another."""
+    """A planner that calls SciPy's SLSQP on the host for one case after another."""
 
     case_type = MeetCase
 
@@ -109,7 +109,7 @@ class MeetVerdict(pj.Verdict):
 
 
 def judge(cases: MeetCase, plans: MeetPlan) -> MeetVerdict:
-    """The referee: flies every plan of a batch in 400 float64 steps and looks where it ends."""
+    """Integrate each plan in 400 float64 steps, and judge its end and its acceleration."""
     case, plan = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), (cases, plans))
     pos, vel, step = case.pos, case.vel, plan.time[:, None] / 400
     for k in range(400):  # the midpoint rule is exact for a velocity that bends evenly, to 1e-5

@@ -43,7 +43,7 @@ def _arm(xml: str) -> Any:
 
 
 def lanes_of(arm: Arm) -> dict[str, np.ndarray]:
-    """Return one arm as a batch of one, in arrays that the referee's kinematics accepts."""
+    """Return an arm's geometry as a batch of one, by names that the referee's kinematics needs."""
     names = ("origin", "turn", "axis", "shield_centre")
     return {f"arm.{name}": np.asarray(getattr(arm, name), float)[None] for name in names}
 
