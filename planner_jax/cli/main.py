@@ -3,7 +3,6 @@
 import functools
 import sys
 import warnings
-from argparse import SUPPRESS
 from collections.abc import Callable, Sequence
 
 from planner_jax.cli import runs, single
@@ -81,9 +80,9 @@ def _make_parser() -> Parser:
                 # `fill` imports the module of the task's settings, which is slow. The parser calls
                 # it for the requested task only.
                 fill = functools.partial(add, task)
-                tasks.add_parser(task.name, help=task.summary, fill=fill, argument_default=SUPPRESS)
+                tasks.add_parser(task.name, help=task.summary, fill=fill)
     words = "train a policy that decides about catches"
-    commands.add_parser("train", help=words, fill=runs.add_train, argument_default=SUPPRESS)
+    commands.add_parser("train", help=words, fill=runs.add_train)
     library = commands.add_parser("library", help="stored motions that the block planner looks up")
     runs.add_library(library)
     view = command("view", "play a run's flights in a browser", runs.view)
@@ -101,18 +100,18 @@ def _make_parser() -> Parser:
     served = serve.add_subparsers(title="tasks", required=True, metavar="task")
     for name, kind in SERVED.items():
         fill = functools.partial(single.add_serve, kind)
-        served.add_parser(name, help=task_named(name).summary, fill=fill, argument_default=SUPPRESS)
+        served.add_parser(name, help=task_named(name).summary, fill=fill)
     words = "compare runs, and list the cases that only some of them solve"
     compare = command("compare", words, runs.compare)
     compare.add_argument("runs", nargs="+", metavar="RUN", help="folders of finished sweeps")
     compare.add("--all", action="store_true", help="list all cases that differ, not ten")
     compare.add("--out", metavar="FILE", help="new file, .csv, for the comparison as a table")
     words = "write a plan for a controller, or send it in real time"
-    commands.add_parser("export", help=words, fill=single.add_export, argument_default=SUPPRESS)
+    commands.add_parser("export", help=words, fill=single.add_export)
     bench = commands.add_parser("bench", help="measure this machine")
     kinds = bench.add_subparsers(title="benchmarks", required=True, metavar="benchmark")
     words = "plans a second, with success and cost"
-    kinds.add_parser("throughput", help=words, fill=runs.add_throughput, argument_default=SUPPRESS)
+    kinds.add_parser("throughput", help=words, fill=runs.add_throughput)
     doctor = command("doctor", "versions, devices, precision, cache and a timed plan", _doctor)
     words = "list the compiled programs of every default planner instead, in some minutes"
     doctor.add("--compile", action="store_true", help=words)

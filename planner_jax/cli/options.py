@@ -9,6 +9,7 @@ import dataclasses
 import re
 import sys
 import typing
+from argparse import SUPPRESS
 from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, NoReturn
@@ -43,13 +44,15 @@ class Parser(argparse.ArgumentParser):
     """An argument parser that reports a bad argument in one line.
 
     Args:
-        fill: function that adds the parser's options; it is called when the parser is used.
+        fill: function that adds the parser's options; it is called when the parser is used. Options
+            that the user leaves out are then missing in the result, instead of None.
         **look: further arguments of `argparse.ArgumentParser`.
     """
 
-    def __init__(self, *, fill: Callable[["Parser"], None] = lambda parser: None, **look: Any):
+    def __init__(self, *, fill: Callable[["Parser"], None] | None = None, **look: Any):
         shape = partial(argparse.RawDescriptionHelpFormatter, max_help_position=28, width=100)
-        super().__init__(**{"formatter_class": shape, "allow_abbrev": False, **look})
+        look = {"formatter_class": shape, "allow_abbrev": False, **look}
+        super().__init__(**look if fill is None else {**look, "argument_default": SUPPRESS})
         self._fill, self._flags = fill, {}
         # A word that matches this pattern is a negative number and not an option. The pattern that
         # argparse uses by default does not match numbers with an exponent, such as -1e3.
@@ -57,7 +60,8 @@ class Parser(argparse.ArgumentParser):
 
     def parse_known_args(self, *arguments: Any, **how: Any) -> Any:
         """Add the parser's options, then parse; the result's `flags` map arguments to options."""
-        self._fill(self)
+        if self._fill is not None:
+            self._fill(self)
         self.set_defaults(flags=self._flags)
         return super().parse_known_args(*arguments, **how)
 
@@ -95,14 +99,12 @@ def add_settings(parser: Parser, kind: Any, task: Task | None = None) -> None:
         default = defaults.get(field.name) if default is None else default
         how: Options = {"action": "store_true"}
         if not isinstance(default, bool):
-            if default not in (None, (), dataclasses.MISSING) and "(default:" not in words:
-                shown = default
-                if isinstance(default, tuple):
-                    shown = " ".join(f"{x:g}" for x in default)
-                words += f" (default: {shown})"
             how = {"type": _type_of(hints[field.name]), **_form_of(field)}
+            shown = default
             if isinstance(default, tuple):
-                how = {"nargs": "+", **how}
+                shown, how = " ".join(f"{x:g}" for x in default), {"nargs": "+", **how}
+            if default not in (None, (), dataclasses.MISSING) and "(default:" not in words:
+                words += f" (default: {shown})"
         parser.add(f"--{field.name.replace('_', '-')}", help=words, **how)
 
 

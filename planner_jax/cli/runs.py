@@ -80,10 +80,8 @@ def add_fly(task: Task, parser: Parser) -> None:
     add_settings(parser, kind, task)
     recordings = "number of flights recorded for `planner-jax view`, the first ones (default: 16)"
     parser.add("--record", type=int, metavar="K", help=recordings)
-    film = (
-        "film the first three of these into the run folder, .gif, or .mp4 if ffmpeg is "
-        "installed (default name: flights.gif)"
-    )
+    film = "film the first three of these into the run folder, .gif, or .mp4 if ffmpeg is installed"
+    film += " (default name: flights.gif)"
     parser.add("--video", nargs="?", const="flights.gif", metavar="FILE", help=film)
     parser.add("--out", metavar="DIR", help=f"run folder (default: runs/fly-{task.name}-DATE-TIME)")
     parser.set_defaults(command=lambda given: _fly(task, kind, given))
@@ -128,9 +126,7 @@ def _train(given: Options) -> None:
         from planner_jax.policies.training import train_from_settings
     except ModuleNotFoundError as error:
         raise MissingExtra("train", error.name, "policies") from None
-    remainder = partial(
-        _how_to_continue, Path(out), f"continue with: {_quote_command()}", "training.json"
-    )
+    remainder = partial(_how_to_continue, Path(out), _repeat_command(), "training.json")
     with stopping.under_way(remainder), _tell_how_to_continue(remainder):
         train_from_settings(settings, out)
     print(f"{Path(out) / 'policy.npz'}")
@@ -209,8 +205,8 @@ def _name_run_folder(name: str) -> str:
     return os.path.join("runs", f"{name}-{datetime.datetime.now():%Y%m%d-%H%M%S}")
 
 
-def _quote_command() -> str:
-    return shlex.join(["planner-jax", *sys.argv[1:]])
+def _repeat_command() -> str:
+    return f"continue with: {shlex.join(['planner-jax', *sys.argv[1:]])}"
 
 
 def _how_to_continue(out: Path, again: str, sign: str = "manifest.json") -> str:
@@ -251,7 +247,7 @@ def _library(name: str, given: Options) -> None:
     keep_compiled_programs()
     run = pkgutil.resolve_name(f"planner_jax.baselines.block.library.command:{name}_library")
     parts = Path(f"{given['path']}.parts")
-    remainder = partial(_how_to_continue, parts, f"continue with: {_quote_command()}", "what.json")
+    remainder = partial(_how_to_continue, parts, _repeat_command(), "what.json")
     rule = "FILE must be one that can be written"
     with stopping.under_way(remainder, patient=False), _tell_how_to_continue(remainder, rule):
         run(**given)

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from planner_jax.cli.options import FAILED, Options, Parser, add_settings, pop_out
-from planner_jax.core.choices import CHOICES
+from planner_jax.core.choices import CHOICES, require
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.registry import Task
 from planner_jax.host import signals as stopping
@@ -21,7 +21,7 @@ from planner_jax.runs.environment import require_backend
 from planner_jax.runs.settings import recovery_options
 
 if TYPE_CHECKING:
-    from planner_jax.cli.plan.answer import Answer
+    from planner_jax.cli.plan.answer import Answer, Single
     from planner_jax.core.protocol import Plan
     from planner_jax.core.rules import Case
 
@@ -41,8 +41,7 @@ def add_plan(task: Task, parser: Parser) -> None:
 def _plan(task: Task, given: Options) -> int:
     out, rate = pop_out(given), given.pop("rate", None)
     settings = pkgutil.resolve_name(str(task.single))(**given).of(task)
-    if rate is not None and out is None:
-        raise ArgumentError("rate", "left out without --out", rate)
+    require(rate is None or out is not None, "rate", "left out without --out", rate)
     if out is not None and (problem := new_file_problem(out)):
         raise ArgumentError("out", problem.replace("file", "folder"), out)
     require_backend()
@@ -55,13 +54,11 @@ def _plan(task: Task, given: Options) -> int:
         setpoints_of(answer.plan, rate)  # raises an error if the plan does not allow this rate
     print("\n".join(single.describe(answer)))
     if out is not None:
-        _write_answer(task, settings.planner, answer, Path(out), rate)
+        _write_answer(single, answer, Path(out), rate)
     return 0 if answer.success else FAILED
 
 
-def _write_answer(
-    task: Task, planner: str, answer: "Answer", out: Path, rate: float | None
-) -> None:
+def _write_answer(single: "Single", answer: "Answer", out: Path, rate: float | None) -> None:
     from planner_jax.cli.plan.answer import write_pictures
     from planner_jax.export.api import export
 
@@ -70,10 +67,9 @@ def _write_answer(
     answer.plan.save(written[0])
     if answer.success:
         # A plan that has a recovery trajectory already is exported unchanged with "brake".
-        recovery = None if answer.plan.recovery is None else "brake"
-        how = {"rate": rate, "recovery": recovery}
+        how = {"rate": rate, "recovery": None if answer.plan.recovery is None else "brake"}
         written.append(export(answer.plan, to="csv", out=out / "setpoints.csv", **how))
-    written += write_pictures(task, planner, answer, out)
+    written += write_pictures(single.task, str(single.settings.planner), answer, out)
     print("\n" + "\n".join(map(str, written)))
 
 
@@ -170,8 +166,7 @@ def _serve(settings: ServeSettings) -> None:
     compute_in_place()
     require_backend()
     keep_compiled_programs()
-    names = ("rate", "horizon", "deadline", "noise")
-    options = {name: vars(settings)[name] for name in names}
+    options = {name: vars(settings)[name] for name in ("rate", "horizon", "deadline", "noise")}
     server = Server(LivePlanner(settings.stroke(), **options), settings.port)
     print("Compiling the planner.", file=sys.stderr, flush=True)
     server.warm_up()

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import BinaryIO
 
-from planner_jax.core.choices import RECOVERIES, require_one_of
+from planner_jax.core.choices import RECOVERIES, require, require_one_of
 from planner_jax.core.errors import (
     ArgumentError,
     MissingExtra,
@@ -18,7 +18,7 @@ from planner_jax.core.errors import (
 )
 from planner_jax.core.protocol import Plan
 from planner_jax.core.rules import Case
-from planner_jax.export.setpoints import DEFAULT_RATE, robot_of
+from planner_jax.export.setpoints import DEFAULT_RATE, require_one, robot_of
 from planner_jax.host.files import new_file_problem, replacing
 from planner_jax.recovery.after_plan import append_recovery, is_rested
 from planner_jax.robot.quadrotor import QuadrotorPlan
@@ -130,18 +130,11 @@ def stream(
 ) -> int:
     """Send one plan to a UDP port of this machine, in real time; return the number of messages.
 
-    Args:
-        plan: one solved plan of a quadrotor.
-        to: "px4", the only format that can be sent as messages.
-        udp: number of the port.
-        rate: messages per second [Hz], 100 by default.
-        recovery: see `export`.
-        case: see `export`.
+    Only the format "px4" can be sent. `udp` is the number of the port, and `rate` the number of
+    messages per second [Hz], 100 by default. Other arguments and errors are as for `export`.
 
     Raises:
-        UnknownName: no format has the name `to`.
         ArgumentError: an argument breaks a rule, or no program listens on the port.
-        MissingExtra: pymavlink is not installed.
     """
     if _require_name(to) != "px4":
         raise ArgumentError("udp", f"given for {to}, only for px4", udp, verb="not be")
@@ -176,16 +169,14 @@ def bring_to_rest(plan: Plan, recovery: str | None, case: Case | None = None) ->
     require_one_of(RECOVERIES, "recovery", recovery)
     if is_rested(plan):
         return plan
-    if robot.name != "quadrotor" and recovery != "brake":
-        raise ArgumentError("recovery", "brake, as only quadrotors go home", recovery)
+    can_stop = robot.name == "quadrotor" or recovery == "brake"
+    require(can_stop, "recovery", "brake, as only quadrotors go home", recovery)
     if case is None:
         rule = "given, whose limits the recovery trajectory keeps, or recovery=None to omit it"
         raise ArgumentError("case", rule, shown="neither")
-    if robot.case_field not in vars(case):
-        raise ArgumentError("case", f"the case of a {robot.name}", shown=type(case).__name__)
-    if case.batch_shape != ():
-        shown = f"a batch of shape {case.batch_shape}"
-        raise ArgumentError("case", "one, as pj.take(cases, k) gives", shown=shown)
+    is_robots = robot.case_field in vars(case)
+    require(is_robots, "case", f"the case of a {robot.name}", shown=type(case).__name__)
+    require_one("case", "cases", case.batch_shape)
     try:
         return append_recovery(case, plan, recovery)
     except NoRecovery as error:
@@ -209,9 +200,9 @@ def _require_name(to: str) -> str:
 
 def _require_format(to: str, plan: Plan) -> Format:
     form, robot = FORMATS[_require_name(to)], robot_of(plan)
-    if robot.name not in form.robots:
-        rule = f"a format for plans of the {robot.name}"
-        raise ArgumentError("to", rule, shown=f"{to!r}, which is for {', '.join(form.robots)}")
+    shown = f"{to!r}, which is for {', '.join(form.robots)}"
+    fits, rule = robot.name in form.robots, f"a format for plans of the {robot.name}"
+    require(fits, "to", rule, shown=shown)
     return form
 
 

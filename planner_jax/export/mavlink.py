@@ -8,6 +8,7 @@ from typing import BinaryIO
 
 from pymavlink.dialects.v20 import common
 
+from planner_jax.core.choices import require
 from planner_jax.core.errors import ArgumentError
 from planner_jax.export.px4 import trajectory_setpoints
 from planner_jax.export.setpoints import DEFAULT_RATE
@@ -22,20 +23,14 @@ _NO_FIELD_IGNORED = 0  # type mask of a message in which every field is valid
 def packets(plan: QuadrotorPlan, rate: float) -> Iterator[tuple[int, bytes]]:
     """Yield for each setpoint its time [us] since the plan's start, and its MAVLink 2 packet."""
     fields = trajectory_setpoints(plan, rate)
-    if rate > FASTEST:
-        raise ArgumentError("rate", f"at most {FASTEST:g} for MAVLink", rate)
+    require(rate <= FASTEST, "rate", f"at most {FASTEST:g} for MAVLink", rate)
     sender = common.MAVLink(None, srcSystem=_SENDER)
-    for stamp, position, velocity, acceleration, _, yaw, yawspeed in zip(
-        *(values.tolist() for values in fields.values()), strict=True
-    ):
-        message = sender.set_position_target_local_ned_encode(
-            round(stamp / 1000),
-            _VEHICLE,
-            _AUTOPILOT,
-            common.MAV_FRAME_LOCAL_NED,
-            _NO_FIELD_IGNORED,
-            *(*position, *velocity, *acceleration, yaw, yawspeed),
-        )
+    target = (_VEHICLE, _AUTOPILOT, common.MAV_FRAME_LOCAL_NED, _NO_FIELD_IGNORED)
+    columns = [values.tolist() for values in fields.values()]
+    for stamp, position, velocity, acceleration, _, yaw, yawspeed in zip(*columns, strict=True):
+        numbers = (*position, *velocity, *acceleration, yaw, yawspeed)
+        time_ms = round(stamp / 1000)
+        message = sender.set_position_target_local_ned_encode(time_ms, *target, *numbers)
         yield stamp, bytes(message.pack(sender))
         sender.seq = (sender.seq + 1) % 256
 
@@ -48,8 +43,8 @@ def write_tlog(plan: QuadrotorPlan, rate: float, file: BinaryIO) -> None:
 
 def stream(plan: QuadrotorPlan, port: int, rate: float = DEFAULT_RATE) -> int:
     """Send a plan's packets to a UDP port of this machine in real time; return their number."""
-    if isinstance(port, bool) or not isinstance(port, int) or not 0 < port < 2**16:
-        raise ArgumentError("udp", f"a port from 1 to {2**16 - 1}", port)
+    is_port = isinstance(port, int) and not isinstance(port, bool) and 0 < port < 2**16
+    require(is_port, "udp", f"a port from 1 to {2**16 - 1}", port)
     ready = list(packets(plan, rate))
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
         out.connect(("127.0.0.1", port))

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 import jax
 import numpy as np
 
+from planner_jax.core.choices import require
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.plan_files import PlanFileError, leaves_by_name, load_fitting
 from planner_jax.core.protocol import Plan, Status, is_solved, take
@@ -62,20 +63,22 @@ def robot_of(plan: Plan) -> Robot:
     """Return the kind of robot of a plan; raise `ArgumentError` if the plan cannot be exported."""
     robot = next((robot for robot in ROBOTS if isinstance(plan, robot.plan)), None)
     if robot is None:
-        names = ", ".join(robot.name for robot in ROBOTS)
-        raise ArgumentError(
-            "plan", f"the plan of a robot ({names})", shown=f"a {type(plan).__name__}"
-        )
-    if np.ndim(plan.status) != 0:
-        shown = f"a batch of shape {np.shape(plan.status)}"
-        raise ArgumentError("plan", "one, as pj.take(plans, k) gives", shown=shown)
-    if not is_solved(plan.status):
-        shown = [f"{each.name}: {each.message}" for each in Status if each == plan.status]
-        raise ArgumentError("plan", "solved", shown=f"the status {(*shown, plan.status)[0]}")
+        rule = f"the plan of a robot ({', '.join(robot.name for robot in ROBOTS)})"
+        raise ArgumentError("plan", rule, shown=f"a {type(plan).__name__}")
+    require_one("plan", "plans", np.shape(plan.status))
+    shown = [f"{each.name}: {each.message}" for each in Status if each == plan.status]
+    solved = bool(is_solved(plan.status))
+    require(solved, "plan", "solved", shown=f"the status {(*shown, plan.status)[0]}")
     _require_shapes(plan, robot)
     if not 0.0 < robot.end(plan) < np.inf:
         raise ArgumentError("plan", "some time", verb="take", shown=f"{robot.end(plan):g} s")
     return robot
+
+
+def require_one(name: str, all_of: str, shape: tuple[int, ...]) -> None:
+    """Raise `ArgumentError` unless an argument with this batch shape is one of `all_of` plans."""
+    shown = f"a batch of shape {shape}"
+    require(shape == (), name, f"one, as pj.take({all_of}, k) gives", shown=shown)
 
 
 def _require_shapes(plan: Plan, robot: Robot) -> None:
@@ -101,16 +104,14 @@ def setpoints_of(plan: Plan, rate: float) -> Setpoints:
     """
     end = robot_of(plan).end(plan)
     low, high = 1.0 / end, (MOST - 1) / end
-    if isinstance(rate, str | bool) or np.ndim(rate) != 0:
-        raise ArgumentError("rate", "a number", rate)
-    if not low * (1.0 - 1e-6) <= rate <= high:
-        rule = f"from {low:.4g} to {high:.4g} for a plan of {end:.4g} s"
-        raise ArgumentError("rate", rule, rate)
+    is_number = not isinstance(rate, str | bool) and np.ndim(rate) == 0
+    require(is_number, "rate", "a number", rate)
+    rule = f"from {low:.4g} to {high:.4g} for a plan of {end:.4g} s"
+    require(bool(low * (1.0 - 1e-6) <= rate <= high), "rate", rule, rate)
     assert isinstance(plan, QuadrotorPlan | CarPlan | ArmPlan)
     setpoints = plan.sample(rate)
     for name, values in vars(setpoints).items():
-        if not np.isfinite(values).all():
-            raise ArgumentError("plan", "finite", shown=f"{name} that is not")
+        require(bool(np.isfinite(values).all()), "plan", "finite", shown=f"{name} that is not")
     return setpoints
 
 
@@ -120,8 +121,8 @@ def pieces_of(plan: QuadrotorPlan) -> PiecewisePolynomial:
     path = jax.tree.map(np.asarray, plan.whole)
     coeffs, durations = path.coeffs, path.durations
     taken = durations != 0.0
-    if not (np.isfinite(coeffs[taken]).all() and (durations[taken] > 0.0).all()):
-        raise ArgumentError("plan", "finite", shown="a trajectory that is not")
+    is_sound = bool(np.isfinite(coeffs[taken]).all() and (durations[taken] > 0.0).all())
+    require(is_sound, "plan", "finite", shown="a trajectory that is not")
     return jax.tree.map(lambda leaf: leaf[taken], path)
 
 

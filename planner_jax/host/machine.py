@@ -36,9 +36,8 @@ def _of_container() -> int | None:
     try:
         most = (_CGROUP / "memory.max").read_text(encoding="ascii").strip()
         taken = int((_CGROUP / "memory.current").read_text(encoding="ascii"))
-        cached = dict(
-            line.split() for line in (_CGROUP / "memory.stat").read_text("ascii").splitlines()
-        )
+        lines = (_CGROUP / "memory.stat").read_text(encoding="ascii").splitlines()
+        cached = dict(line.split() for line in lines)
     except (OSError, ValueError):
         return None
     if most == "max":

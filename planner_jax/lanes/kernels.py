@@ -20,7 +20,7 @@ import jax.numpy as jnp
 from jax import Array
 from jax.extend.core import JaxprEqn
 
-from planner_jax.core.errors import ArgumentError
+from planner_jax.core.choices import require_one_of
 
 SWITCH = "PLANNER_JAX_KERNELS"
 
@@ -60,8 +60,7 @@ def has_gpu() -> bool:
 def is_switched_on() -> bool:
     """Return whether PLANNER_JAX_KERNELS is "on" or not set; raise if it is not on or off."""
     value = os.environ.get(SWITCH, "on")
-    if value not in ("on", "off"):
-        raise ArgumentError(SWITCH, "one of on, off", value)
+    require_one_of(("on", "off"), SWITCH, value)
     return value == "on"
 
 

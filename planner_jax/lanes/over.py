@@ -67,9 +67,8 @@ def over_lanes(function: Callable[..., Results]) -> Callable[..., Results]:
         leaves, treedef = jax.tree.flatten(args)
         lanes = leaves[0].shape[-1]
         single = [jax.ShapeDtypeStruct(leaf.shape[:-1], leaf.dtype) for leaf in leaves]
-        closed, shape = jax.make_jaxpr(function, return_shape=True)(
-            *jax.tree.unflatten(treedef, single)
-        )
+        operands = jax.tree.unflatten(treedef, single)
+        closed, shape = jax.make_jaxpr(function, return_shape=True)(*operands)
         return jax.tree.unflatten(jax.tree.structure(shape), _full_results(closed, leaves, lanes))
 
     return map_lanes

@@ -16,8 +16,9 @@ from typing import Any, Generic
 import numpy as np
 
 from planner_jax.ball.flight import BallState
-from planner_jax.core.errors import ArgumentError
+from planner_jax.core.choices import require
 from planner_jax.core.protocol import is_solved
+from planner_jax.live import packets
 from planner_jax.live.arrivals import Arrivals
 from planner_jax.live.course import (
     Course,
@@ -28,17 +29,7 @@ from planner_jax.live.course import (
     with_recovery,
     without_recovery,
 )
-from planner_jax.live.packets import (
-    BALL,
-    MOST_SETPOINTS,
-    SILENT,
-    WIDTH,
-    Fault,
-    Motion,
-    Packet,
-    answer,
-    read_request,
-)
+from planner_jax.live.packets import BALL, MOST_SETPOINTS, SILENT, WIDTH, Fault, Motion, Packet
 from planner_jax.live.report import Report
 from planner_jax.live.sight import Sight
 from planner_jax.live.strokes import CaseT, PlanT, Stroke
@@ -93,11 +84,10 @@ class LivePlanner(Generic[CaseT, PlanT]):
         deadline: float = 0.01,
         noise: float = 0.005,
     ) -> None:
-        if not 1 <= horizon <= MOST_SETPOINTS:
-            raise ArgumentError("horizon", f"from 1 to {MOST_SETPOINTS}", horizon)
+        fits = 1 <= horizon <= MOST_SETPOINTS
+        require(fits, "horizon", f"from 1 to {MOST_SETPOINTS}", horizon)
         for name, value in {"rate": rate, "deadline": deadline, "noise": noise}.items():
-            if not 0.0 < value < math.inf:
-                raise ArgumentError(name, "finite and > 0", value)
+            require(0.0 < value < math.inf, name, "finite and > 0", value)
         self.stroke, self.deadline = stroke, deadline
         self._period, self._num = 1.0 / rate, horizon
         self._gravity, self._limits = stroke.case.gravity, stroke.case.limits
@@ -142,7 +132,7 @@ class LivePlanner(Generic[CaseT, PlanT]):
         self._complete()
         report = self.report
         report.counts["packets"] += 1
-        packet = read_request(data)
+        packet = packets.read_request(data)
         if isinstance(packet, Fault):
             assert packet in SILENT
             report.faults[packet] += 1
@@ -177,8 +167,6 @@ class LivePlanner(Generic[CaseT, PlanT]):
             self.report.stages["ball"].add(taken)
         self._complete()
 
-    # Methods that use packets with a state of the robot.
-
     def _use_robot(self, packet: Packet, due: float, _: float) -> Fault:
         self._collect(due)
         pos, vel, acc = np.reshape(packet.values, (3, 3))
@@ -199,8 +187,6 @@ class LivePlanner(Generic[CaseT, PlanT]):
         course, is_within = recovery_from(state, self.stroke.pieces, self._gravity, self._limits)
         self.report.counts["hard_rests"] += not is_within
         return _Flight(course, start)
-
-    # Methods that use packets with an observation of the ball.
 
     def _use_ball(self, packet: Packet, due: float, received: float) -> Fault:
         before = self._sight.number
@@ -285,16 +271,14 @@ class LivePlanner(Generic[CaseT, PlanT]):
         old, new = (state_of(each.course, due - each.start) for each in (flight, found))
         return all(math.dist(old[k], new[k]) <= _JOIN[k] for k in range(2))
 
-    # Methods that make the packets of answers.
-
     def _pack(self, packet: Packet, fault: Fault, due: float) -> bytes:
         flight = self._flight
         if flight is None or not math.isfinite(due):
             times = (packet.sent, self._period, math.nan)
-            return answer(packet, fault, Motion.NONE, times, _NOTHING)
+            return packets.answer(packet, fault, Motion.NONE, times, _NOTHING)
         motion = Motion.PLAN if due < flight.contact else Motion.SAFE
         times = due, self._period, flight.contact if motion is Motion.PLAN else math.nan
-        return answer(packet, fault, motion, times, self._setpoints(flight, due))
+        return packets.answer(packet, fault, motion, times, self._setpoints(flight, due))
 
     def _setpoints(self, flight: _Flight[PlanT], due: float) -> np.ndarray:
         times: Any = np.float32(due - flight.start), np.float32(self._period)

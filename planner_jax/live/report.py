@@ -96,9 +96,8 @@ class Report:
         """Format the whole report as lines of text: counts, faults, times, memory."""
         lines = [self.headline(), ""]
         lines += [f"{self.counts[name]:>9,}  {words}" for name, words in COUNTS.items()]
-        lines += [
-            f"{num:>9,}  packets: {fault.words}" for fault, num in sorted(self.faults.items())
-        ]
+        faults = sorted(self.faults.items())
+        lines += [f"{num:>9,}  packets: {fault.words}" for fault, num in faults]
         lines += ["", f"{'stage':<32} {'number':>9} {'p50 ms':>8} {'p99 ms':>8} {'max ms':>8}"]
         for name, words in self.STAGES.items():
             stage = self.stages[name]

@@ -85,12 +85,8 @@ class Server:
         if fault in self._reported:
             return
         self._reported.add(fault)
-        print(
-            f"planner-jax: warning: a packet from {sender[0]}:{sender[1]} {SILENT[fault]}; "
-            "this is not repeated",
-            file=sys.stderr,
-            flush=True,
-        )
+        words = f"warning: a packet from {sender[0]}:{sender[1]} {SILENT[fault]}"
+        print(f"planner-jax: {words}; this is not repeated", file=sys.stderr, flush=True)
 
     def close(self) -> None:
         """Close the socket, and end the planner's thread."""

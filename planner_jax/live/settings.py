@@ -1,7 +1,8 @@
 """Options of the command `planner-jax serve`, checked before the slow import of JAX."""
 
 import dataclasses
-from typing import TYPE_CHECKING, Any
+import pkgutil
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from planner_jax.core.choices import require
 from planner_jax.runs.settings import option, require_count
@@ -9,7 +10,7 @@ from planner_jax.sweep.quadrotor_settings import resolve_robot, robot_option
 from planner_jax.task.hit.spec import DRAG
 
 if TYPE_CHECKING:
-    from planner_jax.live.strokes import CatchStroke, HitStroke, Stroke
+    from planner_jax.live.strokes import Stroke
 
 PORT = 5560  # default UDP port of the server
 
@@ -26,6 +27,10 @@ class ServeSettings:
     seconds: float | None = option(None, "S", "end after this time (default: never)")
     report: bool = option(False, "", "print counts, times and memory at the end")
 
+    STROKE: ClassVar[str]  # name of the class of tasks in `planner_jax.live.strokes`
+    TOOL: ClassVar[str]  # tool that the robot must carry, "net" or "racket"
+    MOST_DRAG: ClassVar[float]  # greatest accepted drag of the ball, in the unit of the task
+
     def __post_init__(self) -> None:
         require_count("port", self.port, 0)
         require(self.port < 2**16, "port", f"at most {2**16 - 1}", self.port)
@@ -36,10 +41,15 @@ class ServeSettings:
         require(0.001 <= self.noise <= 0.5, "noise", "from 0.001 to 0.5", self.noise)
         if self.seconds is not None:
             require(0.0 < self.seconds <= 1e7, "seconds", "> 0 and at most 1e7", self.seconds)
+        object.__setattr__(self, "robot", resolve_robot(vars(self)["robot"], self.TOOL))
+        drag = vars(self)["drag"]
+        require(0.0 <= drag <= self.MOST_DRAG, "drag", f"from 0 to {self.MOST_DRAG:g}", drag)
 
     def stroke(self) -> "Stroke":
-        """Make the task that the server plans, such as a `HitStroke`."""
-        raise NotImplementedError
+        """Make the task that the server plans, such as a `HitStroke`, from these options."""
+        names = {"robot", "target", "drag"} & vars(self).keys()
+        given = {name: vars(self)[name] for name in names if vars(self)[name] is not None}
+        return pkgutil.resolve_name(f"planner_jax.live.strokes:{self.STROKE}")(**given)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,20 +60,13 @@ class HitServe(ServeSettings):
     target: tuple[float, ...] = option((3.0, 0.0, 0.0), "M", "landing position of the ball [m]")
     drag: float = option(DRAG, "K", "quadratic drag K_D of the ball [1/m]")
 
+    STROKE, TOOL, MOST_DRAG = "HitStroke", "racket", 1.0
+
     def __post_init__(self) -> None:
         super().__post_init__()
-        object.__setattr__(self, "robot", resolve_robot(self.robot, "racket"))
         require(len(self.target) == 3, "target", "3 numbers", len(self.target))
         for value in self.target:
             require(abs(value) <= 100.0, "target", "within 100 m", value)
-        require(0.0 <= self.drag <= 1.0, "drag", "from 0 to 1", self.drag)
-
-    def stroke(self) -> "HitStroke":
-        """Make the task to hit balls to the target, with the robot and drag of these options."""
-        from planner_jax.live.strokes import HitStroke
-        from planner_jax.robot.quadrotor_model import PAPER_HITTER
-
-        return HitStroke(self.robot or PAPER_HITTER, target=self.target, drag=self.drag)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,17 +76,7 @@ class CatchServe(ServeSettings):
     robot: Any = robot_option("paper-catcher")
     drag: float = option(0.5, "K", "linear drag of the ball [1/s]")
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        object.__setattr__(self, "robot", resolve_robot(self.robot, "net"))
-        require(0.0 <= self.drag <= 10.0, "drag", "from 0 to 10", self.drag)
-
-    def stroke(self) -> "CatchStroke":
-        """Make the task to catch balls, with the robot and drag of these options."""
-        from planner_jax.live.strokes import CatchStroke
-        from planner_jax.robot.quadrotor_model import PAPER_CATCHER
-
-        return CatchStroke(self.robot or PAPER_CATCHER, drag=self.drag)
+    STROKE, TOOL, MOST_DRAG = "CatchStroke", "net", 10.0
 
 
 SERVED: dict[str, type[ServeSettings]] = {"hit": HitServe, "catch": CatchServe}

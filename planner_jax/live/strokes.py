@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 from jax.typing import ArrayLike
-from jaxtyping import Float
+from jaxtyping import Float, PyTree
 
 from planner_jax.ball.estimation import Flight
 from planner_jax.ball.flight import BallState, linear_drag_flight, rk4_step
@@ -103,14 +103,13 @@ def _state_in(task: Replanning) -> Array:
     return jnp.stack([evaluate(path, elapsed, order) for order in range(4)])
 
 
-def _hit_first(attempt: Round, planner: ExactHit, case: HitCase) -> HitPlan:
+def _solve(attempt: Round, planner: OptimisedPlanner, case: PyTree) -> PyTree:
     return solve_cases(planner, case, planner.load_attempt(attempt, case))
 
 
 def _hit_again(attempt: Round, planner: ReplanHit, task: Replanning) -> HitPlan:
     case = dataclasses.replace(task.case, head_state=_state_in(task))
-    task = dataclasses.replace(task, case=case)
-    return solve_cases(planner, task, planner.load_attempt(attempt, task))
+    return _solve(attempt, planner, dataclasses.replace(task, case=case))
 
 
 class HitStroke(Stroke[HitCase, HitPlan]):
@@ -134,7 +133,7 @@ class HitStroke(Stroke[HitCase, HitPlan]):
         case = hit_case((6.0, 0.0, 2.0), (-1.0, 0.0, 0.0), target, robot=robot, drag=drag)
         planner = ExactHit(drag_after_impact=True)
         planners = planner, ReplanHit(planner, rounds=(_AGAIN,))
-        super().__init__(case, rk4_step, drag, planners, (_hit_first, _hit_again))
+        super().__init__(case, rk4_step, drag, planners, (_solve, _hit_again))
 
     def contact(self, plan: HitPlan) -> float:
         """Return the time [s] at which a plan hits the ball."""
@@ -164,7 +163,7 @@ def _catch_first(attempt: Round, planner: ExactCatch, case: CatchCase) -> CatchP
     """Plan a catch from scratch; the first guess is the earliest catch within the robot's reach."""
     case = dataclasses.replace(case, horizon=_time_left(case))
     case = case.with_choice(jax.tree.map(lambda leaf: leaf[0], Greedy().propose(case)))
-    return solve_cases(planner, case, planner.load_attempt(attempt, case))
+    return _solve(attempt, planner, case)
 
 
 def _catch_again(attempt: Round, planner: ReplanCatch, task: Replanning) -> CatchPlan:
@@ -176,8 +175,7 @@ def _catch_again(attempt: Round, planner: ReplanCatch, task: Replanning) -> Catc
         times=previous.times - task.elapsed,
         head_state=_state_in(task),
     )
-    task = dataclasses.replace(task, case=case)
-    return solve_cases(planner, task, planner.load_attempt(attempt, task))
+    return _solve(attempt, planner, dataclasses.replace(task, case=case))
 
 
 class CatchStroke(Stroke[CatchCase, CatchPlan]):

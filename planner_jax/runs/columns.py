@@ -1,7 +1,7 @@
 """Columns of the rows that a run stores: one row for each case, its plan and the verdict on it."""
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -111,42 +111,31 @@ def leaf_columns(batch: RefereedBatch) -> list[Column]:
     """
     known = {f"plan.{c.name}" for c in SOLVER} | {f"verdict.{c.name}" for c in OUTCOME}
     found = [INDEX]
-    for part, tree in (("case", batch.cases), ("plan", batch.plans), ("verdict", batch.verdict)):
-        found += [c for c in _columns_of(tree, part, part, {}) if c.name not in known]
+    for name, path in (("case", "cases"), ("plan", "plans"), ("verdict", "verdict")):
+        columns = _columns_of(getattr(batch, path), name, path, {})
+        found += [column for column in columns if column.name not in known]
     return [*found, *SOLVER, *OUTCOME]
 
 
-def _columns_of(tree: PyTree, name: str, part: str, words: Mapping[str, str]) -> list[Column]:
+def _columns_of(tree: PyTree, name: str, path: str, words: Mapping[str, str]) -> Iterator[Column]:
+    """Yield a column for each leaf of `tree`, which has the dotted `path` in a `RefereedBatch`."""
     if dataclasses.is_dataclass(tree):
-        fields = [
-            (f.name, vars(tree)[f.name], f.metadata)
-            for f in dataclasses.fields(tree)
-            if f.metadata.get("pytree_node", True)  # a static field has one value for all rows
-        ]
-        return [
-            column
-            for field, value, metadata in fields
-            for column in _columns_of(value, f"{name}.{field}", part, metadata)
-        ]
-    values = np.asarray(tree)
+        for f in dataclasses.fields(tree):
+            if f.metadata.get("pytree_node", True):  # a static field has one value for all rows
+                leaf = vars(tree)[f.name]
+                yield from _columns_of(leaf, f"{name}.{f.name}", f"{path}.{f.name}", f.metadata)
+        return
+    values, unit, meaning = np.asarray(tree), words.get("unit", ""), words.get("meaning", "")
     kind = _KINDS.get(values.dtype.kind, NUMBER)
-    column = Column(
-        name,
-        words.get("unit", ""),
-        words.get("meaning", ""),
-        kind if values.ndim == 1 else list_of(kind),
-        lambda b: _leaf({"case": b.cases, "plan": b.plans, "verdict": b.verdict}, name),
-    )
-    return [column]
+    kind = kind if values.ndim == 1 else list_of(kind)
+    yield Column(name, unit, meaning, kind, lambda batch: _leaf(batch, path))
 
 
 def rows_of(columns: Sequence[Column], batch: RefereedBatch, frame: str) -> pa.Table:
     """Return a table with one row for each case; its metadata describe the coordinate `frame`."""
-    num = len(batch.chunk)
-    fields = [
-        pa.field(c.name, c.type, metadata={"unit": c.unit, "meaning": c.meaning}) for c in columns
-    ]
-    arrays = [_array(column.values(batch), column.type, num) for column in columns]
+    words = [{"unit": column.unit, "meaning": column.meaning} for column in columns]
+    fields = [pa.field(c.name, c.type, metadata=w) for c, w in zip(columns, words, strict=True)]
+    arrays = [_array(column.values(batch), column.type, len(batch.chunk)) for column in columns]
     return pa.Table.from_arrays(arrays, schema=pa.schema(fields, metadata={"frame": frame}))
 
 
@@ -168,11 +157,10 @@ def _array(values: Values, kind: pa.DataType, num: int) -> pa.Array:
 def _leaf(tree: PyTree, path: str, optional: bool = False) -> Values:
     default = (None,) if optional else ()
     for name in path.split("."):
-        tree = tree[name] if isinstance(tree, dict) else getattr(tree, name, *default)
+        tree = getattr(tree, name, *default)
     return tree
 
 
 def _sentences(verdict: PyTree) -> np.ndarray:
-    return np.array(
-        ["" if good else verdict.sentence(lane) for lane, good in enumerate(verdict.success)]
-    )
+    pairs = enumerate(verdict.success)
+    return np.array(["" if success else verdict.sentence(index) for index, success in pairs])

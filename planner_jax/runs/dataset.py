@@ -124,16 +124,12 @@ class Dataset:
         """Return the rows with the indices `rows`, sorted by index; read only their row groups."""
         wanted, first, picked = sorted(set(rows)), 0, []
         for fragment in self._open().get_fragments():
-            size = fragment.metadata.num_rows
-            if any(first <= row < first + size for row in wanted):
-                for group in fragment.split_by_row_group():
-                    num = sum(info.num_rows for info in group.row_groups)
-                    local = [row - first for row in wanted if first <= row < first + num]
-                    if local:
-                        picked += group.to_table(columns=columns).take(local).to_pylist()
-                    first += num
-            else:
-                first += size
+            for group in fragment.split_by_row_group():
+                num = sum(info.num_rows for info in group.row_groups)
+                local = [row - first for row in wanted if first <= row < first + num]
+                if local:
+                    picked += group.to_table(columns=columns).take(local).to_pylist()
+                first += num
         return picked
 
     def _open(self) -> dataset.FileSystemDataset:

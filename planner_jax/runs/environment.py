@@ -87,13 +87,9 @@ def require_backend() -> str:
     except (RuntimeError, AssertionError) as error:
         # JAX 0.10 raises an AssertionError without text if the platform has no device here.
         reason = (str(error) or "JAX finds no device of it").splitlines()[0]
-        asked = os.environ.get("JAX_PLATFORMS", "")
-        raise ArgumentError(
-            "JAX_PLATFORMS",
-            "a platform that works here",
-            verb="name",
-            shown=f"{asked!r} ({reason})",
-        ) from None
+        shown = f"{os.environ.get('JAX_PLATFORMS', '')!r} ({reason})"
+        rule = "a platform that works here"
+        raise ArgumentError("JAX_PLATFORMS", rule, verb="name", shown=shown) from None
 
 
 def _git_commit() -> str | None:

@@ -19,6 +19,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 
+from planner_jax.core.choices import require
 from planner_jax.core.errors import ArgumentError
 from planner_jax.host.files import is_scratch, replacing
 from planner_jax.runs.dataset import Dataset
@@ -40,6 +41,10 @@ class RunFolder:
         self.baselines = Dataset(self.path / "baselines")
         self.figures = self.path / "figures"
         self._made: list[Path] = []
+
+    def require(self, holds: bool, rule: str, shown: str) -> None:
+        """Raise `ArgumentError` with a rule on the folder, and what is there, unless `holds`."""
+        require(holds, self.name, rule, shown=shown)
 
     def require_new(self) -> None:
         """Raise `ArgumentError` unless a new run can be written to this path; write nothing."""
@@ -101,9 +106,8 @@ class RunFolder:
                 return fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
             time.sleep(_BETWEEN)
         owner = os.pread(handle, 200, 0).decode(errors="replace")
-        rule = "a folder that no other process writes"
         shown = f"{str(self.path)!r}, owned by process {owner}"
-        raise ArgumentError(self.name, rule, shown=shown)
+        raise ArgumentError(self.name, "a folder that no other process writes", shown=shown)
 
     def _unwritable(self, error: OSError | None = None) -> ArgumentError:
         why = f" ({error.strerror})" if error else ""
@@ -165,8 +169,7 @@ class RunFolder:
     def require_whole(self, rows: Dataset, remedy: str, num: int | None = None) -> None:
         """Raise `ArgumentError` with the advice `remedy` if rows are missing or files damaged."""
         for path, why in rows.damages(num).items():
-            place = path.relative_to(self.path)
-            rule = f"a run whose {place} is whole"
+            rule = f"a run whose {path.relative_to(self.path)} is whole"
             shown = f"{str(self.path)!r}, where it {why}; {remedy}"
             raise ArgumentError(self.name, rule, shown=shown)
 

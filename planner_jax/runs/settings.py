@@ -81,14 +81,11 @@ class SweepSettings:
     def of(self, task: Task) -> Self:
         """Return the settings; None as planner or suite is replaced by the task's default."""
         planners, suites = task.all_planners(), task.all_suites()
-        filled = dataclasses.replace(
-            self,
-            planner=next(iter(planners)) if self.planner is None else self.planner,
-            suite=next(iter(suites)) if self.suite is None else self.suite,
-        )
-        task.split_planner(str(filled.planner))
-        require_name(suites, "suite", str(filled.suite))
-        return filled
+        planner = next(iter(planners)) if self.planner is None else self.planner
+        suite = next(iter(suites)) if self.suite is None else self.suite
+        task.split_planner(str(planner))
+        require_name(suites, "suite", str(suite))
+        return dataclasses.replace(self, planner=planner, suite=suite)
 
     @property
     def case_bytes(self) -> int:

@@ -8,8 +8,7 @@ import jax
 import numpy as np
 from jaxtyping import PyTree
 
-from planner_jax.core.choices import require_memory
-from planner_jax.core.errors import ArgumentError
+from planner_jax.core.choices import require, require_memory
 from planner_jax.core.registry import Task
 from planner_jax.runs.manifest import Entries
 from planner_jax.runs.settings import SweepSettings
@@ -67,10 +66,8 @@ class DrawnSource(Source):
 
     def cases(self, first: int, last: int) -> Chunk:
         """Draw the cases with indices `first` to `last - 1` of the suite."""
-        settings = self.settings
-        drawn = self.task.draw(
-            last - first, settings.suite, settings.seed, first=first, **settings.draw_options()
-        )
+        suite, seed, options = self.settings.suite, self.settings.seed, self.settings.draw_options()
+        drawn = self.task.draw(last - first, suite, seed, first=first, **options)
         return Chunk(index=np.arange(first, last), cases=jax.tree.map(np.asarray, drawn))
 
     def description(self) -> Entries:
@@ -84,12 +81,9 @@ class DrawnSource(Source):
 def fill_in(settings: SweepSettings, num: int, batch: int) -> Entries:
     """Return the fields of a `Source`; `num` and `batch` are used where the settings are None."""
     num, batch = settings.num or num, settings.batch or batch
-    if num > _MOST_PARTS * batch:
-        rule = f"at most {_MOST_PARTS * batch:,} with a batch of {batch}, as each batch is a file"
-        raise ArgumentError("num", rule, num)
-    if settings.batch is None:
-        require_memory("num", min(num, batch), settings.case_bytes)
-    else:
-        require_memory("batch", batch, settings.case_bytes)
+    rule = f"at most {_MOST_PARTS * batch:,} with a batch of {batch}, as each batch is a file"
+    require(num <= _MOST_PARTS * batch, "num", rule, num)
+    name, size = ("num", min(num, batch)) if settings.batch is None else ("batch", batch)
+    require_memory(name, size, settings.case_bytes)
     resolved = dataclasses.replace(settings, num=num, batch=batch)
     return {"settings": resolved, "num": num, "batch": batch}

@@ -18,19 +18,11 @@ BLUE, ORANGE, GREEN, RED = "#0072B2", "#E69F00", "#009E73", "#D55E00"
 PURPLE, SKY, GREY, INK = "#CC79A7", "#56B4E9", "#8A8F98", "#24292F"
 PALE = "#C9CDD2"
 
-PLANNER_COLOURS = {
-    "exact": BLUE,
-    "bat": ORANGE,
-    "bat-lite": GREEN,
-    "juggle": PURPLE,
-    "catch": ORANGE,
-    "mpp": PURPLE,
-    "spacetime": BLUE,
-    "lattice": GREEN,
-    "paper": ORANGE,
-    "em": PURPLE,
-    "constant": SKY,
-}
+# Colour of the plans of each planner; planners of one task have different colours.
+PLANNER_COLOURS = dict.fromkeys(("exact", "spacetime"), BLUE) | {"constant": SKY}
+PLANNER_COLOURS |= dict.fromkeys(("bat", "catch", "paper"), ORANGE)
+PLANNER_COLOURS |= dict.fromkeys(("bat-lite", "lattice"), GREEN)
+PLANNER_COLOURS |= dict.fromkeys(("juggle", "mpp", "em"), PURPLE)
 
 Look: TypeAlias = dict[str, Any]  # keyword arguments of Matplotlib's drawing functions
 

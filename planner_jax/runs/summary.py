@@ -1,7 +1,7 @@
 """Success rates and other counts of a sweep, computed from its stored rows."""
 
 from collections import Counter
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import pyarrow as pa
@@ -35,6 +35,7 @@ class Tally:
 
     READS: ClassVar[tuple[str, ...]] = ()  # columns that are read; () stands for all columns
     MEANS: ClassVar[tuple[str, ...]] = ()  # columns whose mean over the successes is reported
+    MORE: ClassVar[tuple[type, ...]] = ()  # classes of further counts, with `add` and `summary`
 
     def __init__(self) -> None:
         self.num = 0
@@ -44,6 +45,7 @@ class Tally:
         self.example = 0  # index of the case whose plan the report's figures show
         self._example_rank: int | None = None
         self._sums = dict.fromkeys(self.MEANS, 0.0)
+        self._more: list[Any] = [kind() for kind in self.MORE]
 
     def add(self, rows: pa.Table) -> None:
         """Add rows, one for each planned and judged case, to the counts."""
@@ -59,6 +61,8 @@ class Tally:
             better = self._example_rank is None or rank < self._example_rank
             if better and there.any():
                 self._example_rank, self.example = rank, int(index[there][0])
+        for more in self._more:
+            more.add(rows)
 
     def examples(self, rows: pa.Table, success: np.ndarray) -> list[np.ndarray]:
         """Return masks of rows that qualify as example case of figures, the best mask first."""
@@ -67,7 +71,11 @@ class Tally:
     def summary(self) -> Entries:
         """Return the success rate, counts, and means over the plans that the referee accepted."""
         num = self.successes
-        means = {f"mean_{name}": total / num if num else None for name, total in self._sums.items()}
+        others = {
+            f"mean_{name}": total / num if num else None for name, total in self._sums.items()
+        }
+        for more in self._more:
+            others |= more.summary()
         return {
             "success_rate": self.successes / self.num,
             "num": self.num,
@@ -75,5 +83,5 @@ class Tally:
             "wilson_95": list(wilson_interval(self.successes, self.num)),
             "status_counts": dict(self.status.most_common()),
             "failed_limits": dict(self.failed_limits.most_common()),
-            **means,
+            **others,
         }

@@ -20,19 +20,15 @@ class RateTable(NamedTuple):
 def rate_cells(successes: int, num: int) -> list[str]:
     """Return three cells: number of cases, success rate [%], and its 95 % Wilson interval [%]."""
     low, high = wilson_interval(successes, num)
-    return [
-        f"{num:,}",
-        f"{100.0 * successes / num:.2f}",
-        f"{100.0 * low:.2f} to {100.0 * high:.2f}",
-    ]
+    interval = f"{100.0 * low:.2f} to {100.0 * high:.2f}"
+    return [f"{num:,}", f"{100.0 * successes / num:.2f}", interval]
 
 
 def align(rows: Sequence[Sequence[str]]) -> list[str]:
     """Return a line of text for each row, with the first column flush left, the others right."""
     first, *widths = (max(map(len, column)) for column in zip(*rows, strict=True))
-    return [
-        "  ".join([row[0].ljust(first), *map(str.rjust, row[1:], widths)]).rstrip() for row in rows
-    ]
+    cells = [[row[0].ljust(first), *map(str.rjust, row[1:], widths)] for row in rows]
+    return ["  ".join(line).rstrip() for line in cells]
 
 
 def headline(manifest: Entries, findings: Sequence[str] = ()) -> list[str]:

@@ -108,11 +108,8 @@ class Maker:
         """Judge the plans of a chunk of cases; return its Parquet file as bytes, and its record."""
         watch = Stopwatch()
         verdict = self.sweep.judge(chunk.cases, plans, self.source.settings)
-        record = {
-            **record,
-            "referee_seconds": watch.lap(),
-            "successes": int(np.sum(verdict.success)),
-        }
+        successes = int(np.sum(verdict.success))
+        record = {**record, "referee_seconds": watch.lap(), "successes": successes}
         batch = RefereedBatch(chunk, plans, verdict)
         return encode(rows_of(self.sweep.columns(batch), batch, self.sweep.frame), record), record
 
@@ -191,11 +188,11 @@ def times_of(maker: Maker, records: dict[int, Record]) -> Entries:
         chunk = maker.source.chunk(0)
         _, seconds = measure_warm(lambda: maker.sweep.plan(maker.planner, chunk.cases))
         num = len(chunk)
-    found = {
-        "compile_seconds": sum(part["compile_seconds"] for part in parts),
-        "first_seconds": parts[0]["plan_seconds"],
-        "warm_seconds": seconds,
-        "referee_seconds": sum(part["referee_seconds"] for part in parts),
+    return {
+        "compile_seconds": round(sum(part["compile_seconds"] for part in parts), 4),
+        "first_seconds": round(parts[0]["plan_seconds"], 4),
+        "warm_seconds": round(seconds, 4),
+        "referee_seconds": round(sum(part["referee_seconds"] for part in parts), 4),
+        "warm_plans": num,
+        "measured": _MEASURED,
     }
-    rounded = {name: round(value, 4) for name, value in found.items()}
-    return {**rounded, "warm_plans": num, "measured": _MEASURED}

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.stats import binomtest
 
-from planner_jax.core.errors import ArgumentError
+from planner_jax.core.choices import require
 from planner_jax.runs.manifest import Entries
 from planner_jax.runs.run_folder import RunFolder
 from planner_jax.runs.summary import percent, wilson_interval
@@ -38,8 +38,8 @@ class ComparedRun:
 
     @property
     def settings(self) -> Entries:
-        """Settings of the run by name, as its manifest stores them."""
-        return self.manifest["parameters"]
+        """Settings of the run by name, as its manifest stores them, with `num` as a number."""
+        return {**self.manifest["parameters"], "num": len(self.index)}
 
     @property
     def rate(self) -> float:
@@ -79,16 +79,14 @@ def read_run(path: str | os.PathLike) -> ComparedRun:
 
 def require_comparable(runs: Sequence[ComparedRun]) -> None:
     """Raise `ArgumentError` unless there are several runs of one task, suite and seed."""
-    if len(runs) < 2:
-        raise ArgumentError("RUN", "the folders of two runs or more", len(runs))
+    require(len(runs) > 1, "RUN", "the folders of two runs or more", len(runs))
     first = runs[0]
     for other in runs[1:]:
         kinds = ("task", first.manifest["kind"], other.manifest["kind"])
         words = [(n, first.settings.get(n), other.settings.get(n)) for n in ("suite", "seed")]
         for name, mine, theirs in (kinds, *words):
-            if mine != theirs:
-                shown = f"{mine} in {first.name!r} and {theirs} in {other.name!r}"
-                raise ArgumentError("RUN", f"runs of one {name}", shown=shown)
+            shown = f"{mine} in {first.name!r} and {theirs} in {other.name!r}"
+            require(mine == theirs, "RUN", f"runs of one {name}", shown=shown)
 
 
 def other_cases(first: ComparedRun, other: ComparedRun) -> list[str]:
@@ -97,14 +95,8 @@ def other_cases(first: ComparedRun, other: ComparedRun) -> list[str]:
 
 
 def _unlike(first: ComparedRun, other: ComparedRun, names: Sequence[str]) -> list[str]:
-    found = []
-    for name in names:
-        mine, theirs = (
-            len(run.index) if name == "num" else run.settings.get(name) for run in (first, other)
-        )
-        if mine != theirs:
-            found.append(f"{name} {mine} and {theirs}")
-    return found
+    pairs = [(name, first.settings.get(name), other.settings.get(name)) for name in names]
+    return [f"{name} {mine} and {theirs}" for name, mine, theirs in pairs if mine != theirs]
 
 
 def difference_of(first: ComparedRun, other: ComparedRun) -> Difference:
@@ -220,17 +212,7 @@ def _sentences(first: ComparedRun, run: ComparedRun, row: Entries, k: int) -> It
 
 
 def _cells(rows: Sequence[Entries]) -> list[list[str]]:
-    spread = [
-        f"{100.0 * row['wilson_low']:.2f} to {100.0 * row['wilson_high']:.2f}" for row in rows
-    ]
-    cells = [
-        ["", *(f"[{k}]" for k in range(1, len(rows) + 1))],
-        ["planner", *(str(row["planner"]) for row in rows)],
-        ["cases", *(f"{row['cases']:,}" for row in rows)],
-        ["success %", *(percent(row["successes"], row["cases"]) for row in rows)],
-        ["95 % interval", *spread],
-    ]
-    for words, name, form in (
+    numbers = (
         ("cost of successes, mean", "cost_mean", ".4g"),
         ("cost of successes, median", "cost_median", ".4g"),
         ("iterations, mean", "iterations_mean", ".1f"),
@@ -239,10 +221,16 @@ def _cells(rows: Sequence[Entries]) -> list[list[str]]:
         ("ms a plan", "milliseconds_a_plan", ".3g"),
         ("compiling [s]", "compile_seconds", ".1f"),
         ("all chunks [s]", "wall_seconds", ".1f"),
-    ):
-        numbers = ("-" if row[name] is None else format(row[name], form) for row in rows)
-        cells.append([words, *numbers])
-    return cells
+    )
+    words = ["planner", "cases", "success %", "95 % interval", *(word for word, *_ in numbers)]
+    columns = [["", *words]]
+    for k, row in enumerate(rows, 1):
+        success = percent(row["successes"], row["cases"])
+        spread = f"{100.0 * row['wilson_low']:.2f} to {100.0 * row['wilson_high']:.2f}"
+        own = [f"[{k}]", str(row["planner"]), f"{row['cases']:,}", success, spread]
+        own += ["-" if row[name] is None else format(row[name], form) for _, name, form in numbers]
+        columns.append(own)
+    return [list(row) for row in zip(*columns, strict=True)]
 
 
 def as_csv(runs: Sequence[ComparedRun]) -> str:

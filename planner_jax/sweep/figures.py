@@ -12,13 +12,8 @@ from planner_jax.runs import style
 from planner_jax.runs.manifest import Entries, Row
 from planner_jax.runs.run_folder import RunRows
 from planner_jax.runs.style import Look
-from planner_jax.sweep.quadrotor import (
-    SampledMotion,
-    body_rate,
-    net_thrust,
-    sample_motion,
-    sample_rest,
-)
+from planner_jax.sweep import quadrotor
+from planner_jax.sweep.quadrotor import SampledMotion
 
 DASHED: Look = {"color": style.RED, "linewidth": 1.2, "linestyle": "--", "zorder": 1}
 FORBIDDEN: Look = {"color": style.RED, "alpha": 0.08, "linewidth": 0.0}
@@ -51,12 +46,8 @@ PANELS: dict[str, tuple[str, str, Callable[[SampledMotion, float], np.ndarray]]]
     "speed": ("|v| [m/s]", "Speed", lambda m, g: np.linalg.norm(m.vel, axis=1)),
     "acceleration": ("|a| [m/s²]", "Acceleration", lambda m, g: np.linalg.norm(m.acc, axis=1)),
     "jerk": ("|j| [m/s³]", "Jerk", lambda m, g: np.linalg.norm(m.jerk, axis=1)),
-    "body_rate": ("|ω| [rad/s]", "Body rate", body_rate),
-    "thrust": (
-        "‖τ‖ [m/s²]",
-        "Thrust per mass (dotted: hover)",
-        lambda m, g: np.linalg.norm(net_thrust(m, g), axis=1),
-    ),
+    "body_rate": ("|ω| [rad/s]", "Body rate", quadrotor.body_rate),
+    "thrust": ("‖τ‖ [m/s²]", "Thrust per mass (dotted: hover)", quadrotor.thrust_size),
 }
 
 
@@ -74,15 +65,11 @@ def quadrotor_figure(
     """
     plans, setting = run.same_case(), run.manifest["setting"]
     axes = figure.subplots(2, 3, sharex=True)
-    drawn = [
-        Drawn(
-            row,
-            sample_motion(row["coeffs"], row["durations"], _SAMPLES),
-            sample_rest(row, _SAMPLES),
-            look_of(k, name, row),
-        )
-        for k, (name, row) in enumerate(plans)
-    ][::-1]
+    drawn: list[Drawn] = []
+    for k, (name, row) in enumerate(plans):
+        motion = quadrotor.sample_motion(row["coeffs"], row["durations"], _SAMPLES)
+        rest = quadrotor.sample_rest(row, _SAMPLES)
+        drawn.insert(0, Drawn(row, motion, rest, look_of(k, name, row)))
     first(axes[0, 0], setting, drawn)
     for panel, name in zip(axes.flat[1:5], panels, strict=True):
         unit, title, values = PANELS[name]
@@ -148,12 +135,8 @@ def write_verdicts(
     row, suite = plans[0][1], run.manifest["parameters"].get("suite")
     origin = "single case" if suite is None else f"suite {suite}"
     origin = f"scenario {row['scenario']}" if "scenario" in row else origin
-    axes.text(
-        0.0,
-        1.0,
-        f"Case {row['index']}, {origin}\nlimits: red; curves of failed plans: dashed",
-        **look,
-    )
+    words = f"Case {row['index']}, {origin}\nlimits: red; curves of failed plans: dashed"
+    axes.text(0.0, 1.0, words, **look)
     step = min(0.22, 0.9 / len(plans))
     for index, (name, row) in enumerate(plans):
         top = 0.78 - step * index

@@ -45,18 +45,15 @@ TRAJECTORY = [
     ),
 ]
 
-_RESTS = {
-    "brake": "a trajectory to standstill at the cheapest place",
-    "home": "a trajectory back to the start",
-}
+_RESTS = {"brake": "to standstill at the cheapest place", "home": "back to the start"}
 
 
 def recovery_remark(parameters: Row) -> list[str]:
     """Return a sentence on the setting `recovery`: how the robots stop; [] for "none"."""
-    words = _RESTS.get(parameters.get("recovery", ""))
-    if words is None:
+    if (where := _RESTS.get(parameters.get("recovery", ""))) is None:
         return []
-    return [f"After the last contact: {words}; a plan is a success only together with it."]
+    words = f"After the last contact: a trajectory {where}"
+    return [f"{words}; a plan is a success only together with it."]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -101,6 +98,11 @@ def net_thrust(motion: SampledMotion, gravity: float) -> np.ndarray:
     return motion.acc + gravity * np.array([0.0, 0.0, 1.0])
 
 
+def thrust_size(motion: SampledMotion, gravity: float) -> np.ndarray:
+    """Return the magnitude of the thrust per unit mass at N times, (N,) [m/s^2]."""
+    return np.linalg.norm(net_thrust(motion, gravity), axis=1)
+
+
 def body_rate(motion: SampledMotion, gravity: float) -> np.ndarray:
     """Return the magnitude [rad/s] of the body's angular velocity at N times, at zero heading.
 
@@ -109,7 +111,7 @@ def body_rate(motion: SampledMotion, gravity: float) -> np.ndarray:
     Hopf fibration. The result is NaN where f is zero or points straight down.
     """
     thrust = net_thrust(motion, gravity)
-    size = np.linalg.norm(thrust, axis=1)
+    size = thrust_size(motion, gravity)
     cross = np.cross(thrust, motion.jerk)
     with np.errstate(all="ignore"):
         across = np.linalg.norm(cross, axis=1) / size**2

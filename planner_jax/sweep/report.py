@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from planner_jax.core.errors import ArgumentError
 from planner_jax.runs.dataset import Dataset
 from planner_jax.runs.manifest import Entries, Row
 from planner_jax.runs.run_folder import FAILURES_SHOWN, RunFolder, RunRows
@@ -30,9 +29,7 @@ def read_finished(folder: RunFolder) -> tuple[Entries, Sweep]:
     """Return a run's manifest and `Sweep`; raise `ArgumentError` if it is unfinished or damaged."""
     manifest = folder.read_manifest()
     sweep = sweep_of_run(manifest, folder.name)
-    if "summary" not in manifest:
-        shown = f"{str(folder.path)!r}; resume it first"
-        raise ArgumentError(folder.name, "finished", shown=shown)
+    folder.require("summary" in manifest, "finished", f"{str(folder.path)!r}; resume it first")
     again = f"planner-jax {sweep.kind} --resume --out {shlex.quote(str(folder.path))}"
     remedy = f"make it anew: {again}"
     folder.require_whole(folder.plans, remedy, manifest["summary"]["num"])
@@ -53,11 +50,9 @@ def require_sound(folder: RunFolder) -> None:
 def require_counted(folder: RunFolder, summary: Mapping[str, object], counted: Entries) -> None:
     """Raise `ArgumentError` unless a manifest's summary agrees with the counts of the rows."""
     for name, value in counted.items():
-        if not _agree(summary.get(name), value):
-            rule = f"a run whose entry {name} agrees with its rows, {value}"
-            raise ArgumentError(
-                folder.name, rule, shown=f"{summary.get(name)} in {str(folder.path)!r}"
-            )
+        rule = f"a run whose entry {name} agrees with its rows, {value}"
+        shown = f"{summary.get(name)} in {str(folder.path)!r}"
+        folder.require(_agree(summary.get(name), value), rule, shown)
 
 
 def _agree(one: object, other: object) -> bool:

@@ -32,9 +32,9 @@ def case_of_row(folder: RunFolder, row: int) -> PyTree:
     manifest, sweep = read_finished(folder)
     settings = settings_of_manifest(settings_of(sweep.task), manifest["parameters"], folder.name)
     cases = sweep.open_source(settings.of(sweep.task), 1).cases(row, row + 1).cases
-    if sweep.setting(cases) != manifest["setting"]:
-        rule = "a run whose cases are drawn or read as before"
-        raise ArgumentError(folder.name, rule, shown=f"others for row {row}")
+    is_same = sweep.setting(cases) == manifest["setting"]
+    rule = "a run whose cases are drawn or read as before"
+    folder.require(is_same, rule, f"others for row {row}")
     return take(cases, 0)
 
 
@@ -66,9 +66,8 @@ def quadrotor_plan(row: Row, setting: Entries) -> QuadrotorPlan:
 
 def arm_plan(row: Row, _: Entries) -> ArmPlan:
     """Restore an arm's plan from a run's row; the motion starts at the `delay` [s] of its case."""
-    return ArmPlan(
-        **_outcome(row), motion=_polynomial(row["motion_coeffs"], row["motion_durations"], 6)
-    )
+    motion = _polynomial(row["motion_coeffs"], row["motion_durations"], 6)
+    return ArmPlan(**_outcome(row), motion=motion)
 
 
 def car_plan(row: Row, _: Entries) -> CarPlan:

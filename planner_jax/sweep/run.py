@@ -11,6 +11,7 @@ import jax
 import numpy as np
 import pyarrow as pa
 
+from planner_jax.core.choices import require
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.planner import Planner
 from planner_jax.core.registry import Task
@@ -41,7 +42,7 @@ def start_sweep(
     progress: bool = True,
     workers: str | None = None,
 ) -> Entries:
-    """Plan and judge the cases of a sweep, and write rows and report into a new folder.
+    """Plan and judge the cases of a sweep, write rows and report, and return the manifest.
 
     Args:
         task: task of the sweep.
@@ -51,9 +52,6 @@ def start_sweep(
         workers: "ray" lets the workers of a Ray cluster plan the chunks of cases, on all its GPUs
             if JAX in this process computes on a GPU. The rows do not depend on the number of
             devices. None plans in this process.
-
-    Returns:
-        The manifest of the finished run.
 
     Raises:
         ArgumentError: an argument or a case breaks a rule; all files of the run are removed.
@@ -95,26 +93,17 @@ def resume_sweep(
     workers: str | None = None,
     **given: object,
 ) -> Entries:
-    """Finish a sweep that was interrupted or killed; a complete run is left unchanged.
+    """Finish a sweep that was interrupted or killed, and return the manifest.
 
     Rows are stored in one file per chunk of cases. The cases of a file that is missing, damaged or
-    of another run are planned again.
+    of another run are planned again. The rows equal the rows of an uninterrupted run.
 
-    Args:
-        task: task of the sweep.
-        out: folder of the run.
-        progress: whether to show a progress bar on the standard error stream.
-        workers: "ray" or None as for `start_sweep`; the interrupted sweep may have used others.
-        **given: settings by name that the caller repeats; they must equal the run's settings.
-
-    Returns:
-        The manifest of the finished run. Its rows equal the rows of an uninterrupted run.
+    The settings `given` by name must equal the run's settings. The other arguments and errors are
+    as for `start_sweep`; `workers` may differ from those of the interrupted sweep.
 
     Raises:
-        ArgumentError: the folder does not hold a sweep of this task, a repeated setting differs, or
+        ArgumentError: the folder does not hold a sweep of this task, a given setting differs, or
             rows planned here would differ because of other versions, code, devices or files.
-        SweepInterrupted: on Ctrl-C; the folder can be resumed.
-        WorkersFailed: the workers could not plan a chunk of cases; the folder can be resumed.
     """
     folder, sweep = RunFolder(out), sweep_of(task)
     _settings_of_run(folder, sweep, given)
@@ -127,17 +116,14 @@ def resume_sweep(
             return manifest
         session = _session(workers)
         for what, old in manifest["makers"].items():
-            if (new := makers_of(session).get(what)) != old:
-                rule = f"resumed by {what} {old}, as it started"
-                raise ArgumentError("out", rule, shown=f"{new}; or start again in another folder")
+            new, rule = makers_of(session).get(what), f"resumed by {what} {old}, as it started"
+            folder.require(new == old, rule, f"{new}; or start again in another folder")
         maker = _maker_of(sweep, settings)
         for entry, known in maker.description.items():
-            if known != manifest.get(entry):
-                raise ArgumentError(entry, "the same as when the run started", shown="")
-        if maker.run != manifest["run"]:
-            raise ArgumentError(
-                "out", "resumed with the files that its settings named then", shown=""
-            )
+            is_same = known == manifest.get(entry)
+            require(is_same, entry, "the same as when the run started", shown="")
+        rule = "resumed with the files that its settings named then"
+        folder.require(maker.run == manifest["run"], rule, "")
         sessions = [*manifest["sessions"], session]
         manifest = folder.write_manifest({**manifest, "state": "running", "sessions": sessions})
         return _finish(folder, manifest, maker, there, others, progress)
@@ -152,12 +138,10 @@ def _settings_of_run(
     folder: RunFolder, sweep: Sweep, given: Mapping[str, object]
 ) -> tuple[Entries, SweepSettings]:
     manifest = folder.read_manifest()
-    if manifest["kind"] != sweep.kind:
-        raise ArgumentError(
-            "out", f"the folder of a {sweep.kind}", shown=f"one of a {manifest['kind']}"
-        )
-    kind = settings_of(sweep.task)
-    return manifest, settings_to_resume(kind, manifest["parameters"], dict(given))
+    kind = manifest["kind"]
+    folder.require(kind == sweep.kind, f"the folder of a {sweep.kind}", f"one of a {kind}")
+    settings = settings_to_resume(settings_of(sweep.task), manifest["parameters"], dict(given))
+    return manifest, settings
 
 
 def _maker_of(sweep: Sweep, settings: SweepSettings) -> Maker:
@@ -169,9 +153,8 @@ def _sound_parts(folder: RunFolder, manifest: Entries) -> dict[int, Record]:
     """Return the records of all undamaged row files by number, and delete every other file."""
     files, found = folder.plans.files(), {}
     for path in files:
-        if not path.is_file():
-            rule = "a run whose parts are regular files"
-            raise ArgumentError(folder.name, rule, shown=f"{str(path)!r}, which is not")
+        shown = f"{str(path)!r}, which is not"
+        folder.require(path.is_file(), "a run whose parts are regular files", shown)
     for path in files:
         try:
             number, record = number_of(path), check_part(path)
@@ -246,15 +229,11 @@ def plan_baselines(
     return pa.concat_tables(tables)
 
 
-# Fields that every Flax module has. They do not describe a network and are left out of manifests.
-_OF_NETWORKS = ("parent", "name")
-
-
 def _fields_of(planner: object) -> Entries:
     found = {}
     for field in dataclasses.fields(planner) if dataclasses.is_dataclass(planner) else ():
-        if field.name in _OF_NETWORKS:
-            continue
+        if field.name in ("parent", "name"):
+            continue  # every network of Flax has these two fields, which do not describe it
         value = vars(planner)[field.name]
         if dataclasses.is_dataclass(value):
             value = {"class": type(value).__name__, **_fields_of(value)}

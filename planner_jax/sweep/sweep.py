@@ -87,12 +87,8 @@ class Sweep(Generic[AnySettings]):
 
     def require_fit(self, settings: AnySettings, planner: Planner, cases: PyTree) -> None:
         """Raise `ArgumentError` if the planner takes another class of cases."""
-        require(
-            isinstance(cases, planner.case_type),
-            "planner",
-            f"one that takes the cases of suite {settings.suite}",
-            settings.planner,
-        )
+        rule = f"one that takes the cases of suite {settings.suite}"
+        require(isinstance(cases, planner.case_type), "planner", rule, settings.planner)
 
     def open_source(self, settings: AnySettings, batch: int) -> Source:
         """Return the source of a sweep's cases; `batch` is used if the settings have no batch."""
@@ -154,8 +150,7 @@ def sweep_of(task: Task) -> Sweep:
 def sweep_of_run(manifest: Entries, name: str = "out") -> Sweep:
     """Return the sweep object for a run's task; raise unless it is a sweep of a known task."""
     first, _, task = str(manifest["kind"]).partition(" ")
-    if first != "sweep":
-        raise ArgumentError(name, "the folder of a sweep", shown=f"a {manifest['kind']}")
+    require(first == "sweep", name, "the folder of a sweep", shown=f"a {manifest['kind']}")
     try:
         return sweep_of(task_named(task))
     except UnknownName as error:
@@ -168,11 +163,9 @@ def first_values(tree: PyTree, names: Sequence[str] = (), prefix: str = "") -> E
     `names` are names of fields of `tree`, by default all. In the result each name has the `prefix`.
     Fields that are None or dataclasses are left out.
     """
-    names = names or [field.name for field in dataclasses.fields(tree)]
-    known = {name: vars(tree)[name] for name in names}
-    leaves = {
-        prefix + name: np.asarray(value, float)[0]
-        for name, value in known.items()
-        if value is not None and not dataclasses.is_dataclass(value)
-    }
-    return {name: leaf.round(6).tolist() for name, leaf in leaves.items()}
+    found = {}
+    for name in names or [field.name for field in dataclasses.fields(tree)]:
+        value = vars(tree)[name]
+        if value is not None and not dataclasses.is_dataclass(value):
+            found[prefix + name] = np.asarray(value, float)[0].round(6).tolist()
+    return found

@@ -67,8 +67,8 @@ class ScenarioCounts:
             self._published.update((planner, name) for name in scenario[solved])
 
     def summary(self) -> Entries:
-        """Return success rates of the run and of the published planners for each scenario."""
-        return {
+        """Return, as `per_scenario`, success rates of the run and of the published planners."""
+        found = {
             name: {
                 "num": self._num[name],
                 "successes": self._successes[name],
@@ -82,6 +82,7 @@ class ScenarioCounts:
             for name in court.SCENARIOS
             if self._num[name]
         }
+        return {"per_scenario": found}
 
 
 def make_table(manifest: Entries) -> RateTable:

@@ -2,6 +2,7 @@
 
 import abc
 import dataclasses
+import functools
 from collections.abc import Sequence
 from pathlib import Path
 from typing import ClassVar, Generic, SupportsFloat, TypeVar
@@ -117,8 +118,7 @@ class Single(abc.ABC, Generic[SingleT]):
 
     def margins(self, answer: Answer) -> list[Margin]:
         """Return the margins to all limits of the case: of flight, rotors and task."""
-        of_flight = _of_flight(answer, sample_plan(answer.plan))
-        return [*of_flight, *_of_rotors(answer), *self.task_margins(answer)]
+        return [*_of_flight(answer), *_of_rotors(answer), *self.task_margins(answer)]
 
 
 def sample_plan(found: QuadrotorPlan) -> SampledMotion:
@@ -135,12 +135,7 @@ def _pieces(found: QuadrotorPlan) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _closest(
-    words: str,
-    times: np.ndarray,
-    values: np.ndarray,
-    allowed: SupportsFloat,
-    *,
-    least: bool = False,
+    times: np.ndarray, words: str, values: np.ndarray, allowed: SupportsFloat, least: bool = False
 ) -> Margin:
     """Return the margin at the time when a plan is closest to a limit, or exceeds it most."""
     # Values are NaN where the attitude is undefined; such a plan exceeds the limit infinitely.
@@ -149,15 +144,11 @@ def _closest(
     return Margin(words, float(values[at]), float(allowed), float(times[at]), least)
 
 
-def _of_flight(answer: Answer, motion: SampledMotion) -> list[Margin]:
+def _of_flight(answer: Answer) -> list[Margin]:
     limits, gravity = answer.case.limits, float(answer.case.gravity)
+    motion = sample_plan(answer.plan)
     sizes = {name: values(motion, gravity) for name, (_, _, values) in PANELS.items()}
-
-    def closest(
-        words: str, values: np.ndarray, allowed: SupportsFloat, *, least: bool = False
-    ) -> Margin:
-        return _closest(words, motion.time, values, allowed, least=least)
-
+    closest = functools.partial(_closest, motion.time)
     found = [
         closest(f"{name.replace('_', ' ')} [{unit}]", sizes[name], vars(limits)[name])
         for name, unit in _ABOVE.items()
@@ -184,8 +175,8 @@ def _of_rotors(answer: Answer) -> list[Margin]:
     at = (starts[:, None] + times).ravel()
     low, high = thrusts.min(axis=-1).ravel(), thrusts.max(axis=-1).ravel()
     return [
-        _closest("rotor thrust, least [N]", at, low, rotors.min_thrust, least=True),
-        _closest("rotor thrust, greatest [N]", at, high, rotors.max_thrust),
+        _closest(at, "rotor thrust, least [N]", low, rotors.min_thrust, least=True),
+        _closest(at, "rotor thrust, greatest [N]", high, rotors.max_thrust),
     ]
 
 
@@ -213,10 +204,8 @@ def write_pictures(task: Task, planner: str, answer: Answer, out: Path) -> list[
     """Draw a case and its plan into the folder `out`, and return the paths of the pictures."""
     sweep = sweep_of(task)
     case, plan = jax.tree.map(lambda leaf: np.asarray(leaf)[None], (answer.case, answer.plan))
-    verdict = dataclasses.replace(
-        answer.verdict,
-        **{name: np.asarray(value)[None] for name, value in vars(answer.verdict).items()},
-    )
+    fields = {name: np.asarray(value)[None] for name, value in vars(answer.verdict).items()}
+    verdict = dataclasses.replace(answer.verdict, **fields)
     batch = RefereedBatch(Chunk(np.zeros(1, int), case), plan, verdict)
     (row,) = rows_of(sweep.single_columns, batch, sweep.frame).to_pylist()
     manifest = {"parameters": {"planner": planner}, "setting": sweep.setting(case)}

@@ -32,15 +32,13 @@ class SingleCatch(Single[SingleCatchSettings]):
 
     def contact(self, answer: Answer) -> list[str]:
         """Describe time, position, speed of the ball and miss in one sentence for every catch."""
-        lines = []
-        targets = answer.case.targets
-        for index, (target, time) in enumerate(
-            zip(np.asarray(answer.plan.order), np.asarray(answer.verdict.catch_times), strict=True)
-        ):
+        lines, targets, verdict = [], answer.case.targets, answer.verdict
+        numbers = (answer.plan.order, verdict.catch_times, verdict.net_distance)
+        for target, time, away in zip(*map(np.asarray, numbers), strict=True):
             ball = take(targets, int(target)).at(jnp.asarray(time, jnp.float32))
             x, y, z = np.asarray(ball.pos)
             which = f"Ball {target + 1} caught" if len(targets.gravity) > 1 else "Caught"
-            off = 1e3 * float(answer.verdict.net_distance[index])
+            off = 1e3 * float(away)
             lines.append(
                 f"{which} at {time:.3f} s at ({x:.3f}, {y:.3f}, {z:.3f}) m, flying at "
                 f"{float(np.linalg.norm(ball.vel)):.2f} m/s, {off:.1f} mm from the net's centre."

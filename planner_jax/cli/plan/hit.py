@@ -21,9 +21,7 @@ class SingleHit(Single[SingleHitSettings]):
         """Describe the impact and the ball's landing in one sentence."""
         stroke = answer.plan.stroke
         x, y, z = np.asarray(stroke.ball_pos)
-        before, after = (
-            float(np.linalg.norm(vel)) for vel in (stroke.ball_vel, stroke.ball_vel_after)
-        )
+        before, after = map(float, map(np.linalg.norm, (stroke.ball_vel, stroke.ball_vel_after)))
         lands = float(stroke.time + stroke.flight_time)
         return [
             f"Hit at {float(stroke.time):.3f} s at ({x:.3f}, {y:.3f}, {z:.3f}) m: the ball comes "

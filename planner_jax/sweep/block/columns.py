@@ -1,9 +1,11 @@
 """Columns of the rows that a sweep of blocks stores: ball, arm, plan and referee's verdict."""
 
 from planner_jax.runs import columns as known
-from planner_jax.runs.columns import LIST, VECTOR, leaves_of
+from planner_jax.runs.columns import LIST, NUMBER, VECTOR, leaves_of
 
 FRAME = "base of the robot, z up; times from the first observation of the ball"
+_TILT = "greatest angle between shield's normal and ball's path"
+_DURATIONS = "of the pieces; the first starts at the delay"
 
 COLUMNS = [
     known.INDEX,
@@ -16,25 +18,13 @@ COLUMNS = [
         ("start_rates", "rad/s", "of the joints until the delay", LIST, "rates"),
         ("ends_at_rest", "", "whether the arm must be at rest at the contact", known.BOOL),
         ("offset", "m", "greatest distance of the ball from the shield's middle at contact"),
-        (
-            "tilt_limit",
-            "rad",
-            "greatest angle between shield's normal and ball's path",
-            known.NUMBER,
-            "tilt",
-        ),
+        ("tilt_limit", "rad", _TILT, NUMBER, "tilt"),
     ),
     *leaves_of(
         "plans",
-        ("planned_contact_time", "s", "of the plan", known.NUMBER, "contact_time"),
+        ("planned_contact_time", "s", "of the plan", NUMBER, "contact_time"),
         ("motion_coeffs", "rad/s^k", "(pieces, powers, 6) of the joints", LIST, "motion.coeffs"),
-        (
-            "motion_durations",
-            "s",
-            "of the pieces; the first starts at the delay",
-            LIST,
-            "motion.durations",
-        ),
+        ("motion_durations", "s", _DURATIONS, LIST, "motion.durations"),
     ),
     *known.SOLVER,
     *leaves_of(

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 
-import pyarrow as pa
 from jaxtyping import PyTree
 
 from planner_jax.baselines.block.library.adapt import AdaptBlock
@@ -23,21 +22,8 @@ from planner_jax.sweep.sweep import Sweep
 class BlockTally(Tally):
     """Counts of successes, mean execution time, errors of flight fits, and planning times."""
 
-    MEANS = ("execution_time",)
+    MEANS, MORE = ("execution_time",), (StudyCounts,)
     READS = (*COUNTED, *MEANS, *StudyCounts.READS)
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._study = StudyCounts()
-
-    def add(self, rows: pa.Table) -> None:
-        """Add rows, one for each planned and judged case, to the counts and sums."""
-        super().add(rows)
-        self._study.add(rows)
-
-    def summary(self) -> Entries:
-        """Return success rates and means; with a camera also errors of the fitted flights."""
-        return super().summary() | self._study.summary()
 
 
 class BlockSweep(Sweep[BlockSettings]):

@@ -50,9 +50,8 @@ class CatchTally(Tally):
     def add(self, rows: pa.Table) -> None:
         """Add rows, one for each planned and judged case, to the counts and sums."""
         super().add(rows)
-        caught, present, times = (
-            np.stack(rows[name].to_pylist()) for name in ("caught", "present", "catch_times")
-        )
+        names = ("caught", "present", "catch_times")
+        caught, present, times = (np.stack(rows[name].to_pylist()) for name in names)
         self._shares += float((caught.sum(axis=1) / present.sum(axis=1)).sum())
         self._times += float(times[caught].sum())
         self._num_caught += int(caught.sum())
@@ -92,7 +91,7 @@ class CatchSweep(Sweep[CatchSettings]):
     def setting(self, cases: PyTree) -> Entries:
         """Return physics and limits that all cases share, for the manifest's entry `setting`."""
         net = first_values(cases.net, ["height", "radius", "max_angle"], "net_")
-        return {**first_values(cases, ["gravity"]), **net, **first_values(cases.limits)}
+        return first_values(cases, ["gravity"]) | net | first_values(cases.limits)
 
     def tally(self, settings: CatchSettings) -> CatchTally:
         """Return a new counter of rows, from which the summary of a run is made."""

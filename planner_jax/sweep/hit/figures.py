@@ -60,8 +60,8 @@ def ball_path(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return N times [s] from 0 to `end`, and the positions (N, 3) [m] of a flying ball then."""
     time = np.linspace(0.0, end, _SAMPLES)
-    again = (_SAMPLES, 1)
-    return time, fly(np.tile(pos, again), np.tile(vel, again), time, drag, gravity)[0]
+    pos, vel = (np.tile(vector, (_SAMPLES, 1)) for vector in (pos, vel))
+    return time, fly(pos, vel, time, drag, gravity)[0]
 
 
 def draw_case(axes: Axes, row: Row, second: int, setting: Entries, drag_after: bool) -> None:

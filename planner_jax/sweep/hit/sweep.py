@@ -7,13 +7,9 @@ import numpy as np
 import pyarrow as pa
 from jaxtyping import PyTree
 
-from planner_jax.baselines.hit.comparison import (
-    ScenarioCounts,
-    describe_serves,
-    explain_table,
-    make_table,
-)
-from planner_jax.core.choices import require_one_of
+from planner_jax.baselines.hit import comparison
+from planner_jax.baselines.hit.comparison import ScenarioCounts
+from planner_jax.core.choices import require, require_one_of
 from planner_jax.core.errors import ArgumentError, CaseError
 from planner_jax.runs.manifest import Entries
 from planner_jax.runs.source import Chunk, Source, fill_in
@@ -65,34 +61,20 @@ class ServeSource(Source):
         """Return the manifest entry on the serves: their source, number and SHA-256 digest."""
         if self.folder is None:
             return {"serves": {"source": "generated", "distinct": self.num, "sha256": None}}
-        return {
-            "serves": {"source": self.settings.serves, **describe_serves(self.folder[: self.num])}
-        }
+        described = comparison.describe_serves(self.folder[: self.num])
+        return {"serves": {"source": self.settings.serves, **described}}
 
 
 class HitTally(Tally):
     """Counts of successes by court scenario: where a serve comes from, and where it goes."""
 
-    READS = (*COUNTED, *ScenarioCounts.READS)
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._scenarios = ScenarioCounts()
-
-    def add(self, rows: pa.Table) -> None:
-        """Add rows, one for each planned and judged case, to the counts."""
-        super().add(rows)
-        self._scenarios.add(rows)
+    MORE, READS = (ScenarioCounts,), (*COUNTED, *ScenarioCounts.READS)
 
     def examples(self, rows: pa.Table, success: np.ndarray) -> list[np.ndarray]:
         """Return masks of rows that qualify as example case of figures, the best mask first."""
         scenario = rows["scenario"].to_numpy()
         left_to_far = success & np.array([name[0] + name[2] == "LF" for name in scenario])
         return [left_to_far, *super().examples(rows, success)]
-
-    def summary(self) -> Entries:
-        """Return success rates from 0 to 1, in total and by scenario, with published rates."""
-        return {**super().summary(), "per_scenario": self._scenarios.summary()}
 
 
 class HitSweep(Sweep[HitSettings]):
@@ -123,10 +105,9 @@ class HitSweep(Sweep[HitSettings]):
         # Suites that other packages add cannot be used, since they define cases without serves.
         require_one_of(TASK.suites, "suite", str(settings.suite))
         folder = None if settings.serves is None else read_serves(settings.serves)
-        if folder is not None and (settings.num or 0) > len(folder):
-            rule = f"<= {len(folder)}, the serves that the folder holds"
-            raise ArgumentError("num", rule, settings.num)
         num = settings.DEFAULT_NUM if folder is None else len(folder)
+        fits = folder is None or (settings.num or 0) <= num
+        require(fits, "num", f"<= {num}, the serves that the folder holds", settings.num)
         return ServeSource(**fill_in(settings, num, batch), folder=folder)
 
     def setting(self, cases: PyTree) -> Entries:
@@ -137,7 +118,7 @@ class HitSweep(Sweep[HitSettings]):
 
     def table(self, manifest: Entries) -> RateTable:
         """Return success per scenario in percent, beside the rates of a published planner."""
-        return make_table(manifest)
+        return comparison.make_table(manifest)
 
     def remarks(self, manifest: Entries) -> list[str]:
         """Return sentences for the report: robot, serves, limits and rules of the referee."""
@@ -156,5 +137,5 @@ class HitSweep(Sweep[HitSettings]):
             f"acceleration and body-rate limits x {settings['limit_scale']:g}; returned ball "
             f"{truth} drag.",
             "The referee accepts a success: every limit within 1e-3 relative, landing within 1 cm.",
-            explain_table(manifest),
+            comparison.explain_table(manifest),
         ]

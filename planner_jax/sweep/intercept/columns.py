@@ -13,6 +13,7 @@ from planner_jax.runs.columns import LIST, VECTOR, Column, RefereedBatch, leaves
 
 FRAME = "world, in the plane, headings counter-clockwise from x; times from the car's start"
 WAY_POINTS = 65  # number of points at which the column `target_way` stores a target's path
+_WAY = f"predicted target at {WAY_POINTS} evenly spaced times from 0 to `due_time`, x and y"
 _FLAGS, _POINT = list_of(pa.bool_()), list_of(pa.float32(), 2)
 
 
@@ -53,13 +54,7 @@ COLUMNS = [
         ("target_turn_rate", "rad/s", "of this target, to the left", known.NUMBER, "turn_rate"),
         optional=True,
     ),
-    Column(
-        "target_way",
-        "m",
-        f"predicted target at {WAY_POINTS} evenly spaced times from 0 to `due_time`, x and y",
-        LIST,
-        _target_way,
-    ),
+    Column("target_way", "m", _WAY, LIST, _target_way),
     Column("wall_corners", "m", "N x V x 2", LIST, _corners("walls")),
     Column("mover_corners", "m", "at time 0, N x V x 2", LIST, _corners("movers")),
     *leaves_of(

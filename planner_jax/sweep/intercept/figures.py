@@ -63,11 +63,9 @@ class SampledDrive:
 
 def sample_drive(row: Row, setting: Entries, num: int) -> SampledDrive:
     """Sample the plan in a run's row at `num` evenly spaced times; `setting` has the car's size."""
-    start, speed, curvature = (
-        jnp.asarray(row[name], jnp.float32) for name in ("start", "speed", "curvature")
-    )
-    end = jnp.asarray(row["meeting_time"], jnp.float32)
-    found = _sample(start, end, speed, curvature, jnp.linspace(0.0, 1.0, num))
+    names = ("start", "meeting_time", "speed", "curvature")
+    numbers = [jnp.asarray(row[name], jnp.float32) for name in names]
+    found = _sample(*numbers, jnp.linspace(0.0, 1.0, num))
     sampled = {name: np.array(leaf) for name, leaf in found.items()}
     direction = np.stack([np.cos(sampled["pose"][:, 2]), np.sin(sampled["pose"][:, 2])], axis=1)
     ahead = 0.5 * setting["body_length"] - setting["body_rear_overhang"]
@@ -103,6 +101,7 @@ def _sample(
     return {"time": time, "pose": pose, "speed": v, "curvature": c, "acceleration": acceleration}
 
 
+_TIME = "time since the start of the car [s]"
 _SAMPLES = 241  # number of times at which a plan is sampled
 # Numbers of panels of a figure, each for one case; of panels in a row; and of panels for failures.
 _PANELS, _COLUMNS, _FAILURES = 6, 3, 2
@@ -129,9 +128,7 @@ def plane_figure(figure: Figure, run: RunRows) -> None:
         axes.set_xlabel("x [m]")
     for axes in panels[:, 0]:
         axes.set_ylabel("y [m]")
-    figure.colorbar(
-        colours, ax=panels, label="time since the start of the car [s]", aspect=20 * num_rows
-    )
+    figure.colorbar(colours, ax=panels, label=_TIME, aspect=20 * num_rows)
     figure.legend(handles=entries(colours), loc="outside upper center", ncols=6)
 
 
@@ -224,6 +221,7 @@ def draw_polygons(
     axes.add_collection(PolyCollection(polygons, linewidth=1.0, **look))
 
 
+_lateral = lambda drive: np.abs(drive.speed**2 * drive.curvature)  # noqa: E731
 _CURVE_SAMPLES = 801  # number of times at which a plan is sampled for curves over time
 _LEAST_DISTANCE = 1e-3  # [m] lower end of the logarithmic axis, where smaller distances are drawn
 # Panels of curves over time. Each has the name of a limit, the label of the panel's y axis, its
@@ -231,12 +229,7 @@ _LEAST_DISTANCE = 1e-3  # [m] lower end of the logarithmic axis, where smaller d
 _CURVES: tuple[tuple[str, str, str, Callable[[SampledDrive], np.ndarray]], ...] = (
     ("speed", "v [m/s]", "Speed", lambda d: d.speed),
     ("acceleration", "|a| [m/s²]", "Acceleration along the path", lambda d: np.abs(d.acceleration)),
-    (
-        "lateral_acceleration",
-        "|v² κ| [m/s²]",
-        "Lateral acceleration",
-        lambda d: np.abs(d.speed**2 * d.curvature),
-    ),
+    ("lateral_acceleration", "|v² κ| [m/s²]", "Lateral acceleration", _lateral),
     ("curvature", "|κ| [1/m]", "Curvature", lambda d: np.abs(d.curvature)),
 )
 
@@ -245,10 +238,9 @@ def motion_figure(figure: Figure, run: RunRows) -> None:
     """Draw several planners' plans for one case over time: distance, speed and curvature."""
     plans, setting = run.same_case(), run.manifest["setting"]
     panels = figure.subplots(2, 3, sharex=True)
-    drives = [
-        (sample_drive(row, setting, _CURVE_SAMPLES), look_of(index, name, row))
-        for index, (name, row) in enumerate(plans)
-    ][::-1]
+    looks = [look_of(index, name, row) for index, (name, row) in enumerate(plans)]
+    sampled = [sample_drive(row, setting, _CURVE_SAMPLES) for _, row in plans]
+    drives = list(zip(sampled, looks, strict=True))[::-1]
     axes = panels[0, 0]
     for drive, look in drives:
         away = np.linalg.norm(drive.middle - drive.target, axis=1)
@@ -263,7 +255,7 @@ def motion_figure(figure: Figure, run: RunRows) -> None:
         style.label(axes, "", unit, title)
     panels[0, 2].tick_params(labelbottom=True)
     for axes in (*panels[1, :2], panels[0, 2]):
-        axes.set_xlabel("time since the start of the car [s]")
+        axes.set_xlabel(_TIME)
     write_verdicts(panels[1, 2], run, plans, _word)
 
 
