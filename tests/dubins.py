@@ -2,7 +2,7 @@
 
 The path consists of three arcs, or of an arc, a straight line and an arc, at the greatest curvature
 [Dubins1957]. There are six such sequences (words). Their lengths are closed forms [Shkel2001],
-computed for all words at once, so that a batch needs no branches. SI units, headings from x axis.
+computed for all words at once, so that a batch needs no branches. All quantities are in SI units.
 """
 
 import jax

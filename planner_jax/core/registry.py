@@ -51,7 +51,7 @@ class Task:
     # Classes with the settings of the task's sweeps, and of its simulated flights in `sims`.
     sweep: str = "planner_jax.runs.settings:SweepSettings"
     flight: str | None = None
-    # Class with the settings of one case that a user specifies by a few numbers.
+    # Class with the options of `planner-jax plan`, which specify one case; None: no such command.
     single: str | None = None
     # Keyword arguments with which speed benchmarks call `planner`.
     bench: Mapping[str, object] = dataclasses.field(default_factory=dict)

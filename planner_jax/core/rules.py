@@ -204,7 +204,7 @@ def require_shapes(cases: PyTree) -> None:
 
 
 def _usual_batch(part: PyTree) -> tuple[int, ...]:
-    """Return the batch shape that most arrays in a part of a case have before their other axes."""
+    """Return the batch shape: the leading axes that most arrays in a part of a case have."""
     fronts: Counter[tuple[int, ...]] = Counter()
     for name, shape in {field.name: field.shape for field in type(part).rules}.items():
         if shape is not None and (value := part_at(part, name)) is not None:

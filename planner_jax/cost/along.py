@@ -70,7 +70,7 @@ class Along:
         return f"Along{(*shape, *code, *hinges, self.rate is None, self.orders)}"
 
     def matrices(self) -> np.ndarray:
-        """Return matrices (K, orders, C) from end states and offsets to K samples, at h = 1 s."""
+        """Return matrices (K, orders, C) from C columns to the motion at K samples, for h = 1 s."""
         each = [self.maps.sample_matrix(self.nodes, d) for d in range(self.orders)]
         return np.stack(each, axis=1)
 

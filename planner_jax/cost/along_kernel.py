@@ -285,8 +285,8 @@ def _of_sample(
 def sample_excess(along: Along, unit: Vectors, duration: Array, given: PyTree) -> tuple[Array, ...]:
     """Return the excess over each limit at one sample of a trajectory.
 
-    `unit` is the result of `unit_motion`, and `duration` the mean duration [s] of a piece. `given`
-    holds gravity and limits.
+    `unit` is the sample's motion for pieces of 1 s mean duration (see `unit_motion`), `duration`
+    the true mean duration [s] of a piece, and `given` the gravity and the limits.
     """
     rate = reciprocal(duration)
     rates = [rate, rate * rate, rate * rate * rate]

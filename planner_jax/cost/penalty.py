@@ -63,7 +63,7 @@ def peak_above(
     """
     rising, falling = (middle - left) / before, (middle - right) / after
     bend, turn = rising + falling, after * rising - before * falling
-    # The peak is `turn / (2 bend)` after the middle sample.
+    # The parabola's peak is at the time `turn / (2 bend)` after the middle sample.
     there = (bend > 0.0) & (turn <= 2.0 * after * bend) & (-turn <= 2.0 * before * bend)
     turn, bend = jnp.where(there, turn, 0.0), jnp.where(there, bend, 1.0)
     return turn * turn * reciprocal(4.0 * (before + after) * bend)

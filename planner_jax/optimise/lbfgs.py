@@ -120,8 +120,8 @@ def remember(memory: Memory, step: Array, change: Array) -> Memory:
 def search_direction(memory: Memory, grad: Array, step_cap: float) -> Array:
     """Return the quasi-Newton direction -H g (n,) for the gradient g, not longer than `step_cap`.
 
-    H approximates the inverse Hessian by the stored pairs. Without a stored pair the direction is
-    steepest descent with length 1, as the variables are in units of moderate steps.
+    H approximates the inverse Hessian by the stored pairs of steps and gradient changes. Without a
+    pair the direction is steepest descent with length 1, a moderate step in scaled variables.
     """
     q = grad
     alphas = []

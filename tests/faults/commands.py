@@ -43,7 +43,7 @@ def start(
     blocks: int | None = None,
     cores: int | None = None,
 ) -> subprocess.Popen:
-    """Start `python -m module` with arguments, on random cores, with files of at most some KiB."""
+    """Start `python -m MODULE` on some random cores, with files of at most `blocks` KiB."""
     path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
     environment = {"PYTHONFAULTHANDLER": "1", "PYTHONPATH": path}
     if cache:

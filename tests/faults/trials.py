@@ -123,7 +123,7 @@ def kill_workers(moment: random.Random, num: int, place: Path, base: Path) -> Su
 
 
 def damage_files(what: str, moment: random.Random, num: int, place: Path, base: Path) -> Survived:
-    """Damage files of the kind `what` (a key of TARGETS), and yield what a reader does then."""
+    """Damage files of the kind `what` (a key of TARGETS), and yield the readers' outcomes."""
     from tests.faults.runs import TARGETS, verdict  # needs the simulators
 
     with quick_sweeps():
