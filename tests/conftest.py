@@ -14,8 +14,8 @@ os.environ.setdefault("JAX_PLATFORMS", "cpu")
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(CACHE))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 os.environ.setdefault("MPLBACKEND", "agg")
-# Without XLA's fusion emitters, tests compile in two thirds of the time. Their small batches gain
-# little from fused loops. Later versions of XLA end the process, as they do not know this flag.
+# Without XLA's newer fusion emitters, tests compile in two thirds of the time, and their small
+# batches run as fast. Later versions of XLA do not know this flag and would end the process.
 if version("jaxlib") < "0.11":
     os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false")
 

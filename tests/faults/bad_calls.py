@@ -5,7 +5,7 @@ A row has a call, as a user writes it, and the start of the expected error messa
 `test_bad_calls.py` defines names in the calls, such as `hits`.
 """
 
-# Malformed values, as Python text, for arguments that are numbers, sizes, vectors, switches, ...
+# Malformed values, as Python text, for arguments of each kind, such as numbers or vectors.
 NOT_NUMBERS = ("'x'", "None", "(1, 2)", "1j", "[[1.0]]", "b'1'", "object()")
 NOT_SIZES = ("0", "-1", "1.5", "'2'", "None", "nan", "True", "(1,)")
 NOT_VECTORS = ("'abc'", "None", "5.0", "[]", "(1, 2)", "(1j, 0, 1)", "((1, 2), (3,))", "object()")

@@ -51,9 +51,9 @@ class Trial(NamedTuple):
 
 
 def kill(name: str, moment: random.Random, num: int, place: Path, base: Path) -> Survived:
-    """Kill a sweep, and commands that resume it, `num` times, until it is finished.
+    """Kill a sweep, and the commands that resume it, at `num` random moments.
 
-    It must then have the rows of an undisturbed run.
+    Every run that is finished must have the rows of the undisturbed run `base / name`.
     """
     task, whole, out = SWEEPS[name], rows_of(base / name), place / "run"
     began, tried, took = time.monotonic(), 0, 0.0
