@@ -90,14 +90,14 @@ def _add_constraint(cases: Any, extra: Any) -> Any:
 
 
 def add_spheres(row: Row, cases: Any, random: np.random.Generator) -> Any:
-    """Add to each case a forbidden sphere, 10 to 30 cm in radius, near the plan without it."""
+    """Add to each case a forbidden sphere, radius 10 to 30 cm, near the path planned without it."""
     place = _point_on_plan(row, cases, random)
     centre = place + random.normal(0.0, 0.08, place.shape)
     return _add_constraint(cases, pj.KeepOut(centre, random.uniform(0.1, 0.3, len(place))))
 
 
 def add_boxes(row: Row, cases: Any, random: np.random.Generator) -> Any:
-    """Add to each case a forbidden box, with sides of 20 to 60 cm, near the plan without it."""
+    """Add to each case a forbidden box, sides of 20 to 60 cm, near the path planned without it."""
     place = _point_on_plan(row, cases, random)
     middle = place + random.normal(0.0, 0.08, place.shape)
     half = random.uniform(0.1, 0.3, place.shape)

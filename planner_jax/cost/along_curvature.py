@@ -111,7 +111,7 @@ def curvature_along(
 
 
 def columns_columns(along: Along, at_samples: tuple[Array, ...], given: int = 0) -> Array:
-    """Return the Hessian (C, 3, C, 3) of a segment's penalty in end states and waypoint offsets."""
+    """Return the Hessian (C, 3, C, 3) of a segment's penalty by its C end states and offsets."""
     num = _constants(along, given).num_moving
     every = [(c, f) for c in range(num) for f in range(num)]
     return _square(_entries(along, given, every, at_samples), num)

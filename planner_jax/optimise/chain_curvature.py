@@ -1,8 +1,8 @@
 """Second derivatives of the objective of minimum-snap segments, for Newton's method.
 
 `cost.along_curvature` differentiates the penalties along a segment by its columns (scaled boundary
-states and waypoint offsets) and by its duration. Columns and durations depend on the end variables,
-and the chain rule converts the derivatives to derivatives by the end variables.
+states and waypoint offsets) and by its duration. Columns and durations depend on the end variables
+(of a segment's end), and the chain rule gives the derivatives by these variables.
 """
 
 import functools

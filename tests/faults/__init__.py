@@ -4,7 +4,7 @@
 import os
 from pathlib import Path
 
-# The variables of tests/conftest.py, for `python -m tests.faults` and the commands it starts.
+# Environment variables, as in tests/conftest.py, of `python -m tests.faults` and its commands.
 CACHE = Path(__file__).resolve().parents[2] / ".cache" / "jax"
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(CACHE))
