@@ -148,7 +148,7 @@ def run_in_turns(runs: dict[str, Callable], lanes: list[tuple]) -> tuple[dict, d
         lanes: arguments of the functions, one tuple for each of N problems.
 
     Returns:
-        results: by name, with NumPy leaves that are stacked over the problems.
+        results: by name, in NumPy arrays that are stacked over the problems.
         seconds: by name, (N,) [s], the fastest of three calls, because other programs may run too.
     """
     seconds = {name: np.full(len(lanes), np.inf) for name in runs}

@@ -62,7 +62,7 @@ class Policy(CatchDecision):
     def propose(self, case: CatchCase) -> CatchChoice:
         """Return proposals for the order and times of the catches in one case with N targets.
 
-        The leaves are (K, N) for K proposals. If targets are optional, further proposals are the
+        The arrays are (K, N) for K proposals. If targets are optional, further proposals are the
         same without the last few catches.
         """
         table = timetable(case)

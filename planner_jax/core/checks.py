@@ -21,7 +21,7 @@ from planner_jax.core.rules import FINITE, Rule
 
 
 def format_shapes(tree: PyTree) -> str:
-    """Return one line with the names and shapes of the leaves of a pytree."""
+    """Return one line with the names and shapes of the arrays in a pytree."""
     parts = jax.tree_util.tree_leaves_with_path(tree)
     names = (jax.tree_util.keystr(place, simple=True, separator=".") for place, _ in parts)
     return ", ".join(f"{n} {np.shape(leaf)}" for n, (_, leaf) in zip(names, parts, strict=True))
@@ -158,7 +158,7 @@ def require_path(
     Args:
         name: name of the argument.
         path: a pytree with a method `at(time)`.
-        axes: batch axes that every leaf has in front of the axes of one path.
+        axes: batch axes that every array of `path` has in front of the axes of one path.
         dimensions: dimension of the positions, 2 or 3.
         whose: name of the argument that determines `axes`, for the message.
     """

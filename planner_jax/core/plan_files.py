@@ -46,7 +46,7 @@ def save_arrays(path: str | os.PathLike, tree: PyTree) -> None:
 
 
 def load_arrays(path: str | os.PathLike, kind: type[Kind]) -> Kind:
-    """Return the dataclass, of NumPy leaves, that `save_arrays` wrote, or raise `PlanFileError`."""
+    """Return the dataclass that `save_arrays` wrote, in NumPy arrays, or raise `PlanFileError`."""
     require_path_name("path", path)
     version, name, arrays = _read(path)
     if version != VERSION or name != kind.__name__:

@@ -63,7 +63,7 @@ class Drive(Protocol):
         """Plan some of B cases again; return the better of the old and new plan of each case.
 
         `plan_of` makes plans of a batch of cases. The cases where `left` (B,) is true are planned,
-        unless the caller's time limit has passed. NumPy leaves of `plans` are changed in place.
+        unless the caller's time limit has passed. NumPy arrays in `plans` are changed in place.
         """
         ...
 
@@ -144,7 +144,7 @@ class Planner(Generic[CaseT, PlanT]):
         return jax.vmap(lambda case: self.solve(case, attempt))(cases)
 
     def solve_on_host(self, cases: CaseT, attempt: PyTree, /) -> PlanT:
-        """Return the plans that one attempt makes for a batch; NumPy leaves in and out."""
+        """Return the plans that one attempt makes for a batch; cases and plans in NumPy arrays."""
         raise NotImplementedError
 
     def plan_by(self, drive: Drive, cases: CaseT, /) -> PlanT:

@@ -127,7 +127,7 @@ class Plan:
 
     @classmethod
     def load(cls, path: str | os.PathLike) -> Self:
-        """Return the plan or batch that `save` wrote, with NumPy leaves.
+        """Return the plan or batch that `save` wrote, in NumPy arrays.
 
         Raises:
             PlanFileError: the file holds no plans, or plans of another class or version.
@@ -224,12 +224,12 @@ def mark_out_of_time(plans: PlanT, left: Numbers | bool) -> PlanT:
 
 
 def is_resident(tree: PyTree) -> bool:
-    """Return whether all leaves are jax arrays, which may be on other devices than the host."""
+    """Return whether all arrays of a pytree are jax arrays, which may be on another device."""
     return all(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(tree))
 
 
 def take(tree: Tree, k: int | np.integer | slice | Numbers) -> Tree:
-    """Return one case, plan or verdict of a batch, or several: entry `k` of every leaf.
+    """Return one case, plan or verdict of a batch, or several: entry `k` of each of its arrays.
 
     Args:
         tree: a pytree, or a dataclass of arrays such as a verdict, with a leading axis.
@@ -297,7 +297,7 @@ def select(later: PlanT, before: PlanT, where: Array | bool = True) -> PlanT:
 
 
 def select_into(plans: PyTree, later: PyTree, lanes: np.ndarray) -> PyTree:
-    """Replace plans in place by later plans of the same cases that are better; NumPy leaves.
+    """Replace plans, in place in NumPy arrays, by later plans of the same cases that are better.
 
     `lanes` are the indices of these cases in the batch. If there are more later plans than
     indices, the surplus plans are padding and are ignored.

@@ -91,7 +91,7 @@ class Ruled:
 
 @runtime_checkable
 class Case(Protocol):
-    """A pytree of arrays for one case, or for a batch with a leading axis on every leaf."""
+    """A pytree of arrays for one case, or for a batch with a leading axis on every array."""
 
     @property
     def batch_shape(self) -> tuple[int, ...]:

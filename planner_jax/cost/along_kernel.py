@@ -208,7 +208,7 @@ def _result_shapes(mode: str, treedef: Treedef, num_columns: int) -> list[tuple[
 
 
 def load_numbers(ref: Ref) -> PyTree:
-    """Load one number, or C columns of three components, for each lane (problem of the batch)."""
+    """Load a number, or from three axes a list of C columns (3), for each lane (problem)."""
     if len(ref.shape) != 3:
         return ref[...]
     return [[ref[c, axis] for axis in range(3)] for c in range(ref.shape[0])]

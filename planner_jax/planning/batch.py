@@ -141,7 +141,7 @@ def plan_batch(
         watch: ends the attempts at the time limit; the first attempt always starts.
 
     Returns:
-        The plans, with NumPy leaves, or with jax arrays if all leaves of the cases are jax arrays;
+        The plans, in NumPy arrays, or in jax arrays if all arrays of the cases are jax arrays;
         and the number of unsolved cases, or an array with one such number for each device.
     """
     planner, mesh = on_devices(planner, devices)
@@ -217,7 +217,7 @@ class _Batch:
     def try_lanes(
         self, cases: PyTree, attempt: Attempt, lanes: np.ndarray, plans: PyTree
     ) -> PyTree:
-        """Return all plans after one attempt at the cases with indices `lanes`; NumPy leaves."""
+        """Return all plans, in NumPy arrays, after one attempt at the cases of indices `lanes`."""
         calls = self._calls(attempt, lanes)
         found, tried = [], 0
         self.watch.report(self.planner, attempt, 0, lanes.size)

@@ -115,7 +115,7 @@ def _require_own_precision(leaves: list[PyTree]) -> None:
 
 
 def require_batch(cases: Case) -> int:
-    """Return the number of cases of a batch; raise `ValueError` unless all leaves agree on it."""
+    """Return the number of cases of a batch; raise `ValueError` unless all arrays agree on it."""
     batch = cases.batch_shape
     if len(batch) != 1 or batch[0] == 0:
         raise ArgumentError("cases", "a batch of at least one", shown=f"batch shape {batch}")

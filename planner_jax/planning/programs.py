@@ -219,7 +219,7 @@ def program_key(
 
 
 def solve_one(planner: Planner, case: PyTree, attempt: Attempt) -> PyTree:
-    """Return the plan of one case, with NumPy leaves; the case is sent as one vector."""
+    """Return the plan of one case in NumPy arrays; the case is sent to the device as one vector."""
     own = planner, planner.load_attempt(attempt, case)
     quickly = planner.compiles_quickly(attempt)
     return call_packed(_solve_one, None, own, case, compiles_quickly=quickly)
@@ -238,7 +238,7 @@ def call_packed(
     *,
     compiles_quickly: bool = False,
 ) -> PyTree:
-    """Return `function(static, own, case)` with NumPy leaves; the case is sent as one vector.
+    """Return `function(static, own, case)` in NumPy arrays; the case is sent as one vector.
 
     The pure function is compiled once for each hashable `static` and each layout of the other
     arguments. `own` is a pytree that stays on the device, such as a planner. `case` has NumPy
@@ -270,7 +270,7 @@ class _Result:
 
     tree: PyTree = None
     fields: list[tuple[slice, tuple[int, ...]]] = dataclasses.field(default_factory=list)
-    # Indices and dtypes of the leaves whose dtype differs from the packed vector's dtype.
+    # Indices and dtypes of the result's arrays whose dtype differs from the packed vector's dtype.
     others: list[tuple[int, np.dtype]] = dataclasses.field(default_factory=list)
 
 

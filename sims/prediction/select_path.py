@@ -228,7 +228,7 @@ def covariance(prediction: Prediction, time: ArrayLike) -> Array:
 
 
 def chance_within(prediction: Prediction, time: ArrayLike, radius: ArrayLike) -> Array:
-    """Return the probability () that a target is within a radius () [m] of its path at a time.
+    """Return the probability () that a target is within `radius` () [m] of its predicted position.
 
     The result is 0 if there were too few observations.
     """
