@@ -69,7 +69,7 @@ def record_programs() -> Iterator[dict[str, Program]]:
 
 
 def format_rows(planner: str, num: int, seconds: float, programs: dict[str, Program]) -> list[str]:
-    """Format a planner's rows of the table, the slowest program first, and a last row of sums."""
+    """Format a planner's rows of the table of compile times, the slowest first, the sums last."""
     columns = zip(*map(dataclasses.astuple, programs.values()), strict=True)
     shown = [row for row in programs.items() if row[1].compiling >= _SMALL]
     shown.sort(key=lambda row: -row[1].compiling)

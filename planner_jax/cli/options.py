@@ -33,7 +33,7 @@ class Unfinished(PlannerJaxError):
 def fail(
     error: str | PlannerJaxError, flags: Mapping[str, str] | None = None, code: int = BAD_ARGUMENT
 ) -> int:
-    """Print an error in one line, with the options in `flags` as argument names; return `code`."""
+    """Print an error, with names replaced by `flags`, such as "num" by "--num"; return `code`."""
     if isinstance(error, ArgumentError | MissingExtra):
         error = error.with_names(flags or {})
     print(f"planner-jax: error: {' '.join(str(error).split())}", file=sys.stderr)
@@ -59,14 +59,14 @@ class Parser(argparse.ArgumentParser):
         self._negative_number_matcher = re.compile(r"-\.?[0-9]")
 
     def parse_known_args(self, *arguments: Any, **how: Any) -> Any:
-        """Add the parser's options, then parse; the result's `flags` map arguments to options."""
+        """Add the options, then parse; the entry `flags` of the result maps "num" to "--num"."""
         if self._fill is not None:
             self._fill(self)
         self.set_defaults(flags=self._flags)
         return super().parse_known_args(*arguments, **how)
 
     def add(self, flag: str, *, type: type | None = None, **how: Any) -> None:
-        """Add the option `flag`, whose value is converted to `type`, or else remains text."""
+        """Add the option `flag`, whose value is converted to `type` if this is int or float."""
         if type in (int, float):
             how["type"] = partial(_read_number, flag, type)
         self._flags[self.add_argument(flag, **how).dest] = flag

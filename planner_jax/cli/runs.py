@@ -210,7 +210,6 @@ def _repeat_command() -> str:
 
 
 def _how_to_continue(out: Path, again: str, sign: str = "manifest.json") -> str:
-    """Return the advice `again` if folder `out` has the file `sign`, else `stopping.NOTHING`."""
     return again if (out / sign).exists() else stopping.NOTHING
 
 
@@ -218,7 +217,7 @@ def _how_to_continue(out: Path, again: str, sign: str = "manifest.json") -> str:
 def _tell_how_to_continue(
     remainder: Callable[[], str], rule: str = "--out must be a folder that can be written"
 ) -> Iterator[None]:
-    """Add `remainder()`, advice on how to continue, to errors and interruptions of the block."""
+    """Append the advice that `remainder()` returns to errors raised within the `with` block."""
     try:
         yield
     except KeyboardInterrupt:

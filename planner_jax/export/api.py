@@ -207,7 +207,7 @@ def _require_format(to: str, plan: Plan) -> Format:
 
 
 def _resolve(writer: str, purpose: str) -> Callable:
-    """Import the function "module:name"; raise `MissingExtra` if a package is not installed."""
+    """Import a writer "module:name" of this package; raise `MissingExtra` without its packages."""
     try:
         return pkgutil.resolve_name(f"planner_jax.export.{writer}")
     except ModuleNotFoundError as error:

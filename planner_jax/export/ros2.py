@@ -71,7 +71,7 @@ def trajectory_message(plan: Plan, rate: float = DEFAULT_RATE) -> object:
 
 
 def trajectory(plan: Plan, rate: float) -> tuple[str, dict[str, Json]]:
-    """Convert a plan to the type of its ROS message, a key of `TYPES`, and the fields' values."""
+    """Convert a plan to a ROS message; return its type, a key of `TYPES`, and its fields."""
     setpoints = setpoints_of(plan, rate)
     nanoseconds = np.round(setpoints.time * 1e9).astype(int).tolist()
     times = [dict(zip(("sec", "nanosec"), divmod(t, 10**9), strict=True)) for t in nanoseconds]

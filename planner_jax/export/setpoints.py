@@ -1,8 +1,9 @@
 """Setpoints and polynomials of a plan and its recovery trajectory, for all export formats."""
 
 import dataclasses
+import operator
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 
 import jax
 import numpy as np
@@ -31,31 +32,20 @@ class Robot:
     # Shapes of the plan's arrays by name. A letter stands for any size, equal in all the shapes.
     shapes: Mapping[str, tuple[int | str, ...]]
     case_field: str  # name of a field that only the cases of this robot have
-    end: Callable[..., float]  # function that returns the duration [s] of a plan
+    durations: str  # dotted name of the plan's durations [s], whose sum is the plan's duration
+
+    def end(self, plan: Plan) -> float:
+        """Return the duration [s] of a plan."""
+        return float(np.sum(np.asarray(operator.attrgetter(self.durations)(plan))))
 
 
+_FLOWN = {"trajectory.coeffs": ("M", "D", 3), "trajectory.durations": ("M",), "gravity": ()}
+_DRIVEN = {"start": (3,), "time": (), "speed": ("K",), "curvature": ("K",)}
+_MOVED = {"motion.coeffs": ("M", "D", 6), "motion.durations": ("M",)}
 ROBOTS = (
-    Robot(
-        "quadrotor",
-        QuadrotorPlan,
-        {"trajectory.coeffs": ("M", "D", 3), "trajectory.durations": ("M",), "gravity": ()},
-        "head_state",
-        lambda plan: float(np.sum(np.asarray(plan.whole.durations))),
-    ),
-    Robot(
-        "car",
-        CarPlan,
-        {"start": (3,), "time": (), "speed": ("K",), "curvature": ("K",)},
-        "movers",
-        lambda plan: float(plan.time),
-    ),
-    Robot(
-        "arm",
-        ArmPlan,
-        {"motion.coeffs": ("M", "D", 6), "motion.durations": ("M",)},
-        "scene",
-        lambda plan: float(np.sum(np.asarray(plan.motion.durations))),
-    ),
+    Robot("quadrotor", QuadrotorPlan, _FLOWN, "head_state", "whole.durations"),
+    Robot("car", CarPlan, _DRIVEN, "movers", "time"),
+    Robot("arm", ArmPlan, _MOVED, "scene", "motion.durations"),
 )
 
 
@@ -76,7 +66,7 @@ def robot_of(plan: Plan) -> Robot:
 
 
 def require_one(name: str, all_of: str, shape: tuple[int, ...]) -> None:
-    """Raise `ArgumentError` unless an argument with this batch shape is one of `all_of` plans."""
+    """Raise `ArgumentError` unless the batch shape is (); `all_of` is a name of plans or cases."""
     shown = f"a batch of shape {shape}"
     require(shape == (), name, f"one, as pj.take({all_of}, k) gives", shown=shown)
 

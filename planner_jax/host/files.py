@@ -46,7 +46,7 @@ def replacing(path: str | os.PathLike) -> Iterator[Path]:
 
 
 def new_file_problem(path: str | os.PathLike) -> str:
-    """Return the rule that a path breaks if no new file can be created there, otherwise ""."""
+    """Return why no new file can be created at a path, such as "a new file" is needed; else ""."""
     place = Path(path)
     if os.path.lexists(place):
         return "a new file"
@@ -56,7 +56,7 @@ def new_file_problem(path: str | os.PathLike) -> str:
 
 
 def to_disk(path: Path) -> None:
-    """Flush a file, or the names in a folder, to the disk."""
+    """Flush the content of a file, or the list of files of a folder, to the disk."""
     handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)

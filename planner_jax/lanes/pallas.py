@@ -97,12 +97,12 @@ def kernel_by_lanes(
 
 
 def load_masked(ref: Ref, index: tuple, mask: Array) -> Array:
-    """Read entries of a reference at arrays of indices; 0 where the mask is False."""
+    """Read entries of an array in GPU memory at indices; return 0 where the mask is False."""
     return load(ref.at[index], mask=mask, other=0.0)
 
 
 def store_masked(ref: Ref, index: tuple, value: Array, mask: Array) -> None:
-    """Write entries of a reference at arrays of indices, where the mask is True."""
+    """Write entries of an array in GPU memory at indices, where the mask is True."""
     store(ref.at[index], value, mask=mask)
 
 
@@ -112,7 +112,7 @@ def grid_index(axis: int) -> Array:
 
 
 def _spare_searches() -> None:
-    """Provide an empty module that JAX searches for; kernels are then lowered a third faster."""
+    """Register an empty module that JAX searches in vain; kernels are lowered a third faster."""
     name = "jaxlib.mlir.dialects.tt"
     if name not in sys.modules and importlib.util.find_spec(name) is None:
         sys.modules[name] = types.ModuleType(name)

@@ -30,7 +30,7 @@ class Arrivals:
         self._senders: dict[Hashable, tuple[float, int]] = {}
 
     def check(self, packet: Packet, sender: Hashable, now: float) -> tuple[Fault, bool]:
-        """Check a packet that arrives at `now` [s]; return its fault, and if its clock is new."""
+        """Check a packet that arrives at `now` [s]; return its fault, and if its clock changed."""
         self.was_late = False
         if packet.fault:
             return packet.fault, False

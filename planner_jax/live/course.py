@@ -29,7 +29,7 @@ class Course:
 
 
 def without_recovery(path: PiecewisePolynomial, gravity: Array) -> Course:
-    """Make a course of a plan's pieces alone; the pieces of the recovery have zero duration."""
+    """Make a course of a plan alone; the pieces that lead to standstill have zero duration."""
     end = state_on(path, np.sum(path.durations))
     return Course(_join(path, _stand_still(_REST.num_pieces, end[0])), gravity)
 
@@ -37,7 +37,7 @@ def without_recovery(path: PiecewisePolynomial, gravity: Array) -> Course:
 def with_recovery(
     path: PiecewisePolynomial, gravity: Array, limits: QuadrotorLimits
 ) -> tuple[Course, bool]:
-    """Append a recovery trajectory; return the course, and whether it keeps the limits."""
+    """Append a trajectory to standstill to a plan; return both, and whether the limits are kept."""
     state: Any = state_on(path, np.sum(path.durations))
     case = RecoveryCase(state, state[0], gravity, limits)
     rest: RecoveryPlan = solve_one(_REST, case, _REST.rounds[0])

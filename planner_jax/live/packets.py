@@ -104,7 +104,7 @@ class Answer:
 def request(
     kind: int, sequence: int, sent: float, measured: float, values: tuple, ball: int = 0
 ) -> bytes:
-    """Encode the values of a `kind` (BALL or ROBOT), the ball's number, and two times [s]."""
+    """Encode a measurement of the kind BALL or ROBOT; `sent` and `measured` are times [s]."""
     head = _HEADER.pack(MAGIC, VERSION, kind, ball, sequence, sent)
     return head + _MEASURED.pack(measured) + _VALUES[kind].pack(*values)
 
@@ -139,7 +139,7 @@ def answer(
     times: tuple[float, float, float],
     setpoints: np.ndarray,
 ) -> bytes:
-    """Encode an answer; `times` [s] are of the first setpoint, the period, and of the contact."""
+    """Encode an answer; `times` [s]: first setpoint, period of setpoints, contact with the ball."""
     head = _HEADER.pack(MAGIC, VERSION, ANSWER, packet.ball, packet.sequence, packet.sent)
     return head + _ANSWERED.pack(motion, fault, len(setpoints), *times) + setpoints.tobytes()
 

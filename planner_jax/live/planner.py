@@ -257,7 +257,7 @@ class LivePlanner(Generic[CaseT, PlanT]):
             self._complete()
 
     def _complete(self) -> None:
-        """Append a trajectory to standstill to the plan, or else resume the previous trajectory."""
+        """Append a trajectory to standstill to the plan; drop the plan if this exceeds a limit."""
         flight, before = self._flight, self._before
         if flight is None or flight.plan is None or before is None:
             return

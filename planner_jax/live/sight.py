@@ -9,14 +9,8 @@ from flax import struct
 from jax import Array
 from jax.typing import ArrayLike
 
-from planner_jax.ball.estimation import (
-    EkfModel,
-    EkfState,
-    Flight,
-    ekf_predict,
-    ekf_update,
-    solve_definite,
-)
+from planner_jax.ball import estimation
+from planner_jax.ball.estimation import EkfModel, EkfState, Flight
 from planner_jax.ball.flight import BallState
 from planner_jax.live.packets import Fault
 from planner_jax.planning.programs import call_packed
@@ -52,12 +46,12 @@ class Estimate:
 
 def _filter(flight: Flight, model: EkfModel, seen: Observation) -> Estimate:
     """Update the belief about a ball with an observation, and predict the ball's state."""
-    belief = ekf_predict(seen.belief, seen.since, model, flight=flight)
+    belief = estimation.ekf_predict(seen.belief, seen.since, model, flight=flight)
     away = seen.pos - belief.mean[:3]
     noise = jnp.diag(jnp.ones(3, away.dtype) * model.observation_std**2)
     spread = belief.covariance[:3, :3] + noise
-    is_outlier = jnp.sum(away * solve_definite(spread, away[:, None])[:, 0]) > _GATE**2
-    belief = ekf_update(belief, jnp.where(is_outlier, jnp.nan, seen.pos), model)
+    is_outlier = jnp.sum(away * estimation.solve_definite(spread, away[:, None])[:, 0]) > _GATE**2
+    belief = estimation.ekf_update(belief, jnp.where(is_outlier, jnp.nan, seen.pos), model)
     variances = jnp.diag(belief.covariance)[3:]
     ball = flight(belief.ball, seen.ahead, model.drag, model.gravity)
     return Estimate(belief, is_outlier, jnp.sqrt(jnp.max(variances)), ball)

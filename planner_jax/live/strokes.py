@@ -72,13 +72,12 @@ class Stroke(abc.ABC, Generic[CaseT, PlanT]):
         self._case = dataclasses.replace(self.case, limits=jax.tree.map(np.asarray, limits))
         self.flight, self.drag = flight, drag
         self._planner, self._replanner = planners
-        # Functions that plan from scratch, and that plan again: (optimiser's settings, planner,
-        # case) -> plan.
+        # Functions (optimiser's settings, planner, case) -> plan: to plan, and to plan again.
         self._solve_first, self._solve_again = solvers
         self.pieces = self._planner.num_pieces  # number of polynomial pieces of a plan
 
     def first(self, ball: BallState, head_state: Float[np.ndarray, "4 3"]) -> PlanT:
-        """Plan from scratch for a ball. `head_state` is the robot's position to jerk at time 0."""
+        """Plan for a ball; `head_state` is the position, velocity, acceleration, jerk at time 0."""
         case = dataclasses.replace(self._with_ball(ball), head_state=head_state)
         return call_packed(self._solve_first, self._planner.rounds[1], self._planner, case)
 

@@ -94,7 +94,7 @@ class Dataset:
         self.write(0, encode(rows, {}))
 
     def damages(self, num: int | None = None) -> dict[Path, str]:
-        """Return by path why files are damaged, or why the folder has not `num` rows in total."""
+        """Return by path what is wrong with damaged files, or with a folder without `num` rows."""
         found, counted = {}, 0
         for place, path in enumerate(self.files()):
             try:

@@ -43,7 +43,7 @@ class RunFolder:
         self._made: list[Path] = []
 
     def require(self, holds: bool, rule: str, shown: str) -> None:
-        """Raise `ArgumentError` with a rule on the folder, and what is there, unless `holds`."""
+        """Raise `ArgumentError` "NAME must be RULE, got SHOWN" on the folder unless `holds`."""
         require(holds, self.name, rule, shown=shown)
 
     def require_new(self) -> None:

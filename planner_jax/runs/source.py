@@ -42,7 +42,7 @@ class Source(abc.ABC):
         return -(-self.num // self.batch)
 
     def chunk(self, number: int) -> Chunk:
-        """Return the cases of block `number`; raise `ArgumentError` if a case breaks a rule."""
+        """Return the cases of chunk `number`; raise `ArgumentError` if a case breaks a rule."""
         return self.cases(number * self.batch, min((number + 1) * self.batch, self.num))
 
     def check(self) -> PyTree:

@@ -65,7 +65,7 @@ class Tally:
             more.add(rows)
 
     def examples(self, rows: pa.Table, success: np.ndarray) -> list[np.ndarray]:
-        """Return masks of rows that qualify as example case of figures, the best mask first."""
+        """Return masks of the rows that figures may show as example, the preferred mask first."""
         return [success, np.ones_like(success)]
 
     def summary(self) -> Entries:

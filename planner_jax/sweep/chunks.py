@@ -115,7 +115,7 @@ class Maker:
 
 
 def _files_of(parameters: Entries) -> dict[str, int]:
-    """Return for settings of the form "NAME:FILE" the CRC-32 checksums of the files."""
+    """Return, by setting, the CRC-32 checksums of files that settings name as "NAME:FILE"."""
     found = {}
     for name, value in parameters.items():
         path = value.partition(":")[2] if isinstance(value, str) else ""
@@ -132,7 +132,8 @@ def make_parts(
     """Plan every chunk of cases whose file is missing; return the records of all files by number.
 
     While one chunk is planned, the next chunk is drawn, and previous chunks are judged and written.
-    `there` has the records of existing files. Unless `workers` is None, other processes plan.
+    A record has a file's number of rows, successes and times. `there` has the records of existing
+    files. Unless `workers` is None, other processes plan.
     """
     source, records = maker.source, dict(there)
     done, successes = (sum(each[name] for each in there.values()) for name in ("num", "successes"))
@@ -170,7 +171,7 @@ def make_parts(
 def _make_here(
     maker: Maker, numbers: Iterable[int], pool: ThreadPoolExecutor
 ) -> Generator[Callable[[], Made], None, None]:
-    """Plan chunks of cases in this process; yield for each a function that judges and encodes."""
+    """Plan chunks of cases in this process; yield for each a function that returns its rows."""
     with CompileClock() as clock:
         draws = (pool.submit(as_here(maker.source.chunk), number) for number in numbers)
         following = next(draws, None)

@@ -60,8 +60,8 @@ def workers_of(kind: str | None) -> Iterator[Workers | None]:
     with tempfile.TemporaryDirectory("", "ray-", "/tmp", ignore_cleanup_errors=True) as folder:
         _start(ray, folder)
         try:
-            # Let JAX use one GPU in this process. Each worker uses one GPU, and the device that the
-            # run records must be equal in all processes.
+            # Let JAX use one GPU in this process, as in each worker: the device that a run records
+            # must be the same in all processes.
             os.environ[_GPUS] = os.environ.get(_GPUS, "0").partition(",")[0]
             os.environ["XLA_PYTHON_CLIENT_PREALLOCATE"] = "false"
             on_gpus = require_backend() == "gpu"
@@ -101,7 +101,7 @@ def _start(ray: ModuleType, folder: str) -> None:
 def _make_parts(
     ray: ModuleType, on_gpus: bool, maker: Maker, numbers: Iterable[int]
 ) -> Generator[Callable[[], Made], None, None]:
-    """Submit chunks of cases to Ray, a few per worker; yield functions that wait for each."""
+    """Submit chunks of cases to Ray, a few per worker; yield functions that wait for their rows."""
     cores, gpus = (int(ray.cluster_resources().get(name, 0)) for name in ("CPU", "GPU"))
     num, threads = max(cores, 1), threads_of_a_computation()
     environ, config, how = {}, {"jax_platforms": "cpu"}, {}
@@ -111,8 +111,7 @@ def _make_parts(
         num, threads = gpus * shared, max(2 * cores // (gpus * shared), 1)
         memory = {"XLA_CLIENT_MEM_FRACTION": f"{_MEMORY / shared:.4f}"}
         environ, config = {"XLA_PYTHON_CLIENT_PREALLOCATE": "false", **memory}, {}
-        # With `max_calls` 0 a worker process plans any number of blocks of cases, always on the
-        # same GPU.
+        # With `max_calls` 0 a worker process plans any number of chunks, always on the same GPU.
         how = {"num_gpus": 1.0 / shared, "max_calls": 0}
     environ |= dict.fromkeys(("NPROC", "PJRT_NPROC"), str(threads))
     config |= {"jax_enable_x64": jnp.result_type(float) == jnp.float64}

@@ -38,7 +38,7 @@ class ComparedRun:
 
     @property
     def settings(self) -> Entries:
-        """Settings of the run by name, as its manifest stores them, with `num` as a number."""
+        """Settings of the run by name, in which `num` is the number of its cases."""
         return {**self.manifest["parameters"], "num": len(self.index)}
 
     @property
@@ -116,8 +116,8 @@ def difference_of(first: ComparedRun, other: ComparedRun) -> Difference:
     mine = int((first.success & ~other.success).sum())
     theirs = int((other.success & ~first.success).sum())
     apart, num = mine + theirs, len(first.success)
-    # If no case is solved by exactly one run, k / n is undefined. The bound is then the end of
-    # Clopper-Pearson's interval for 0 events in all cases.
+    # If no case is solved by exactly one run, k / n is undefined. The bounds are then +- the upper
+    # end of Clopper-Pearson's interval for 0 events in all cases.
     if not apart:
         reach = float(binomtest(0, num).proportion_ci(0.95, "exact").high)
         return Difference(change, -reach, reach, mine, theirs, 1.0)

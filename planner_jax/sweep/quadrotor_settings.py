@@ -42,8 +42,7 @@ def resolve_robot(given: object, tool: str) -> "QuadrotorModel | None":
 
 def robot_remark(parameters: Row) -> list[str]:
     """Return a sentence on the robot that a run's settings name; [] without a robot."""
-    robot = parameters.get("robot")
-    if robot is None:
+    if (robot := parameters.get("robot")) is None:
         return []
     source = f" ({robot['source']})" if robot["source"] else ""
     return [f"Robot: {robot['name']}{source}; its figures stand in manifest.json."]

@@ -1,7 +1,5 @@
 """Cases and plans of finished sweeps, restored from the rows of a run for the command line."""
 
-from typing import NamedTuple
-
 import numpy as np
 from jax import Array
 from jaxtyping import PyTree
@@ -20,13 +18,6 @@ from planner_jax.sweep.sweep import settings_of
 from planner_jax.trajectory.polynomial import PiecewisePolynomial
 
 
-class PlannedRow(NamedTuple):
-    """A plan restored from a stored row of results, and the referee's reason for rejecting it."""
-
-    plan: Plan  # an object of the robot's plan class, such as `QuadrotorPlan`
-    sentence: str  # the referee's reason as a sentence; "" if the referee accepts the plan
-
-
 def case_of_row(folder: RunFolder, row: int) -> PyTree:
     """Return the case of a stored row; raise `ArgumentError` if it does not fit the manifest."""
     manifest, sweep = read_finished(folder)
@@ -38,8 +29,8 @@ def case_of_row(folder: RunFolder, row: int) -> PyTree:
     return take(cases, 0)
 
 
-def read_plan(folder: RunFolder, row: int | None) -> PlannedRow:
-    """Restore the plan from row `row` of a run, with the referee's reason if it was rejected."""
+def read_plan(folder: RunFolder, row: int | None) -> tuple[Plan, str]:
+    """Restore the plan from row `row` of a run; return also why the referee rejects it, or ""."""
     manifest, sweep = read_finished(folder)
     last = manifest["summary"]["num"] - 1
     if row is None or not 0 <= row <= last:
@@ -50,7 +41,7 @@ def read_plan(folder: RunFolder, row: int | None) -> PlannedRow:
         raise ArgumentError(folder.name, rule, shown=f"a {sweep.kind}")
     with folder.reading_rows():
         (found,) = folder.plans.pick([row])
-        return PlannedRow(sweep.plan_of_row(found, manifest["setting"]), found["sentence"])
+        return sweep.plan_of_row(found, manifest["setting"]), found["sentence"]
 
 
 def quadrotor_plan(row: Row, setting: Entries) -> QuadrotorPlan:

@@ -150,7 +150,7 @@ def _maker_of(sweep: Sweep, settings: SweepSettings) -> Maker:
 
 
 def _sound_parts(folder: RunFolder, manifest: Entries) -> dict[int, Record]:
-    """Return the records of all undamaged row files by number, and delete every other file."""
+    """Return the records of undamaged files of rows, by number, and delete every other file."""
     files, found = folder.plans.files(), {}
     for path in files:
         shown = f"{str(path)!r}, which is not"

@@ -51,7 +51,7 @@ class Sweep(Generic[AnySettings]):
     # A function that restores a plan from a row. Its arguments are the row and the manifest's entry
     # `setting`, which holds the physics of all cases.
     plan_of_row: Callable[[Row, Entries], Plan] | None = None
-    # Columns that the report's list of failures shows: the name of the column by its heading.
+    # Headings and columns of the report's list of failures.
     failure_words: ClassVar[Mapping[str, str]] = {
         "case": "index",
         "solver's status": "status",

@@ -55,7 +55,7 @@ class OpenStates:
         self._lengths, self._closed = {_cell_of(start.angles): 0.0}, set()
 
     def pop(self) -> State | None:
-        """Remove and return the next state in a grid cell not returned yet; None without one."""
+        """Remove and return the best state whose grid cell is new; None if no state is left."""
         while self._states:
             state = heapq.heappop(self._states)[2]
             if (cell := _cell_of(state.angles)) not in self._closed:
@@ -97,7 +97,7 @@ class EpaseBlock(PathThenTime):
     def path_to(
         self, case: BlockCase, free: FreeSpace, goal: Goal, left: Clock
     ) -> np.ndarray | None:
-        """Return a collision-free joint path (N, 6) [rad], or None if none is found in time."""
+        """Return a collision-free joint path (N, 6) [rad] to the goal, or None if none is found."""
         end = np.asarray(goal.angles, float)
         states = OpenStates(State(np.asarray(case.angles, float), 0.0), end, self.weight)
         while left() > 0.0 and (state := states.pop()) is not None:

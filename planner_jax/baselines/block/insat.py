@@ -66,7 +66,7 @@ class Bounds:
 
 @struct.dataclass
 class Splines:
-    """All K iterates of A splines that are optimised at once."""
+    """A splines of joint angles that are optimised at once, with the K iterates of each."""
 
     points: Array  # (A, K, m, 6) [rad], m control points
     time: Array  # (A, K) [s], duration

@@ -41,7 +41,7 @@ class RrtConnectBlock(PathThenTime):
     def path_to(
         self, case: BlockCase, free: FreeSpace, goal: Goal, left: Clock
     ) -> np.ndarray | None:
-        """Return a collision-free joint path (N, 6) [rad], or None if none is found in time."""
+        """Return a collision-free joint path (N, 6) [rad] to the goal, or None if none is found."""
         base, geometric = _ompl()
         space = base.RealVectorStateSpace(6)
         bounds = base.RealVectorBounds(6)

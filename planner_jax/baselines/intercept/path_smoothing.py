@@ -109,9 +109,9 @@ def smooth_path(
     middle = 0.5 * (body[0] + body[1])
 
     def evaluate(share: Array) -> tuple[Array, Array, Array, Array]:
-        """Return the path at a fraction of the shift to the smooth points, and whether it is valid.
+        """Return poses, curvatures and length of a partly smoothed path, and whether it is valid.
 
-        The path is its poses, curvatures and length.
+        Its points are moved by the fraction `share` of the way to the smooth points.
         """
         points = given + share * (smooth - given)
         found, bent, total = resample(points, poses[0, 2], poses[-1, 2], poses.shape[0])

@@ -203,9 +203,9 @@ def _cover_run(
     right = jnp.clip(finish - middle, -0.5 * width, 0.5 * width)
 
     def edge(side: float) -> Array:
-        """Return the lowest straight line above all rectangles (side 1).
+        """Return the lowest line above all rectangles (side 1), or the highest below (side -1).
 
-        Side -1 gives the highest line below all rectangles. The lines have the slopes `_SLOPES`.
+        The result has the line's stations at the start and the end of each slab of time.
         """
         height = side * station + half_step
         highest = jnp.max(jnp.where(is_in, height, -jnp.inf), axis=1)

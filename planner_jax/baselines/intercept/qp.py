@@ -116,7 +116,7 @@ def qp_template(
 class _Search:
     """State of the dual method: a point, and its working set of at most A active bounds.
 
-    The point is optimal if only these bounds count. Each of M bounded rows has two parallel planes.
+    The point is optimal if only these bounds count. A row's two bounds are two parallel planes.
     """
 
     point: Array  # (d,), coordinates of the point along d free directions

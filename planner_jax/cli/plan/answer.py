@@ -72,8 +72,7 @@ class Answer:
 class Single(abc.ABC, Generic[SingleT]):
     """Base class of the command `plan` for one task: it makes, plans and describes a case."""
 
-    # For a field of the case, the name of the option that sets the field. Other fields are set by
-    # an option of the same name.
+    # Option that sets a field of the case, by field. Other fields are set by options of their name.
     NAMES: ClassVar[dict[str, str]] = {"head_state": "start"}
 
     def __init__(self, task: Task, settings: SingleT):
@@ -89,7 +88,7 @@ class Single(abc.ABC, Generic[SingleT]):
 
     @abc.abstractmethod
     def task_margins(self, answer: Answer) -> list[Margin]:
-        """Return the margins to those limits that only this task has."""
+        """Return how close the plan comes to each limit that only this task has."""
 
     def answer(self) -> Answer:
         """Plan the case and judge the plan; raise `ArgumentError` if the case breaks a rule."""
@@ -117,7 +116,7 @@ class Single(abc.ABC, Generic[SingleT]):
         return [*lines, "", *_table(self.margins(answer))]
 
     def margins(self, answer: Answer) -> list[Margin]:
-        """Return the margins to all limits of the case: of flight, rotors and task."""
+        """Return how close the plan comes to each limit: of flight, of rotors, and of the task."""
         return [*_of_flight(answer), *_of_rotors(answer), *self.task_margins(answer)]
 
 
@@ -137,7 +136,7 @@ def _pieces(found: QuadrotorPlan) -> tuple[np.ndarray, np.ndarray]:
 def _closest(
     times: np.ndarray, words: str, values: np.ndarray, allowed: SupportsFloat, least: bool = False
 ) -> Margin:
-    """Return the margin at the time when a plan is closest to a limit, or exceeds it most."""
+    """Return the margin at the time at which `values` are closest to a limit, or exceed it most."""
     # Values are NaN where the attitude is undefined; such a plan exceeds the limit infinitely.
     values = np.nan_to_num(values, nan=-np.inf if least else np.inf)
     at = int(np.argmin(values) if least else np.argmax(values))
@@ -196,7 +195,7 @@ class OneRow(RunRows):
     row: Row
 
     def same_case(self) -> list[tuple[str, Row]]:
-        """Return the planner's name and the only row, as figures of one case expect them."""
+        """Return one pair in a list: the planner's name, and the only row."""
         return [(self.manifest["parameters"]["planner"], self.row)]
 
 

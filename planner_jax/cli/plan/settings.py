@@ -56,7 +56,7 @@ class SingleSettings:
                 require(sound, field.name, "finite", number)
 
     def of(self, task: Task) -> "SingleSettings":
-        """Check the planner's name; return a copy in which None is replaced by the default."""
+        """Check the planner's name; return a copy with the task's first planner instead of None."""
         name = next(iter(task.all_planners())) if self.planner is None else self.planner
         task.split_planner(name)
         return dataclasses.replace(self, planner=name)

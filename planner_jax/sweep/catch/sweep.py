@@ -112,7 +112,7 @@ class CatchSweep(Sweep[CatchSettings]):
         return [f"{text}."]
 
     def remarks(self, manifest: Entries) -> list[str]:
-        """Return sentences on robot, cases, how catches were ordered, limits, and what succeeds."""
+        """Return sentences on robot, cases, order of catches, limits, and the rule of success."""
         settings, limits = manifest["parameters"], manifest["setting"]
         gravity = limits["gravity"]
         return [

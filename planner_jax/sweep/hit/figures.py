@@ -58,7 +58,7 @@ def court_figure(figure: Figure, run: RunRows) -> None:
 def ball_path(
     pos: np.ndarray, vel: np.ndarray, end: float, drag: float, gravity: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return N times [s] from 0 to `end`, and the positions (N, 3) [m] of a flying ball then."""
+    """Return N times [s] from 0 to `end`, and the positions (N, 3) [m] of a flying ball."""
     time = np.linspace(0.0, end, _SAMPLES)
     pos, vel = (np.tile(vector, (_SAMPLES, 1)) for vector in (pos, vel))
     return time, fly(pos, vel, time, drag, gravity)[0]

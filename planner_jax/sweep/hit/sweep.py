@@ -51,7 +51,7 @@ class ServeSource(Source):
         return Chunk(serves.index, jax.tree.map(np.asarray, cases), serves)
 
     def check(self) -> PyTree:
-        """Check the first block of cases, or all cases if their serves are read from files."""
+        """Check the first chunk of cases, or all cases if their serves are read from files."""
         cases = super().check()
         for chunk in range(1, 1 if self.folder is None else self.num_chunks):
             self.chunk(chunk)
@@ -71,7 +71,7 @@ class HitTally(Tally):
     MORE, READS = (ScenarioCounts,), (*COUNTED, *ScenarioCounts.READS)
 
     def examples(self, rows: pa.Table, success: np.ndarray) -> list[np.ndarray]:
-        """Return masks of rows that qualify as example case of figures, the best mask first."""
+        """Return masks of the rows that figures may show as example, the preferred mask first."""
         scenario = rows["scenario"].to_numpy()
         left_to_far = success & np.array([name[0] + name[2] == "LF" for name in scenario])
         return [left_to_far, *super().examples(rows, success)]

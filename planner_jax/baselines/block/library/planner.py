@@ -51,7 +51,7 @@ class LibraryBlock(Planner):
 
     @property
     def attempts(self) -> tuple[Attempt, ...]:
-        """The only attempt: a lookup cannot be improved."""
+        """The only attempt, since a second lookup would find the same motion."""
         return (Attempt(),)
 
     def check(self, cases: BlockCase) -> None:

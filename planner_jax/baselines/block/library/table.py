@@ -55,7 +55,7 @@ def fingerprint(setting: Setting) -> str:
 
 @struct.dataclass
 class Table:
-    """The stored motions from H start poses, for P pairs of cells on two boxes."""
+    """Stored motions from H start poses, for P pairs of a cell on the outer and the inner box."""
 
     rows: Array | np.ndarray  # (H, P, 6 K + 10) float32, fields of `Row` for motions of K pieces
     homes: Array | np.ndarray  # (H, 6) [rad], joint angles at which the motions start
