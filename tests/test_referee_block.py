@@ -7,7 +7,7 @@ from referees import add, checks, edit, failure, stack, tree
 from scipy.optimize import least_squares, lsq_linear
 from scipy.spatial.transform import Rotation
 
-from planner_jax.referee import block, solids
+from planner_jax.referee import solids
 from planner_jax.referee.block import LIMITS, BlockVerdict, referee_blocks, times_inside
 from planner_jax.robot.arm import REGIMES, shield_pose
 from planner_jax.robot.arm_mjcf import irb1600
@@ -21,6 +21,7 @@ PIECES = (0.3, 0.6)
 ARM = jax.tree.map(lambda leaf: np.asarray(leaf, float), irb1600())
 HOME = ARM.home
 THICKNESS = 0.01
+COEFFS, DURATIONS = "plan.motion.coeffs", "plan.motion.durations"
 # Coefficients of the fifth-order polynomial from 0 to 1 that begins and ends at rest.
 REST_TO_REST, FROM_REST = (0.0, 0.0, 0.0, 10.0, -15.0, 6.0), (0.0, 0.0, 1.0)
 
@@ -83,12 +84,8 @@ def good(shape=REST_TO_REST, end=GOAL, durations=PIECES, velocity=INCOMING, at=C
     pairs, _ = jax.tree_util.tree_flatten_with_path(case(pos, begin, delay=DELAY, **options))
     leaves = {jax.tree_util.keystr(path)[1:]: np.asarray(leaf) for path, leaf in pairs}
     leaves |= {"ball.pos": pos, "ball.vel": begin, "gravity": GRAVITY, "delay": DELAY}
-    leaves |= {
-        "plan.motion.coeffs": motion(shape, end, durations),
-        "plan.motion.durations": durations,
-        "plan.contact_time": CONTACT_TIME,
-        "angles": HOME,
-    }
+    leaves |= {COEFFS: motion(shape, end, durations), DURATIONS: durations}
+    leaves |= {"plan.contact_time": CONTACT_TIME, "angles": HOME}
     leaves = {name: np.array(leaf)[None] for name, leaf in leaves.items()}
     return {k: leaf if leaf.dtype == bool else leaf.astype(float) for k, leaf in leaves.items()}
 
@@ -111,7 +108,7 @@ def assert_fails(leaves, name, *, part="", **found):
 def still(angles, **options):
     leaves = good(durations=(SPAN,), **options)
     angles = np.asarray(angles, float)
-    return leaves | {"plan.motion.coeffs": angles[None, None, None], "angles": angles[None]}
+    return leaves | {COEFFS: angles[None, None, None], "angles": angles[None]}
 
 
 def test_an_arm_that_swings_to_the_balls_place_blocks_it():
@@ -164,19 +161,15 @@ def spoil(edits, *found, **options):
 
 FAILURES = {
     "time: before the arm may start": spoil(
-        {"plan.contact_time": 0.07, "plan.motion.durations": 0.0}, 0.03, 0.07
+        {"plan.contact_time": 0.07, DURATIONS: 0.0}, 0.03, 0.07
     ),
     "time: motion too long": spoil({"plan.contact_time": 0.9}, 0.1, 0.9),
-    "time: negative": spoil({"plan.motion.durations": [[-0.25, 0.6]]}, 0.25, CONTACT_TIME),
+    "time: negative": spoil({DURATIONS: [[-0.25, 0.6]]}, 0.25, CONTACT_TIME),
     "time: an hour": spoil({"plan.contact_time": 3600.0}, 3540.0, 3600.0),
     "start: angle": spoil({("angles", 2): add(0.02)}, 0.02, DELAY, part="joint 3"),
     "start: rate": spoil({("rates", 4): add(0.3)}, 0.3, DELAY, part="joint 5"),
-    "continuity: angle": spoil(
-        {("plan.motion.coeffs", 1, 0, 3): add(0.01)}, 0.01, JOINT, part="joint 4"
-    ),
-    "continuity: rate": spoil(
-        {("plan.motion.coeffs", 1, 1, 0): add(-0.1)}, 0.1, JOINT, part="joint 1"
-    ),
+    "continuity: angle": spoil({(COEFFS, 1, 0, 3): add(0.01)}, 0.01, JOINT, part="joint 4"),
+    "continuity: rate": spoil({(COEFFS, 1, 1, 0): add(-0.1)}, 0.1, JOINT, part="joint 1"),
     "position: above": failure(
         overshoot(upper=HOME[5] + 0.35), 0.05, DELAY + SPAN / 3.0, part="joint 6"
     ),
@@ -231,7 +224,7 @@ def test_an_obstacle_moved_beyond_its_clearance_is_hit_by_the_difference(kind):
     assert f"{verdict.failed_part[0]} is 0.02 m " in verdict.sentence(0)
 
 
-def test_an_absent_pole_is_ignored():
+def test_an_absent_pole_and_absent_beams_are_ignored():
     leaves = good()
     leaves["scene.pole"][:] = CONTACT[:2]
     assert_fails(leaves, "pole", part="link 4")
@@ -239,30 +232,20 @@ def test_an_absent_pole_is_ignored():
     assert np.isposinf(assert_good(leaves).pole_clearance[0])
     leaves["scene.pole"][:], leaves["scene.pole_radius"][:] = np.nan, np.inf
     assert_good(leaves)
-
-
-def test_a_rig_without_beams_has_infinite_clearance():
-    leaves = good()
     leaves |= {name: leaves[name][:, :0] for name in ("scene.beam_ends", "scene.beam_radius")}
     assert np.isposinf(assert_good(leaves).rig_clearance[0])
 
 
 def test_an_arm_may_move_at_the_contact_if_the_case_does_not_require_rest():
     leaves = good(FROM_REST, regime="R1")
-    assert_good(leaves)
+    for early in (0.0, -5e-5, 5e-5):  # The motion is evaluated at the contact.
+        leaves[DURATIONS][0, -1] = PIECES[-1] - early
+        assert_good(leaves, contact_tolerance=1e-7)
     leaves["ends_at_rest"][:] = True
-    assert_fails(leaves, "rest", part=f"joint {STEEPEST + 1}")
+    assert_fails(leaves, "rest", part=STEEP)
     # An arm at rest may wait for the ball, whether the case requires rest or not.
     for regime in ("R1", "R3"):
         assert_good(good(regime=regime, durations=(0.2, 0.4)))
-
-
-def test_a_motion_that_ends_near_the_contact_is_evaluated_at_the_contact():
-    leaves = good(FROM_REST, regime="R1")
-    assert_good(leaves, contact_tolerance=1e-7)
-    for early in (-5e-5, 5e-5):
-        leaves["plan.motion.durations"][0, -1] = PIECES[-1] - early
-        assert_good(leaves, contact_tolerance=1e-7)
 
 
 def test_the_shield_may_be_met_beside_its_middle_and_at_an_angle_but_not_beyond_its_edge():
@@ -277,24 +260,19 @@ def test_the_shield_may_be_met_beside_its_middle_and_at_an_angle_but_not_beyond_
 def test_a_ball_is_inside_a_box_when_it_is_found_there():
     random = np.random.default_rng(3)
     num, times = 200, np.linspace(-1.0, 3.0, 4001)
-    lower = random.uniform([-1.0, -1.0, 0.0], 0.0, (num, 3))
+    corner = random.uniform([-1.0, -1.0, 0.0], 0.0, (num, 3))
+    low, high = corner + [0.0, 0.0, 0.3], corner + [1.5, 1.5, 0.7]
     moves = random.random((num, 3)) < 0.8
-    leaves = {
-        "ball.pos": random.uniform(-1.0, 1.0, (num, 3)) * [1.0, 1.0, 0.0],
-        "ball.vel": random.uniform([-1.0, -1.0, 3.0], [1.0, 1.0, 7.0], (num, 3)) * moves,
-        "gravity": random.uniform(5.0, 10.0, num),
-        "scene.box.lower": lower + [0.0, 0.0, 0.3],
-        "scene.box.upper": lower + [1.5, 1.5, 0.7],
-    }
+    pos = random.uniform(-1.0, 1.0, (num, 3)) * [1.0, 1.0, 0.0]
+    vel = random.uniform([-1.0, -1.0, 3.0], [1.0, 1.0, 7.0], (num, 3)) * moves
+    leaves = {"ball.pos": pos, "ball.vel": vel, "gravity": random.uniform(5.0, 10.0, num)}
+    leaves |= {"scene.box.lower": low, "scene.box.upper": high}
     with np.errstate(invalid="ignore"):
         begin, end = times_inside(leaves, "box", 0.05)
     computed = ((begin[..., None] <= times) & (times <= end[..., None])).any(axis=0)
-    fall = 0.5 * np.array([0.0, 0.0, 1.0]) * leaves["gravity"][:, None]
-    place = leaves["ball.pos"][:, None] + leaves["ball.vel"][:, None] * times[:, None]
-    place = place - fall[:, None] * times[:, None] ** 2
-    box = (leaves[f"scene.box.{side}"][:, None] for side in ("lower", "upper"))
-    low, high = next(box) - 0.05, next(box) + 0.05
-    sampled = ((low <= place) & (place <= high)).all(axis=2)
+    place = pos[:, None] + vel[:, None] * times[:, None]
+    place[..., 2] -= 0.5 * leaves["gravity"][:, None] * times**2
+    sampled = ((low[:, None] - 0.05 <= place) & (place <= high[:, None] + 0.05)).all(axis=2)
     np.testing.assert_array_equal(computed, sampled)
     changes = np.abs(np.diff(sampled.astype(int), axis=1)).sum(axis=1)
     assert (changes == 4).sum() > 5 and (changes == 0).sum() > 5
@@ -304,7 +282,7 @@ def test_a_ball_is_inside_a_box_when_it_is_found_there():
 def test_extrema_are_the_greatest_of_many_samples(seed):
     random = np.random.default_rng(seed)
     coeffs = random.normal(size=(1, 2, (2, 4, 8)[seed], 6))
-    leaves = good(durations=(0.3, 0.6)) | {"plan.motion.coeffs": coeffs}
+    leaves = good() | {COEFFS: coeffs}
     verdict = judge(leaves)
     for order, name in ((1, "velocity"), (2, "acceleration")):
         found = []
@@ -317,27 +295,9 @@ def test_extrema_are_the_greatest_of_many_samples(seed):
         assert getattr(verdict, f"{name}_share")[0] >= share * (1.0 - 1e-12)
 
 
-@pytest.mark.parametrize("durations", [(0.3, 0.6), (0.05, 0.02), (0.0, 0.9)])
-def test_samples_are_close_in_time_and_in_angle_and_hold_both_ends(monkeypatch, durations):
-    seen = {}
-
-    def record(case, links, angles, sampled):
-        seen.update(angles=angles[:, 0, sampled[0]])
-        return original(case, links, angles, sampled)
-
-    original = block.clearances
-    monkeypatch.setattr(block, "clearances", record)
-    judge(good(durations=durations))
-    angles = seen["angles"]
-    steps = np.linalg.norm(np.diff(angles), axis=0)
-    assert steps.max() <= block.LARGEST_TURN
-    assert len(steps) >= sum(durations) / block.LONGEST_STEP
-    np.testing.assert_allclose(angles[:, [0, -1]].T, [HOME, GOAL], atol=1e-12)
-
-
-def test_the_least_clearance_of_a_motion_is_that_of_a_pose_on_its_way():
-    leaves = good()
-    verdict = judge(leaves)
+@pytest.mark.parametrize("durations", [PIECES, (0.05, 0.02), (0.0, 0.9)])
+def test_the_least_clearance_of_a_motion_of_any_speed_is_the_least_of_its_poses(durations):
+    verdict = judge(good(durations=durations))
     shares = np.linspace(0.0, 1.0, 201)
     angles = HOME + np.polynomial.polynomial.polyval(shares, REST_TO_REST)[:, None] * CHANGE
     poses = judge(stack(*(still(each) for each in angles)))
@@ -348,19 +308,23 @@ def test_the_least_clearance_of_a_motion_is_that_of_a_pose_on_its_way():
 
 
 def gap(first, second):
-    """Solve for the distance of two solids, each with a middle, rows that span it, and a radius."""
+    """Solve for the distance of two rounded boxes, each a tuple (middle, half edges, radius)."""
     (middle, spans, radius), (other, others, more) = first, second
     columns = np.concatenate([spans, -np.asarray(others)]).T
     found = lsq_linear(columns, other - middle, bounds=(-1.0, 1.0), method="bvls", tol=1e-14)
     return np.sqrt(2.0 * found.cost) - radius - more
 
 
+def segment(first, second, radius=0.0):
+    return 0.5 * (first + second), [0.5 * (second - first)], radius
+
+
 def solids_of(angles):
     frames, found = links(angles), []
-    for k, (first, second) in enumerate(ARM.capsule_ends):
-        rotation, place = frames[ARM.capsule_link[k]]
-        middle, half = place + rotation @ (0.5 * (first + second)), 0.5 * (second - first)
-        found.append((ARM.capsule_link[k], middle, [rotation @ half], ARM.capsule_radius[k]))
+    for k, link in enumerate(ARM.capsule_link):
+        rotation, place = frames[link]
+        ends = place + ARM.capsule_ends[k] @ rotation.T
+        found.append((link, *segment(*ends, ARM.capsule_radius[k])))
     rotation, middle = shield(angles)
     half = np.array([0.5 * THICKNESS, ARM.shield_half, ARM.shield_half])
     plate = (6, middle - 0.5 * THICKNESS * rotation[:, 0], list(half[:, None] * rotation.T), 0.0)
@@ -368,13 +332,11 @@ def solids_of(angles):
 
 
 def brute_clearances(angles, scene):
-    """Return the least distances by kind, with every pair solved for."""
+    """Return the least clearance of each kind, from the distances of all pairs of solids."""
     arm = solids_of(angles)
     pole = (np.array([*scene.pole[0], 0.0]), [np.array([0.0, 0.0, 5.0])], scene.pole_radius[0])
-    beams = [
-        (0.5 * (a + b), [0.5 * (b - a)], radius)
-        for (a, b), radius in zip(scene.beam_ends[0], scene.beam_radius[0], strict=True)
-    ]
+    rods = zip(scene.beam_ends[0], scene.beam_radius[0], strict=True)
+    beams = [segment(*ends, radius) for ends, radius in rods]
     low, high = ARM.base_box
     base = (0.5 * (low + high), list(0.5 * np.diag(high - low)), 0.0)
     # The radius of link 4 at which it touches the shield while the wrist is straight.
@@ -431,8 +393,7 @@ def test_distances_of_segments_are_those_of_a_solver():
     d[:, 10:20] = c[:, 10:20] + (b - a)[:, 10:20] * random.normal(size=10)  # parallel
     found, points = solids.between_segments(a, b, c, d), solids.from_segment(c, a, b)
     for k in range(num):
-        first = 0.5 * (a + b)[:, k], [0.5 * (b - a)[:, k]], 0.0
-        second = 0.5 * (c + d)[:, k], [0.5 * (d - c)[:, k]], 0.0
+        first, second = segment(a[:, k], b[:, k]), segment(c[:, k], d[:, k])
         assert found[k] == pytest.approx(gap(first, second), abs=1e-9)
         assert points[k] == pytest.approx(gap(first, (c[:, k], np.zeros((1, 3)), 0.0)), abs=1e-9)
 
@@ -450,8 +411,7 @@ def test_distances_of_boxes_are_those_of_a_solver():
     assert (segments == 0.0).any() and (boxes < 0.0).any()
     for k in range(num):
         box = np.zeros(3), np.diag(half[:, k]), 0.0
-        segment = 0.5 * (a + b)[:, k], [0.5 * (b - a)[:, k]], 0.0
-        assert segments[k] == pytest.approx(gap(box, segment), abs=1e-9)
+        assert segments[k] == pytest.approx(gap(box, segment(a[:, k], b[:, k])), abs=1e-9)
         turned = 1.5 * middle[:, k], (rotation[..., k] * half[:, k]).T, 0.0
         apart = gap(turned, (np.zeros(3), np.diag(other[:, k]), 0.0))
         assert max(boxes[k], 0.0) == pytest.approx(apart, abs=1e-7)
@@ -462,35 +422,28 @@ def test_overlapping_boxes_are_as_deep_as_the_shortest_way_out():
     turn = Rotation.from_euler("z", 45.0, degrees=True).as_matrix()[..., None]
     middle = np.array([[0.9], [0.0], [0.2]])
     assert solids.between_boxes(middle, np.eye(3)[..., None], half, other)[0] == pytest.approx(-0.2)
-    corner = np.sqrt(0.5) * 0.3
     found = solids.between_boxes(middle, turn, half, other)[0]
-    assert found == pytest.approx(-(0.1 + corner))
+    assert found == pytest.approx(-(0.1 + np.sqrt(0.5) * 0.3))
 
 
 def unequal_lanes():
-    return [
-        good(),
-        FAILURES["tilt: by TURN"][0],
-        good(durations=(0.05, 0.06)),
-        good(durations=(0.1, 0.3)),
-        FAILURES["time: an hour"][0],
-        FAILURES["self: wrist"][0],
-        good(),
-    ]
+    tilted, late, touching = (
+        FAILURES[key][0] for key in ("tilt: by TURN", "time: an hour", "self: wrist")
+    )
+    quick, quicker = good(durations=(0.1, 0.3)), good(durations=(0.05, 0.06))
+    return [good(), tilted, quicker, quick, late, touching, good()]
 
 
 # Arguments of the tests in `test_referees`.
 FAILED = ["", "tilt", "velocity", "velocity", "time", "self", ""]
 UNREAD = {"arm.home", "arm.mass", "arm.centre", "arm.inertia"}  # for dynamics, and the home pose
 UNKNOWN = ("miss", "pole_clearance")
-PLANNED = ("plan.motion.coeffs", "plan.motion.durations", "plan.contact_time")
+PLANNED = (COEFFS, DURATIONS, "plan.contact_time")
 ABSURD, HARMLESS = ("ball.pos", "angles", "arm.origin", "scene.pole", *PLANNED), "scene.pole"
 READ = {name for name, leaf in good().items() if leaf.dtype == float} - UNREAD
+READ |= {"scene.has_pole", "ends_at_rest"}
 WRONG = [
     ({}, {"capsule_link": (6,) * 8}, "arm.capsule_link must be in -1, ..., 5"),
-    ({PLANNED[0]: np.zeros((1, 2, 6, 5))}, {}, r"coeffs must be \(B, M, D \+ 1, 6\), got"),
-    *(
-        ({name: good()[name][..., None]}, {}, f"{name} must be ")
-        for name in sorted({*READ, "scene.has_pole", "ends_at_rest"})
-    ),
+    ({COEFFS: np.zeros((1, 2, 6, 5))}, {}, r"coeffs must be \(B, M, D \+ 1, 6\), got"),
+    *(({name: good()[name][..., None]}, {}, f"{name} must be ") for name in sorted(READ)),
 ]

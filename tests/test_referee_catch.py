@@ -40,16 +40,12 @@ def above_net(place, time):
 
 
 def good():
-    """Return leaves, with leading axis 1, of catches of the last and the first of three targets."""
+    """Return arrays (1, ...) of a case and a plan by name: target 2 is caught, then target 0."""
     nowhere = np.full(3, np.nan)
+    first = rest_to_rest(START, FIRST, DURATIONS[:2])
+    second = rest_to_rest(FIRST, SECOND, DURATIONS[2:4])
     leaves = {
-        "coeffs": np.concatenate(
-            [
-                rest_to_rest(START, FIRST, DURATIONS[:2]),
-                rest_to_rest(FIRST, SECOND, DURATIONS[2:4]),
-                hover(SECOND, 2),
-            ]
-        ),
+        "coeffs": np.concatenate([first, second, hover(SECOND, 2)]),
         "durations": DURATIONS,
         "order": [2, 0, 1],
         "times": [*TIMES, TIMES[1]],
@@ -61,14 +57,9 @@ def good():
         "targets.ball.vel": [np.zeros(3), nowhere, np.zeros(3)],
         "targets.drag": [np.full(3, DRAG), nowhere, np.full(3, DRAG)],
         "targets.gravity": [GRAVITY, np.nan, GRAVITY],
-        "net.height": NET_HEIGHT,
-        "net.radius": NET_RADIUS,
-        "net.max_angle": math.pi / 6.0,
-        "limits.speed": 5.0,
-        "limits.min_thrust": 0.3 * GRAVITY,
-        "limits.max_thrust": 2.5 * GRAVITY,
-        "limits.body_rate": 5.0,
-        "limits.min_height": 0.25,
+        **{"net.height": NET_HEIGHT, "net.radius": NET_RADIUS, "net.max_angle": math.pi / 6.0},
+        **{"limits.min_thrust": 0.3 * GRAVITY, "limits.max_thrust": 2.5 * GRAVITY},
+        **{"limits.speed": 5.0, "limits.body_rate": 5.0, "limits.min_height": 0.25},
     }
     exact = {"order": int, "present": bool}
     return {k: np.array(leaf, exact.get(k, float))[None] for k, leaf in leaves.items()}
@@ -86,12 +77,9 @@ def one_target(place=START, *, pos=None, vel=(0.0, 0.0, -3.0), time=1.1, drag=0.
     pos = np.array(place) + [0.0, 0.0, NET_HEIGHT] if pos is None else np.asarray(pos)
     leaves = good()
     return leaves | {
-        "coeffs": hover(place, 2)[None],
-        "durations": np.array([[0.4, time - 0.4]]),
-        "order": np.array([[0]]),
-        "times": np.array([[time]]),
-        "present": np.array([[True]]),
-        "horizon": np.array([[3.0]]),
+        **{"coeffs": hover(place, 2)[None], "durations": np.array([[0.4, time - 0.4]])},
+        **{"order": np.array([[0]]), "times": np.array([[time]])},
+        **{"present": np.array([[True]]), "horizon": np.array([[3.0]])},
         "head_state": np.array([[place, *np.zeros((3, 3))]]),
         "targets.ball.pos": (pos - np.array(vel) * time)[None, None],
         "targets.ball.vel": np.array([[vel]], float),
@@ -269,9 +257,9 @@ def test_a_tilted_thrust_tilts_the_net():
     end = np.array([0.5 * push * time**2, 0.0, 1.2])
     path = [Polynomial([0.0, 0.0, 0.5 * push]), Polynomial([0.0]), Polynomial([1.2])]
     across = np.array([-axis[2], 0.0, axis[0]])
-    leaves = one_target(
-        pos=end + NET_HEIGHT * axis + 0.1 * across - 0.003 * axis, vel=-4.0 * axis, time=time
-    ) | {"coeffs": cut(path, durations)[None], "durations": durations[None]}
+    pos = end + NET_HEIGHT * axis + 0.1 * across - 0.003 * axis
+    leaves = one_target(pos=pos, vel=-4.0 * axis, time=time)
+    leaves |= {"coeffs": cut(path, durations)[None], "durations": durations[None]}
     leaves["head_state"][0, 2, 0] = push
     verdict = assert_good(leaves)
     assert verdict.angle[0, 0] == pytest.approx(0.0, abs=1e-12)
@@ -287,9 +275,8 @@ def test_a_ball_with_linear_drag_is_where_integration_puts_it(drag):
     def fall(_, state):
         return np.concatenate([state[3:], -drag * state[3:] - [0.0, 0.0, GRAVITY]])
 
-    end = solve_ivp(
-        fall, (0.0, time), np.concatenate([pos, vel]), method="DOP853", rtol=1e-12, atol=1e-12
-    ).y[:, -1]
+    exact = {"method": "DOP853", "rtol": 1e-12, "atol": 1e-12}
+    end = solve_ivp(fall, (0.0, time), np.concatenate([pos, vel]), **exact).y[:, -1]
     leaves = one_target(end[:3] - [0.0, 0.0, NET_HEIGHT], time=time, gravity=GRAVITY)
     leaves["targets.ball.pos"][0, 0], leaves["targets.ball.vel"][0, 0] = pos, vel
     leaves["targets.drag"][0, 0] = drag
@@ -364,14 +351,9 @@ def test_targets_of_a_users_class_are_followed_by_a_function():
 
 def unequal_lanes():
     only = {"present": [False, False, True], "order": [2, 1, 0], ("durations", (2, 3, 4, 5)): 0.0}
-    return [
-        good(),
-        edit(good(), {"limits.speed": 1.25}),
-        edit(good(), only),
-        edit(good(), {("head_state", 0): add(0.2)}),
-        edit(good(), {("targets.ball.pos", 2, 0): add(0.5)}),
-        edit(good(), {"order": [0, 2, 1], "horizon": 3.0}),
-    ]
+    edits = [{}, {"limits.speed": 1.25}, only, {("head_state", 0): add(0.2)}]
+    edits += [{("targets.ball.pos", 2, 0): add(0.5)}, {"order": [0, 2, 1], "horizon": 3.0}]
+    return [edit(good(), each) for each in edits]
 
 
 def test_caught_targets_are_counted_and_none_is_caught_by_a_broken_plan():

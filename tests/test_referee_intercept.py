@@ -1,7 +1,6 @@
 """The referee of interceptions, on plans in closed form, without a planner."""
 
 import math
-from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -41,7 +40,7 @@ def group(polygons=(), velocities=(), room=(3, 6)):
 
 
 def good(speed=SPEED, curvature=0.0, time=TIME, start=START, end=None, walls=(), movers=((), ())):
-    """Return the leaves, with leading axis 1, of a car that drives to its target.
+    """Return arrays (1, ...) of a case and a plan by name: a car drives to its target.
 
     The default end is the end of a straight drive at constant speed.
     """
@@ -50,31 +49,16 @@ def good(speed=SPEED, curvature=0.0, time=TIME, start=START, end=None, walls=(),
     ahead = np.array([math.cos(start[2]), math.sin(start[2])])
     end = start[:2] + (speed[0] * time + MIDDLE) * ahead if end is None else np.asarray(end)
     leaves = {
-        "plan.start": start,
-        "plan.time": time,
-        "plan.speed": speed,
-        "plan.curvature": curvature,
-        "start": start,
-        "speed": speed[0],
-        "curvature": curvature[0],
-        "time": time,
-        "tolerance": 0.05,
-        "end_heading": 0.0,
-        "heading_tolerance": math.pi,
-        "lower": (0.0, 0.0),
-        "upper": (8.0, 8.0),
-        "target.pos": end - [0.0, 0.3 * time],
-        "target.vel": (0.0, 0.3),
-        "target.turn_rate": 0.0,
-        "body.length": LENGTH,
-        "body.width": WIDTH,
-        "body.wheelbase": WHEELBASE,
-        "body.rear_overhang": REAR,
-        "limits.speed": 1.5,
-        "limits.acceleration": 1.0,
-        "limits.lateral_acceleration": 0.8,
-        "limits.curvature": 2.0,
-        "limits.steering_rate": 2.0,
+        **{"plan.start": start, "plan.time": time, "plan.speed": speed},
+        **{"plan.curvature": curvature, "start": start, "time": time},
+        **{"speed": speed[0], "curvature": curvature[0], "tolerance": 0.05},
+        **{"end_heading": 0.0, "heading_tolerance": math.pi},
+        **{"lower": (0.0, 0.0), "upper": (8.0, 8.0), "target.pos": end - [0.0, 0.3 * time]},
+        **{"target.vel": (0.0, 0.3), "target.turn_rate": 0.0},
+        **{"body.length": LENGTH, "body.width": WIDTH},
+        **{"body.wheelbase": WHEELBASE, "body.rear_overhang": REAR},
+        **{"limits.speed": 1.5, "limits.acceleration": 1.0, "limits.curvature": 2.0},
+        **{"limits.lateral_acceleration": 0.8, "limits.steering_rate": 2.0},
     }
     leaves = {name: np.array(leaf, float)[None] for name, leaf in leaves.items()}
     for name, (polygons, velocities) in {"walls": (walls, ()), "movers": movers}.items():
@@ -257,33 +241,34 @@ def test_polygons_may_have_either_orientation_and_repeated_corners():
     plain, turned = good(walls=[wall]), good(walls=[wall[::-1]])
     tight = good()
     tight |= {f"walls.{k}": leaf for k, leaf in group([wall], room=(1, 4)).items()}
+    expected = assert_good(plain).wall_clearance
     for leaves in (turned, tight):
-        np.testing.assert_allclose(
-            assert_good(leaves).wall_clearance, assert_good(plain).wall_clearance, rtol=1e-12
-        )
-    assert assert_good(plain).wall_clearance[0] == pytest.approx(0.2 - 0.5 * WIDTH)
+        np.testing.assert_allclose(assert_good(leaves).wall_clearance, expected, rtol=1e-12)
+    assert expected[0] == pytest.approx(0.2 - 0.5 * WIDTH)
+
+
+def spoil(edits, *found, **options):
+    return failure(edit(good(), edits), *found, **options)
 
 
 BACKWARDS = [SPEED] * 6 + [-0.15] + [SPEED] * 4
 FAILURES = {
-    "time: late": failure(edit(good(), {"time": TIME - 0.5}), 0.5, TIME),
-    "time: negative": failure(edit(good(), {"plan.time": -1.0}), 1.0, -1.0),
-    "time: an hour": failure(edit(good(), {"plan.time": 4000.0, "time": 4000.0}), 400.0, 4000.0),
-    "start: position": failure(edit(good(), {("start", (0, 1)): add([0.3, 0.4])}), 0.5, 0.0),
-    "start: heading": failure(
-        edit(good(), {("plan.start", 2): add(2.0 * math.pi + 0.02)}), 0.02, 0.0
-    ),
-    "start: speed": failure(edit(good(), {"speed": add(0.1)}), 0.1, 0.0),
-    "start: curvature": failure(edit(good(), {"curvature": add(0.2)}), 0.2, 0.0),
-    "speed: too fast": failure(edit(good(), {"limits.speed": 0.64}), 0.25, 0.0),
+    "time: late": spoil({"time": TIME - 0.5}, 0.5, TIME),
+    "time: negative": spoil({"plan.time": -1.0}, 1.0, -1.0),
+    "time: an hour": spoil({"plan.time": 4000.0, "time": 4000.0}, 400.0, 4000.0),
+    "start: position": spoil({("start", (0, 1)): add([0.3, 0.4])}, 0.5, 0.0),
+    "start: heading": spoil({("plan.start", 2): add(2.0 * math.pi + 0.02)}, 0.02, 0.0),
+    "start: speed": spoil({"speed": add(0.1)}, 0.1, 0.0),
+    "start: curvature": spoil({"curvature": add(0.2)}, 0.2, 0.0),
+    "speed: too fast": spoil({"limits.speed": 0.64}, 0.25, 0.0),
     "speed: backwards": failure(edit(good(BACKWARDS), {"limits.acceleration": np.inf}), 0.1, 6 * H),
     "curvature: at a knot": failure(
         edit(good(SPEED, 0.5), {"limits.curvature": 0.5, ("plan.curvature", 4): 0.6}), 0.2, 4 * H
     ),
-    "map: beyond its edge": failure(
-        edit(good(), {("upper", 0): START[0] + MIDDLE + SPEED * TIME - 0.4}), 0.4, TIME
+    "map: beyond its edge": spoil(
+        {("upper", 0): START[0] + MIDDLE + SPEED * TIME - 0.4}, 0.4, TIME
     ),
-    "meeting: missed": failure(edit(good(), {("target.pos", 1): add(0.2)}), 0.2, TIME),
+    "meeting: missed": spoil({("target.pos", 1): add(0.2)}, 0.2, TIME),
 }
 
 
@@ -295,14 +280,11 @@ def test_a_plan_may_end_before_the_cases_time():
 
 def test_the_true_path_replaces_the_expected_one():
     leaves = good()
-    truth = SimpleNamespace(
-        pos=leaves["target.pos"] + [[0.3, 0.0]],
-        vel=leaves["target.vel"],
-        turn_rate=leaves["target.turn_rate"],
-    )
+    truth = tree(leaves).target
+    truth.pos = truth.pos + [0.3, 0.0]
     assert_fails(leaves, "meeting", excess=0.3, truth=truth)
     leaves["target.pos"][:] = np.nan
-    truth.pos -= [0.3, 0.0]
+    truth.pos = truth.pos - [0.3, 0.0]
     assert_good(leaves, truth=truth)
 
 

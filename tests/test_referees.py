@@ -73,9 +73,8 @@ def test_float32_arrays_of_jax_are_taken_as_they_are(judged):
     lanes = stack(tests.unequal_lanes()[0], tests.good())
     verdict = judge({k: jnp.asarray(leaf, kinds[leaf.dtype.kind]) for k, leaf in lanes.items()})
     np.testing.assert_array_equal(verdict.failed_limit, judge(lanes).failed_limit)
-    assert {value.dtype for value in rows(verdict).values() if value.dtype.kind == "f"} == {
-        np.dtype(float)
-    }
+    dtypes = {value.dtype for value in rows(verdict).values() if value.dtype.kind == "f"}
+    assert dtypes == {np.dtype(float)}
 
 
 def test_an_empty_batch_has_an_empty_verdict(judged):
