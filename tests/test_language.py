@@ -1,4 +1,4 @@
-"""How the project writes, by the counts of `tests/language.py`."""
+"""Docstrings and names keep the project's rules of language, counted by `tests/language.py`."""
 
 from language import find_participles, find_phrases, share_of_imperatives
 

@@ -1,4 +1,4 @@
-"""L-BFGS: directions of the textbook, known minima, and the status of every end."""
+"""L-BFGS: directions of the textbook, known minima, and the status of ended searches."""
 
 import functools
 
@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import scipy.optimize
 
 from planner_jax.core.protocol import Status, status_of
 from planner_jax.optimise import lbfgs
@@ -40,17 +39,7 @@ LONG = LbfgsConfig(max_steps=300, tolerance=1e-12, patience=8)
 def test_known_minimum_is_found(float64, cost):
     found = search(without_limits(cost), np.full(6, -0.5), LONG)
     np.testing.assert_allclose(found.point, 1.0, atol=1e-4)
-    assert found.stationary
-
-
-def test_final_cost_is_as_low_as_scipys(float64):
-    start = np.full(6, -0.5)
-    ours = search(without_limits(rosenbrock), start, LONG)
-    slopes = jax.jit(jax.value_and_grad(rosenbrock))
-    theirs = scipy.optimize.minimize(
-        slopes, start, jac=True, method="L-BFGS-B", options={"maxcor": 6}
-    )
-    assert ours.evaluation.cost <= theirs.fun + 1e-8
+    assert found.stationary and found.evaluation.cost < 1e-8
 
 
 def two_loop_by_the_book(steps, changes, grad):
@@ -77,9 +66,8 @@ def test_direction_equals_the_two_loop_recursion(float64):
     grads = np.asarray(jax.jit(jax.vmap(jax.grad(stretch)))(points))
     steps, changes = np.diff(points[:-1], axis=0)[-4:], np.diff(grads[:-1], axis=0)[-4:]
     expected = two_loop_by_the_book(list(steps), list(changes), grads[-2])
-    np.testing.assert_allclose(
-        direction_of(state.memory, state.grad, config.step_cap), expected, rtol=1e-9
-    )
+    found = direction_of(state.memory, state.grad, config.step_cap)
+    np.testing.assert_allclose(found, expected, rtol=1e-9)
     taken = points[-1] - points[-2]
     lengths = taken / expected
     np.testing.assert_allclose(lengths, lengths[0], rtol=1e-6)
@@ -162,15 +150,13 @@ def test_best_feasible_iterate_is_kept_when_the_minimum_is_infeasible():
     config = LbfgsConfig(max_steps=80, trial_steps=(0.3,), step_cap=0.2)
     found = search(objective, np.full(2, 3.0, np.float32), config)
     assert found.evaluation.violation <= 0.0
-    assert jnp.all(found.point >= 1.0)
-    assert jnp.all(found.point < 1.5)
+    assert jnp.all((found.point >= 1.0) & (found.point < 1.5))
 
 
 def end_of(objective, start, **options):
     found = search(objective, start, LbfgsConfig(**options))
-    return Status(
-        int(status_of(found.evaluation.cost, found.evaluation.violation, found.stationary))
-    )
+    numbers = found.evaluation.cost, found.evaluation.violation, found.stationary
+    return Status(int(status_of(*numbers)))
 
 
 def test_every_end_of_a_search_has_its_status():

@@ -12,13 +12,8 @@ from planner_jax.optimise.levenberg import LevenbergConfig, Model, least_squares
 def of_residuals(residuals, violation=lambda x: jnp.array(-1.0)):
     def evaluate(x):
         r, slopes = residuals(x), jax.jacfwd(residuals)(x)
-        product = lambda a, b: jnp.matmul(a, b, precision="highest")  # noqa: E731
-        return Model(
-            cost=jnp.sum(r**2),
-            gradient=product(r, slopes),
-            curvature=product(slopes.T, slopes),
-            violation=violation(x),
-        )
+        gradient, curvature = (jnp.matmul(a, slopes, precision="highest") for a in (r, slopes.T))
+        return Model(jnp.sum(r**2), gradient, curvature, violation(x))
 
     return evaluate
 

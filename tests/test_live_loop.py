@@ -17,7 +17,6 @@ import pytest
 import planner_jax as pj
 from planner_jax.benchmarks.serve_soak import distance_off
 from planner_jax.cli.main import main
-from planner_jax.core.errors import ArgumentError
 from planner_jax.live import planner as live_planner
 from planner_jax.live.course import with_recovery
 from planner_jax.live.packets import BALL, ROBOT, Fault, Motion, read_answer, request
@@ -165,15 +164,10 @@ def test_bad_packets_are_counted_by_name_without_an_effect(warm, path):
     def disturb(step, data):
         throw.sequence += 4
         n, now = throw.sequence - 3, throw.now
-        packets = [
-            [data, data],
-            [data, data[:-3]],
-            [b"junk", data],
-            [request(BALL, n, now, now, nan, 4), data],
-            [data, request(BALL, n, now, now, far, 4)],
-            [request(BALL, n, 1e300, 1e300, far, 4), data],
-            [data[:5] + b"\x63" + data[6:], data],
-        ]
+        unknown, of_nan = data[:5] + b"\x63" + data[6:], request(BALL, n, now, now, nan, 4)
+        before = [b"junk", of_nan, request(BALL, n, 1e300, 1e300, far, 4), unknown]
+        after = [data, data[:-3], request(BALL, n, now, now, far, 4)]
+        packets = [*([data, bad] for bad in after), *([bad, data] for bad in before)]
         return packets[step % len(packets)]
 
     clean = balls_of(Throw(warm, path, 4).fly(60))[-1]
@@ -199,8 +193,7 @@ def test_throws_are_caught_by_plans_with_recoveries(warm):
         ball = [np.interp(since, STEP * np.arange(200), positions[:, k]) for k in range(3)]
         assert distance_off(last, 0.2, 9.81, np.array(ball)) < 0.125
         assert since < 1.0
-    for name in ("endless", "refused"):
-        assert warm.report.counts[name] == before[name]
+    assert all(warm.report.counts[name] == before[name] for name in ("endless", "refused"))
 
 
 def test_a_robot_off_its_course_gets_a_recovery_from_its_position(warm, path):
@@ -289,10 +282,10 @@ def test_a_robot_is_selected_by_name_and_must_carry_the_tool():
     stroke = CatchServe(robot="x500-net").stroke()
     assert float(stroke.case.net.radius) == pytest.approx(0.2)
     assert CatchServe().stroke().case.net.radius == CatchStroke().case.net.radius
-    with pytest.raises(ArgumentError, match="robot must carry a racket"):
+    with pytest.raises(pj.ArgumentError, match="robot must carry a racket"):
         HitServe(robot="x500-net")
     for robot, rule in (("nobody", "one of"), ("gone.yaml", "a file that can be read")):
-        with pytest.raises(ArgumentError, match=f"robot must be {rule}"):
+        with pytest.raises(pj.ArgumentError, match=f"robot must be {rule}"):
             CatchServe(robot=robot)
 
 

@@ -7,44 +7,37 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from planner_jax.live import packets
 from planner_jax.live.arrivals import Arrivals
-from planner_jax.live.packets import (
-    BALL,
-    ROBOT,
-    WIDTH,
-    Fault,
-    Motion,
-    Packet,
-    answer,
-    read_answer,
-    read_request,
-    request,
-)
+from planner_jax.live.packets import Fault, Packet
 from planner_jax.live.report import Latencies
 
-BALL_SEEN = request(BALL, 7, 5.0, 4.99, (1.0, 2.0, 3.0), 4)
+BALL_SEEN = packets.request(packets.BALL, 7, 5.0, 4.99, (1.0, 2.0, 3.0), 4)
 
 
 def test_a_request_comes_back_as_it_was_packed():
-    packet = Packet(BALL, 4, 7, 5.0, 4.99, (1.0, 2.0, 3.0))
-    assert read_request(BALL_SEEN) == packet
+    packet = Packet(packets.BALL, 4, 7, 5.0, 4.99, (1.0, 2.0, 3.0))
+    assert packets.read_request(BALL_SEEN) == packet
     state = tuple(map(float, range(9)))
-    assert read_request(request(ROBOT, 1, 2.0, 2.0, state)) == Packet(ROBOT, 0, 1, 2.0, 2.0, state)
+    sent = packets.request(packets.ROBOT, 1, 2.0, 2.0, state)
+    assert packets.read_request(sent) == Packet(packets.ROBOT, 0, 1, 2.0, 2.0, state)
 
 
 def test_the_layout_is_that_of_the_documentation():
     head = struct.unpack("<4sBBHId", BALL_SEEN[:20])
-    assert head == (b"PJLV", 1, BALL, 4, 7, 5.0)
+    assert head == (b"PJLV", 1, packets.BALL, 4, 7, 5.0)
     assert struct.unpack("<d3d", BALL_SEEN[20:]) == (4.99, 1.0, 2.0, 3.0)
 
 
 def test_an_answer_comes_back_as_it_was_packed():
-    packet = read_request(BALL_SEEN)
-    rows = np.arange(2 * WIDTH, dtype=np.float32).reshape(2, WIDTH)
+    packet = packets.read_request(BALL_SEEN)
+    rows = np.arange(2 * packets.WIDTH, dtype=np.float32).reshape(2, packets.WIDTH)
     assert isinstance(packet, Packet)
-    found = read_answer(answer(packet, Fault.OUTLIER, Motion.PLAN, (5.0, 0.01, 5.5), rows))
+    found = packets.read_answer(
+        packets.answer(packet, Fault.OUTLIER, packets.Motion.PLAN, (5.0, 0.01, 5.5), rows)
+    )
     assert found is not None
-    assert (found.sequence, found.sent, found.motion) == (7, 5.0, Motion.PLAN)
+    assert (found.sequence, found.sent, found.motion) == (7, 5.0, packets.Motion.PLAN)
     assert (found.fault, found.begin, found.period, found.contact) == (11, 5.0, 0.01, 5.5)
     np.testing.assert_array_equal(found.setpoints, rows)
     np.testing.assert_array_equal(found.column("quat_wxyz"), rows[:, 12:16])
@@ -63,7 +56,7 @@ def test_an_answer_comes_back_as_it_was_packed():
     ],
 )
 def test_an_unreadable_packet_has_a_fault(data, fault):
-    assert read_request(data) is fault
+    assert packets.read_request(data) is fault
 
 
 @pytest.mark.parametrize(
@@ -78,20 +71,20 @@ def test_an_unreadable_packet_has_a_fault(data, fault):
     ],
 )
 def test_an_invalid_number_is_a_fault(sent, measured, values, fault):
-    packet = read_request(request(BALL, 1, sent, measured, values))
+    packet = packets.read_request(packets.request(packets.BALL, 1, sent, measured, values))
     assert isinstance(packet, Packet) and packet.fault is fault
 
 
 @given(st.binary(max_size=120))
 def test_no_bytes_crash_it(data):
     for prefix in (b"", b"PJLV", b"PJLV\1\1", BALL_SEEN[:20]):
-        found = read_request(prefix + data)
+        found = packets.read_request(prefix + data)
         assert isinstance(found, Fault | Packet)
-        read_answer(prefix + data)
+        packets.read_answer(prefix + data)
 
 
 def packet(sequence, sent):
-    return Packet(BALL, 0, sequence, sent, sent, (0.0, 0.0, 0.0))
+    return Packet(packets.BALL, 0, sequence, sent, sent, (0.0, 0.0, 0.0))
 
 
 def faults(marks):
@@ -105,9 +98,7 @@ def test_packets_in_order_count_and_others_do_not():
     found, arrivals = faults(marks)
     assert found == [0, 0, Fault.OUT_OF_ORDER, Fault.DUPLICATE, 0]
     assert arrivals.newest == 1.03
-
-
-def test_a_sender_may_begin_to_count_anew():
+    # A sender may start to count anew.
     found, _ = faults([(900, 1.0, 9.0), (1, 1.5, 9.5), (2, 1.6, 9.6)])
     assert found == [0, 0, 0]
 

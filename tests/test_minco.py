@@ -1,4 +1,4 @@
-"""MINCO with durations in fixed proportion against a dense quadratic program."""
+"""Piecewise polynomials of least energy (MINCO), compared with a dense quadratic program."""
 
 import functools
 import itertools
@@ -10,14 +10,8 @@ import numpy as np
 import pytest
 from derivatives import assert_gradient_matches_differences
 
+from planner_jax.trajectory import proportional_minco as minco
 from planner_jax.trajectory.polynomial import evaluate, snap_energy
-from planner_jax.trajectory.proportional_minco import (
-    boundary_rows,
-    proportional_minco,
-    proportional_trajectory,
-    sample_motion,
-    trajectory_energy,
-)
 
 NODES = 5  # sampling intervals of each piece
 PIECE_DURATION = np.array(0.45)  # mean
@@ -35,24 +29,24 @@ def durations_of(pieces):
 
 
 def maps_of(order, pieces, velocities=False):
-    return proportional_minco(order, tuple(durations_of(pieces)), velocities)
+    return minco.proportional_minco(order, tuple(durations_of(pieces)), velocities)
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1))
 def solve_for(order, pieces, rows, offsets, duration):
     args = maps_of(order, pieces), rows, offsets, duration
     return (
-        proportional_trajectory(*args),
-        sample_motion(args[0], NODES, jnp.concatenate(args[1:3]), args[3]),
-        trajectory_energy(*args),
+        minco.proportional_trajectory(*args),
+        minco.sample_motion(args[0], NODES, jnp.concatenate(args[1:3]), args[3]),
+        minco.trajectory_energy(*args),
     )
 
 
-trajectory_of = jax.jit(proportional_trajectory, static_argnums=0)
+trajectory_of = jax.jit(minco.proportional_trajectory, static_argnums=0)
 
 
 def interpolate(head, tail, waypoints, durations):
-    maps = proportional_minco(len(head), tuple(np.asarray(durations, np.float64).tolist()))
+    maps = minco.proportional_minco(len(head), tuple(np.asarray(durations, np.float64).tolist()))
     rows = np.asarray(rows_of(head, tail, durations.mean()), head.dtype)
     offsets = (maps.offsets @ np.concatenate([rows, waypoints])).astype(head.dtype)
     return trajectory_of(maps, rows, offsets, durations.mean())
@@ -82,13 +76,12 @@ def solve_drawn(order, pieces, dtype=np.float64):
 
 
 def derivative_row(time, derivative, size):
-    return np.array(
-        [math.perm(k, derivative) * time ** max(k - derivative, 0) for k in range(size)]
-    )
+    powers = [time ** max(k - derivative, 0) for k in range(size)]
+    return np.array([math.perm(k, derivative) * power for k, power in enumerate(powers)])
 
 
 def energy_form(order, durations):
-    """Return the integral of |p^(s)|^2 as a quadratic form in all coefficients."""
+    """Return the quadratic form of coefficients that is the squared derivative's integral."""
     size = 2 * order
     form = np.zeros((len(durations) * size,) * 2)
     for piece, duration in enumerate(durations):
@@ -100,9 +93,9 @@ def energy_form(order, durations):
 
 
 def dense_solution(head, tail, waypoints, durations):
-    """Return coefficients (M, 2s, 3) from the Karush-Kuhn-Tucker system of the quadratic program.
+    """Return coefficients (M, 2 order, 3) from the Karush-Kuhn-Tucker system of the program.
 
-    The constraints are the end states, the waypoints, and derivatives up to s - 1 that join.
+    The constraints are end states, waypoints, and continuous derivatives below the order.
     """
     order, pieces = len(head), len(durations)
     size = 2 * order
@@ -173,23 +166,21 @@ def test_a_trajectory_in_float32_is_right_to_a_tenth_of_a_millimetre():
     np.testing.assert_allclose(*positions, atol=1e-4)
 
 
-def weigh_energy_and_coefficients(maps, point):
-    rows, offsets, duration, weight = point
-    trajectory = proportional_trajectory(maps, rows, offsets, duration)
-    weights = weight * jnp.cos(jnp.arange(trajectory.coeffs.size, dtype=weight.dtype))
-    return snap_energy(trajectory, maps.order) + weights @ trajectory.coeffs.ravel()
-
-
 @pytest.mark.parametrize(("order", "pieces"), [(2, 2), (4, 1), (4, 4)])
 def test_the_gradient_in_boundary_offsets_and_duration_matches_finite_differences(order, pieces):
+    def weigh_energy_and_coefficients(point):
+        *args, weight = point
+        path = minco.proportional_trajectory(maps_of(order, pieces), *args)
+        weights = weight * jnp.cos(jnp.arange(path.coeffs.size, dtype=weight.dtype))
+        return snap_energy(path, order) + weights @ path.coeffs.ravel()
+
     point = *draw_rows(order, pieces), PIECE_DURATION, 1.0
-    function = functools.partial(weigh_energy_and_coefficients, maps_of(order, pieces))
-    assert_gradient_matches_differences(function, point, rtol=1e-6)
+    assert_gradient_matches_differences(weigh_energy_and_coefficients, point, rtol=1e-6)
 
 
 def test_boundary_rows_are_derivatives_in_the_mean_time_of_a_piece():
     head, tail, _, _ = draw_problem(4, 1)
-    rows = jax.jit(boundary_rows)(head, tail, PIECE_DURATION)
+    rows = jax.jit(minco.boundary_rows)(head, tail, PIECE_DURATION)
     np.testing.assert_allclose(rows, rows_of(head, tail), rtol=1e-14)
 
 
@@ -202,7 +193,7 @@ def test_the_energy_formula_is_the_energy_of_the_trajectory(order, pieces):
 @pytest.mark.parametrize("proportions", [(1.0,) * 12, (0.2, 0.5) + (1.0,) * 10, (1.0, 30.0)])
 @every_order
 def test_the_least_energy_is_the_same_in_a_frame_in_uniform_motion_far_away(order, proportions):
-    form = proportional_minco(order, proportions).boundary_energy
+    form = minco.proportional_minco(order, proportions).boundary_energy
     rows, _ = draw_rows(order, 3)
     moving = rows.copy()
     moving[[0, order]] += [[10.0], [10.0 + 3.0 * len(proportions)]]  # metres, at 3 m a piece
@@ -281,12 +272,10 @@ def test_samples_are_the_values_of_the_trajectory(order, pieces):
     knots = np.concatenate([[0.0], np.cumsum(durations_of(pieces))])
     times = np.interp(np.arange(pieces * NODES + 1) / NODES, np.arange(pieces + 1), knots)
 
-    @jax.jit
-    @functools.partial(jax.vmap, in_axes=(0, None))
-    def evaluate_all(time, trajectory):
-        return tuple(evaluate(trajectory, time, derivative) for derivative in range(4))
+    def evaluate_all(time):
+        return [evaluate(trajectory, time, derivative) for derivative in range(4)]
 
-    pos, *others = evaluate_all(times, trajectory)
+    pos, *others = jax.jit(jax.vmap(evaluate_all))(times)
     assert motion.height.shape == times.shape
     np.testing.assert_allclose(motion.height, pos[:, 2], atol=1e-10)
     for samples, values in zip((motion.vel, motion.acc, motion.jerk), others, strict=True):
@@ -303,11 +292,11 @@ def test_samples_and_energy_in_float32_are_right_to_a_millionth():
 @pytest.mark.parametrize("proportions", [(), (1.0, 0.0), (1.0, -2.0)])
 def test_pieces_without_a_duration_are_rejected(proportions):
     with pytest.raises(ValueError, match=r"^proportions must be some numbers > 0, got \("):
-        proportional_minco(4, proportions)
+        minco.proportional_minco(4, proportions)
 
 
 def test_maps_are_built_once_and_depend_only_on_ratios():
-    assert proportional_minco(4, (1.0,) * 3) is proportional_minco(4, (1.0, 1.0, 1.0))
-    one, other = proportional_minco(4, (0.2, 0.4)), proportional_minco(4, (1.0, 2.0))
+    assert minco.proportional_minco(4, (1.0,) * 3) is minco.proportional_minco(4, (1.0, 1.0, 1.0))
+    one, other = minco.proportional_minco(4, (0.2, 0.4)), minco.proportional_minco(4, (1.0, 2.0))
     np.testing.assert_allclose(one.coefficients, other.coefficients, rtol=1e-12)
     np.testing.assert_allclose(one.proportions, [2.0 / 3.0, 4.0 / 3.0])

@@ -50,7 +50,7 @@ def test_the_primitive_meets_both_states():
 
 @float64
 def test_from_hover_to_hover_it_is_the_classical_quintic():
-    """p = (10 x^3 - 15 x^4 + 6 x^5) d with x = t / T, whose cost is 720 |d|^2 / T^6."""
+    """A move d in time T is (10 x^3 - 15 x^4 + 6 x^5) d, x = t / T, with cost 720 |d|^2 / T^6."""
     move, rest = np.array([2.0, -1.0, 0.5]), np.zeros((3, 3))
     primitive, cost = solve(rest, np.concatenate([move[None], rest[1:]]), DURATION)
     shape = np.array([0.0, 0.0, 0.0, 10.0, -15.0, 6.0]) / DURATION ** np.arange(6)

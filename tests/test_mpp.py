@@ -7,13 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from planner_jax.ball.flight import BallState
+import planner_jax as pj
 from planner_jax.baselines.catch.mpp import MppCatch, falling_time
 from planner_jax.core.protocol import Status, is_solved, take
-from planner_jax.planning.plan import plan
 from planner_jax.referee.catch import referee_catches
 from planner_jax.task.catch.context import order_targets, targets_at
-from planner_jax.task.catch.suites import draw
 
 NUM = 16
 MPP = MppCatch()
@@ -21,18 +19,18 @@ MPP = MppCatch()
 
 @pytest.fixture(scope="module")
 def throws():
-    suites = [draw(NUM // 2, name, 4, num_targets=3) for name in ("throws", "hard")]
+    suites = [pj.catch.draw(NUM // 2, name, 4, num_targets=3) for name in ("throws", "hard")]
     cases = jax.tree.map(lambda *leaves: np.concatenate(leaves), *suites)
-    return cases, plan(MPP, cases)
+    return cases, pj.plan(MPP, cases)
 
 
 @pytest.fixture(scope="module")
 def pairs():
-    cases = draw(NUM, "parabola2", 4, num_targets=3)
+    cases = pj.catch.draw(NUM, "parabola2", 4, num_targets=3)
     order = np.tile([0, 1, 2], (NUM, 1))
     order[:2] = [1, 0, 2]
     cases = dataclasses.replace(cases, order=order.astype(np.int32))
-    return jax.tree.map(np.asarray, cases), plan(MPP, cases)
+    return jax.tree.map(np.asarray, cases), pj.plan(MPP, cases)
 
 
 def heights(cases, plans):
@@ -48,7 +46,6 @@ def test_the_net_is_on_the_ball_and_faces_it_at_the_fixed_height(throws):
     assert verdict.head_error.max() < 1e-5
     assert verdict.continuity_error.max() < 1e-4
     np.testing.assert_allclose(heights(cases, plans)[:, 0], MPP.height, atol=1e-4)
-    assert MPP.height < 2.0
     np.testing.assert_allclose(verdict.catch_times[:, 0], plans.times[:, 0], atol=1e-6)
 
 
@@ -83,7 +80,7 @@ def test_the_kept_candidate_is_the_cheapest(throws):
 
 
 def mean_squared_jerk(trajectory):
-    """Return (K,) by Gauss-Legendre quadrature, exact for squares of quadratic jerks."""
+    """Return the mean squared jerks (K,) of K trajectories, by quadrature that is exact here."""
     nodes, weights = np.polynomial.legendre.leggauss(5)
     coeffs, durations = (np.asarray(x, float) for x in (trajectory.coeffs, trajectory.durations))
     t = 0.5 * durations[..., None] * (1.0 + nodes)  # (K, 2, 5)
@@ -104,8 +101,7 @@ def test_targets_are_caught_one_after_the_other_but_for_those_absent_or_in_wrong
     assert (np.diff(plans.times[right, :2], axis=1) > 0.0).all()
     np.testing.assert_array_equal(plans.times[:, 2], plans.times[:, 1])
     assert not plans.trajectory.durations[:, 4:].any()
-    solved = is_solved(plans.status)
-    assert verdict.success[solved].all()
+    assert verdict.success[is_solved(plans.status)].all()
     # Times that do not rise leave a case unsolved.
     assert set(np.asarray(plans.status)[:2]) == {Status.INFEASIBLE}
     assert (plans.violation[:2] > 0.0).all()
@@ -120,10 +116,10 @@ def test_a_target_that_never_falls_through_the_height_is_not_solved(throws):
     pos[3] = np.nan
     gravity, drag = np.array(throws.targets.gravity), np.array(throws.targets.drag)
     vel[2], gravity[2], drag[2] = 0.0, 0.0, 0.0
-    changes = {"ball": BallState(pos, vel), "gravity": gravity, "drag": drag}
+    changes = {"ball": pj.BallState(pos, vel), "gravity": gravity, "drag": drag}
     targets = dataclasses.replace(throws.targets, **changes)
     broken = dataclasses.replace(throws, targets=targets)
-    found = jax.device_get(plan(MPP, jax.tree.map(jnp.asarray, broken)))
+    found = jax.device_get(pj.plan(MPP, jax.tree.map(jnp.asarray, broken)))
     assert set(found.status[:3]) == {Status.INFEASIBLE}
     assert found.status[3] == Status.BAD_INPUT
     assert all(np.isfinite(leaf[:3]).all() for leaf in jax.tree.leaves(found))
@@ -132,7 +128,7 @@ def test_a_target_that_never_falls_through_the_height_is_not_solved(throws):
 
 
 def test_the_first_fall_of_a_swing_is_found():
-    targets = draw(8, "harmonic2", 1).targets
+    targets = pj.catch.draw(8, "harmonic2", 1).targets
     middle = targets.pos[..., 2]
 
     @jax.jit

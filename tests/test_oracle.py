@@ -1,4 +1,4 @@
-"""The oracle of the late and weak rows: its results are hits, and it detects hopeless cases."""
+"""The benchmark `hit_oracle`: its trajectories are hits, and hopeless serves are detected."""
 
 import jax
 import jax.numpy as jnp

@@ -25,9 +25,6 @@ BROKEN = {
 }
 
 
-# From the command line, in new processes, or in this one, which has already imported JAX.
-
-
 @pytest.fixture(scope="module")
 def meet():
     with pytest.MonkeyPatch.context() as patch:
@@ -149,12 +146,9 @@ def test_a_broken_package_beside_it_is_named_in_one_line_and_the_rest_works(tmp_
     for name, text in BROKEN.items():
         (folder / name).write_text(text)
     done = command(tmp_path, "sweep", "--help", path=[folder.parent])
-    assert done.code == 0
-    assert done.err.count("\n") == 1
-    assert done.err.startswith(
-        "planner-jax: warning: task 'broken' of nowhere_at_all:TASK is left out: "
-        "ModuleNotFoundError"
-    )
+    assert done.code == 0 and done.err.count("\n") == 1
+    problem = "task 'broken' of nowhere_at_all:TASK is left out: ModuleNotFoundError"
+    assert done.err.startswith(f"planner-jax: warning: {problem}")
     listed = " ".join(done.out.split())  # argparse's columns differ between versions of Python
     for words in ("hit ", "catch ", "meet a point mass in the plane meets a moving point"):
         assert words in listed

@@ -15,10 +15,7 @@ import numpy as np
 import pytest
 
 import planner_jax as pj
-from planner_jax.ball.flight import BallState
-from planner_jax.ball.target import BallPath
 from planner_jax.baselines.catch.paper import PaperCatch
-from planner_jax.planning.plan import plan
 from planner_jax.referee.catch import referee_catches
 from tests.derivatives import assert_gradient_matches_differences, value_and_gradient
 
@@ -34,12 +31,12 @@ def rows(name, num=None):
     with path.open(encoding="utf-8") as file:
         table = list(csv.DictReader(file))[:num]
     columns = {key: np.array([float(row[key]) for row in table]) for key in table[0]}
-    ball = BallState(
-        *(np.stack([columns[f"{kind}_{axis}"] for axis in "xyz"], axis=1)[:, None]
-          for kind in ("b0", "bv0"))
-    )  # fmt: skip
-    shape = ball.pos.shape[:2]
-    targets = BallPath(ball, np.full((*shape, 3), 0.5), np.full(shape, 9.81))
+    pos, vel = (
+        np.stack([columns[f"{kind}_{axis}"] for axis in "xyz"], axis=1)[:, None]
+        for kind in ("b0", "bv0")
+    )
+    shape = pos.shape[:2]
+    targets = pj.BallPath(pj.BallState(pos, vel), np.full((*shape, 3), 0.5), np.full(shape, 9.81))
     cases = pj.catch.case(targets, np.full(shape, 3.0), dtype=jnp.float64)
     return cases.replace(times=columns["Tp"][:, None]), columns
 
@@ -54,7 +51,7 @@ def excess(planner):
     """Return relative excess over the published optima, time errors, cases and plans."""
     (easy, published), (hard, of_hard) = map(rows, NAMES)
     cases = jax.tree.map(lambda *leaves: np.concatenate(leaves), easy, hard)
-    plans = plan(planner, cases)
+    plans = pj.plan(planner, cases)
     cost = np.concatenate([published["cost_ref"], of_hard["cost_ref"]])
     times = np.concatenate([published["T_ref"], of_hard["T_ref"]])
     return UNIT * plans.cost / cost - 1.0, plans.times[:, 0] - times, cases, plans

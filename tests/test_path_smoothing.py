@@ -1,24 +1,19 @@
 """Smoothing of paths: gradients, a decreasing cost, fixed ends, and paths returned unchanged."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from dubins import dubins, sample_dubins
 
-from planner_jax.baselines.intercept.path_smoothing import (
-    Smoothing,
-    control_points,
-    resample,
-    smooth_path,
-    smooth_points,
-    smoothing_cost,
-)
+from planner_jax.baselines.intercept import path_smoothing
 from planner_jax.plane.obstacles import obstacles, separation
 
 CURVATURE, BODY = 2.0, (-0.05, 0.35, 0.125)
 NUM = 65
-SETTINGS = Smoothing(stride=2, iterations=60)
+SETTINGS = path_smoothing.Smoothing(stride=2, iterations=60)
 WALLS = [[(0.8, 4.0), (1.6, 4.0), (1.2, 4.8)], [(3.0, 0.6), (4.0, 0.6), (3.5, 1.0)]]
 START = np.array([0.8, 2.0, 0.2])
 GOALS = np.array([[6.0, 2.5, -0.4], [6.0, 4.5, 1.0], [5.5, 0.8, -2.0], [3.5, 6.0, 2.0]])
@@ -42,22 +37,15 @@ def paths(goals):
 
 
 def smooth(poses, curvatures, length, walls):
-    return smooth_path(
-        poses,
-        curvatures,
-        length,
-        walls,
-        curvature=jnp.asarray(CURVATURE),
-        body=BODY,
-        lower=jnp.zeros(2),
-        upper=jnp.full(2, 8.0),
-        settings=SETTINGS,
-    )
+    car = {"curvature": jnp.asarray(CURVATURE), "body": BODY}
+    box = {"lower": jnp.zeros(2), "upper": jnp.full(2, 8.0)}
+    path = poses, curvatures, length
+    return path_smoothing.smooth_path(*path, walls, **car, **box, settings=SETTINGS)
 
 
 @jax.jit
 def cost(points, unit, walls):
-    return smoothing_cost(points, unit, walls, CURVATURE)
+    return path_smoothing.smoothing_cost(points, unit, walls, CURVATURE)
 
 
 cost_and_slope = jax.jit(jax.value_and_grad(cost))
@@ -65,16 +53,15 @@ cost_and_slope = jax.jit(jax.value_and_grad(cost))
 
 @jax.jit
 def descend(points, walls):
-    return smooth_points(points, walls, CURVATURE, Smoothing(iterations=5))
+    settings = path_smoothing.Smoothing(iterations=5)
+    return path_smoothing.smooth_points(points, walls, CURVATURE, settings)
 
 
 @jax.jit
+@functools.partial(jax.vmap, in_axes=(0, None))
 def gaps(poses, walls):
-    def one(poses):
-        x, y, heading = poses.T
-        return separation(walls.vertices(0.0), walls.present, x[None], y[None], heading, BODY)
-
-    return jax.vmap(one)(poses)
+    x, y, heading = poses.T
+    return separation(walls.vertices(0.0), walls.present, x[None], y[None], heading, BODY)
 
 
 all_smooth = jax.jit(jax.vmap(smooth, in_axes=(0, 0, 0, None)))
@@ -97,23 +84,19 @@ def test_the_gradient_of_the_cost_matches_finite_differences(crooked, float64):
     walls = walls_of()
     unit = np.float64(0.21)
     slope = np.asarray(cost_and_slope(crooked, unit, walls)[1])
-    step = 1e-6
     for direction in np.random.default_rng(1).normal(size=(20, *crooked.shape)):
-        ahead, back = (
-            float(cost_and_slope(crooked + sign * step * direction, unit, walls)[0])
-            for sign in (1, -1)
-        )
-        assert np.sum(slope * direction) == pytest.approx((ahead - back) / (2 * step), rel=1e-5)
+        moved = (crooked + step * direction for step in (1e-6, -1e-6))
+        ahead, back = (float(cost_and_slope(points, unit, walls)[0]) for points in moved)
+        assert np.sum(slope * direction) == pytest.approx((ahead - back) / 2e-6, rel=1e-5)
 
 
 def test_terms_have_their_closed_forms(float64):
-    nothing, settings = walls_of([]), Smoothing()
+    nothing, settings = walls_of([]), path_smoothing.Smoothing()
     line = np.stack([np.arange(9.0), np.zeros(9)], axis=1)
     assert cost(line, 1.0, nothing) == 0.0
     # A right angle between steps of 0.5 m: two displacements of one unit that differ by sqrt(2).
-    corner = np.array(
-        [[-0.5 * k, 0.0] for k in range(5)][::-1] + [[0, 0.5 * k] for k in range(1, 5)]
-    )
+    steps = 0.5 * np.arange(-4.0, 5.0)
+    corner = np.stack([np.minimum(steps, 0.0), np.maximum(steps, 0.0)], axis=1)
     excess = np.pi / 2 - CURVATURE * 0.5
     expected = settings.curvature * excess**2 + settings.smoothness * 2.0
     assert cost(corner, 0.5, nothing) == pytest.approx(expected)
@@ -141,7 +124,8 @@ def test_the_spline_of_an_arc_is_that_arc(float64):
 
     @jax.jit
     def spline(poses):
-        return resample(control_points(poses, jnp.ones(17)), 0.0, 2.0, 41)
+        points = path_smoothing.control_points(poses, jnp.ones(17))
+        return path_smoothing.resample(points, 0.0, 2.0, 41)
 
     poses, curvature, length = jax.tree.map(np.asarray, spline(given))
     even = np.linspace(0.0, 2.0, 41)
@@ -168,9 +152,8 @@ def test_poses_are_equally_far_apart_and_turn_by_their_curvature(batch):
     found = batch[1]
     spacing = found.length[:, None] / (NUM - 1)
     steps = np.diff(found.poses, axis=1)
-    np.testing.assert_allclose(
-        np.hypot(steps[..., 0], steps[..., 1]), spacing * np.ones(64), rtol=0.01
-    )
+    lengths = np.hypot(steps[..., 0], steps[..., 1])
+    np.testing.assert_allclose(lengths, spacing * np.ones(64), rtol=0.01)
     mean = 0.5 * (found.curvature[:, 1:] + found.curvature[:, :-1])
     np.testing.assert_allclose(steps[..., 2], mean * spacing, atol=0.01)
 

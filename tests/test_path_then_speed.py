@@ -11,20 +11,9 @@ import pytest
 from dubins import dubins, sample_dubins
 
 import planner_jax as pj
+from planner_jax.baselines.intercept import path_then_speed
+from planner_jax.baselines.intercept import projection as projections
 from planner_jax.baselines.intercept.path import path_along, path_beside, path_of_drive
-from planner_jax.baselines.intercept.path_then_speed import (
-    PathSource,
-    SpeedStep,
-    lattice,
-    ramp_and_cruise,
-)
-from planner_jax.baselines.intercept.projection import (
-    Projection,
-    overlap,
-    project_obstacles,
-    speed_limits,
-    station_time_problem,
-)
 from planner_jax.baselines.intercept.static_paths import count_turns
 from planner_jax.plane.obstacles import obstacles, separation
 from planner_jax.plane.reach import Lattice
@@ -48,11 +37,8 @@ def scene(target=(6.0, 4.0), movers=(), velocities: Any = 0.0, walls=(), **setti
 EMPTY = scene()
 along = jax.jit(path_along)
 STRAIGHT = along(np.float32([0.8, 4.0, 0.0]), np.float32(5.05), np.zeros(129, np.float32))
-BENT = along(
-    np.float32([0.8, 2.0, 0.0]),
-    np.float32(7.0),
-    np.float32(1.2 * np.sin(np.linspace(0.0, 4.0 * np.pi, 129))),
-)
+WAVES = np.float32(1.2 * np.sin(np.linspace(0.0, 4.0 * np.pi, 129)))
+BENT = along(np.float32([0.8, 2.0, 0.0]), np.float32(7.0), WAVES)
 
 
 def crossing(rng, path, num):
@@ -67,10 +53,7 @@ def crossing(rng, path, num):
 
 @jax.jit
 def least_distance(path, movers, times, stations):
-    """Return the distance of the body from the nearest mover [m], (times, stations).
-
-    It is negative in an overlap, by brute force. The path is interpolated between its points.
-    """
+    """Return distances [m] (times, stations) of the car from movers, negative in overlaps."""
     place = jnp.linspace(0.0, 1.0, len(path.heading)) * path.length
     x, y, heading = (jnp.interp(stations, place, each) for each in (*path.pos.T, path.heading))
 
@@ -91,12 +74,12 @@ def is_inside(blocked, times, stations):
 
 @functools.partial(jax.jit, static_argnames="projection")
 def project(path, movers, projection):
-    return project_obstacles(path, movers, EMPTY.body, EMPTY.time, projection)
+    return projections.project_obstacles(path, movers, EMPTY.body, EMPTY.time, projection)
 
 
 edges_at = jax.jit(lambda blocked, times: blocked.edges_at(times))
-overlaps = jax.jit(lambda path, movers: overlap(path, movers, EMPTY.body, jnp.zeros(()), 0.0))
-limits_along = jax.jit(lambda path: speed_limits(path, EMPTY.body, EMPTY.limits))
+overlaps = jax.jit(lambda *x: projections.overlap(*x, EMPTY.body, jnp.zeros(()), 0.0))
+limits_along = jax.jit(lambda path: projections.speed_limits(path, EMPTY.body, EMPTY.limits))
 
 
 @pytest.mark.parametrize("path", [STRAIGHT, BENT], ids=["straight", "bent"])
@@ -107,7 +90,8 @@ def test_quadrangles_hold_whatever_the_body_meets_and_little_else(path):
     for seed in range(10):
         movers = crossing(np.random.default_rng(seed), path, 2)
         apart = np.asarray(least_distance(path, movers, times, stations))
-        found = is_inside(project(path, movers, Projection(margin=0.0)), times, stations)
+        blocked = project(path, movers, projections.Projection(margin=0.0))
+        found = is_inside(blocked, times, stations)
         assert not (~found & (apart < -1e-4)).any()
         held, exact = held + found.sum(), exact + (apart < 0.0).sum()
         near += (found & (apart < 0.1)).sum()
@@ -130,11 +114,11 @@ def test_a_square_that_crosses_a_straight_path_blocks_it_just_as_long_as_they_ov
 def test_a_path_that_comes_back_is_blocked_in_two_runs():
     loop = along(np.zeros(3, np.float32), np.float32(5.0), np.full(129, 0.4 * np.pi, np.float32))
     movers = obstacles([SQUARE], [0.0, 1e-3])  # stays at start and end of the loop
-    found = project(loop, movers, Projection(runs=2, slabs=1))
+    found = project(loop, movers, projections.Projection(runs=2, slabs=1))
     assert found.present.tolist() == [True, True]
     middle = np.asarray(edges_at(found, np.float32(5.0))).mean(axis=0)
     assert middle[0] < 1.0 and middle[1] > 4.0
-    one = project(loop, movers, Projection(runs=1, slabs=1))
+    one = project(loop, movers, projections.Projection(runs=1, slabs=1))
     low, high = jax.device_get(edges_at(one, np.float32(5.0)))
     assert low[0] <= 0.0 and high[0] >= 5.0  # one joined run blocks everything between
 
@@ -162,9 +146,8 @@ def test_the_path_of_a_drive_is_the_path_of_the_car():
     path, end = jax.device_get(drive_both(start, np.float32(4.0), speed, curvature))
     np.testing.assert_allclose(path.pos[-1], end[:2], atol=5e-3)
     np.testing.assert_allclose(path.heading[-1], end[2], atol=5e-3)
-    np.testing.assert_allclose(
-        path.length, np.mean(0.5 * (speed[1:] + speed[:-1])) * 4.0, rtol=1e-5
-    )
+    driven = np.mean(0.5 * (speed[1:] + speed[:-1])) * 4.0
+    np.testing.assert_allclose(path.length, driven, rtol=1e-5)
 
 
 def test_a_car_drives_beside_arcs_without_a_jump_of_its_curvature():
@@ -183,30 +166,26 @@ def test_a_car_drives_beside_arcs_without_a_jump_of_its_curvature():
     away = np.linalg.norm(path.pos - poses[:, :2], axis=1)
     assert away.max() < 0.06
     assert path.curvature[0] == 0.0 and np.abs(path.curvature).max() <= 2.0
-    changes = np.diff(path.curvature) / (path.length / 128)
-    assert (
-        np.abs(changes).max() <= 8.0 * 1.01 < np.abs(np.diff(curvatures)).max() * 128 / path.length
-    )
+    changes, jumps = (np.diff(each) * 128 / path.length for each in (path.curvature, curvatures))
+    assert np.abs(changes).max() <= 8.0 * 1.01 < np.abs(jumps).max()
 
 
 drive = jax.jit(lambda case, path: STEP.drive(case, path, STEP.problem(case, path)))
-STEP = SpeedStep()
+STEP = path_then_speed.SpeedStep()
 
 
 @pytest.mark.slow
 def test_a_drive_follows_its_path_and_ends_where_it_ends():
     movers = [SQUARE + [3.0, 2.0]]
-    end = np.asarray(BENT.pos[-1]) + 0.15 * np.array(
-        [np.cos(BENT.heading[-1]), np.sin(BENT.heading[-1])]
-    )
+    heading = BENT.heading[-1]
+    end = np.asarray(BENT.pos[-1]) + 0.15 * np.array([np.cos(heading), np.sin(heading)])
     case = scene(tuple(end), movers, [0.0, 0.4], time=14.0, start=(0.8, 2.0, 0.0))
     plan = drive(case, BENT)
     assert plan.status == pj.Status.CONVERGED, pj.intercept.judge(case, plan).sentence()
     assert pj.intercept.judge(case, plan).success
     times = np.linspace(0.0, 14.0, 141, dtype=np.float32)
-    poses = jax.jit(
-        jax.vmap(lambda t: pose_at(plan.start, plan.time, plan.speed, plan.curvature, t))
-    )(times)
+    driven = plan.start, plan.time, plan.speed, plan.curvature
+    poses = jax.jit(jax.vmap(lambda time: pose_at(*driven, time)))(times)
     away = np.linalg.norm(np.asarray(poses)[:, None, :2] - np.asarray(BENT.pos), axis=2).min(1)
     assert away.max() < 0.5 * 7.0 / 128 + 0.01
     np.testing.assert_allclose(poses[-1, :2], BENT.pos[-1], atol=0.01)
@@ -214,10 +193,9 @@ def test_a_drive_follows_its_path_and_ends_where_it_ends():
 
 @jax.jit
 def ramp_along(path, times):
-    problem = station_time_problem(
-        path, EMPTY.movers, EMPTY.body, EMPTY.limits, EMPTY.time, EMPTY.speed
-    )
-    return ramp_and_cruise(problem, times)
+    setting = EMPTY.movers, EMPTY.body, EMPTY.limits, EMPTY.time, EMPTY.speed
+    problem = projections.station_time_problem(path, *setting)
+    return path_then_speed.ramp_and_cruise(problem, times)
 
 
 @pytest.mark.parametrize("length", [3.0, 5.0, 8.0])
@@ -247,22 +225,20 @@ def test_paths_differ_by_a_turn_just_if_a_wall_is_between_them():
     assert abs(above[0] - below[0]) == 1 and above[1] == below[1]
 
 
-PLANNER = lattice(source=PathSource(drawn=6), searches=(Search(4, lattice=Lattice(layers=22)),))
+SMALL = {"searches": (Search(4, lattice=Lattice(layers=22)),)}
+PLANNER = path_then_speed.lattice(source=path_then_speed.PathSource(drawn=6), **SMALL)
+CROSSING = [SQUARE + [3.5, 1.5]]
 # A barrier across the whole map.
 BARRIER = [[3.9, -0.5], [4.1, -0.5], [4.1, 8.5], [3.9, 8.5]]
-NEAR = (6.0, 4.0)
 SCENES = {
     "free": (scene(), pj.Status.CONVERGED),
-    "a mover crosses": (
-        scene(movers=[SQUARE + [3.5, 1.5]], velocities=[0.0, 0.5]),
-        pj.Status.CONVERGED,
-    ),
+    "a mover crosses": (scene(movers=CROSSING, velocities=[0.0, 0.5]), pj.Status.CONVERGED),
     "parked on every path": (scene(movers=[BARRIER]), pj.Status.NO_PATH),
     "a wall across": (scene(walls=[BARRIER]), pj.Status.NO_PATH),
     "parked on the goal": (scene(movers=[SQUARE + [6.0, 4.0]]), pj.Status.BLOCKED),
     "parked on the start": (scene(movers=[SQUARE + [0.8, 4.0]]), pj.Status.BLOCKED),
     "too far for the time": (scene((7.8, 4.0), time=3.0), pj.Status.NO_PATH),
-    "NaN": (dataclasses.replace(scene(NEAR), target=still(np.nan, 4.0)), pj.Status.BAD_INPUT),
+    "NaN": (dataclasses.replace(scene(), target=still(np.nan, 4.0)), pj.Status.BAD_INPUT),
 }
 
 
@@ -285,10 +261,8 @@ def test_a_case_is_solved_or_has_a_failure_status_and_the_referee_agrees(scenes,
 @pytest.mark.slow
 def test_the_paper_s_planner_searches_smooths_and_drives(scenes):
     pytest.importorskip("numba", reason="the extra `baselines` is not installed")
-    plans = jax.device_get(
-        pj.plan(pj.intercept.planner("paper"), jax.tree.map(jnp.asarray, scenes[0]))
-    )
-    expected = [status for _, status in SCENES.values()]
-    assert plans.status.tolist() == expected
+    cases = jax.tree.map(jnp.asarray, scenes[0])
+    plans = jax.device_get(pj.plan(pj.intercept.planner("paper"), cases))
+    assert plans.status.tolist() == [status for _, status in SCENES.values()]
     verdict = pj.intercept.judge(scenes[0], plans)
     np.testing.assert_array_equal(verdict.success, plans.status == pj.Status.CONVERGED)

@@ -4,16 +4,10 @@ import jax
 import numpy as np
 import pytest
 
+import planner_jax as pj
 from planner_jax.baselines.catch.paper import steep_hinge
+from planner_jax.cost import quadrotor
 from planner_jax.cost.penalty import join_trapezoid_weights, smooth_hinge, trapezoid_weights
-from planner_jax.cost.quadrotor import (
-    acceleration_excess,
-    body_rate_excess,
-    ground_excess,
-    relative,
-    speed_excess,
-)
-from planner_jax.robot.quadrotor import QuadrotorLimits
 from planner_jax.task.hit.context import apex_excess, hitting_speed_excess
 
 WIDTH = 0.1
@@ -58,7 +52,7 @@ def test_the_smooth_hinge_is_twice_differentiable_never_falls_and_is_never_conca
 
 @float64
 def test_the_steep_hinge_is_as_printed_and_loses_its_slope_at_the_joint():
-    """x^3 up to eps, then eps^3 + (x - eps)^2 x / eps^4."""
+    """The hinge is x^3 up to its width eps, and then eps^3 + (x - eps)^2 x / eps^4."""
     x = np.array([-1.0, 0.0, 0.06, 0.1, 0.3])
     printed = [0.0, 0.0, 0.06**3, 1e-3, 1e-3 + 0.2**2 * 0.3 / 1e-4]
     np.testing.assert_allclose(value_slope_bend("steep", x)[0], printed, rtol=1e-12)
@@ -93,17 +87,16 @@ def test_joined_weights_are_those_of_the_pieces_with_shared_ends_added():
 
 def limits():
     values = {"speed": 5.0, "acceleration": 15.0, "body_rate": 4.0, "min_height": 0.25}
-    return QuadrotorLimits(**{name: np.array(value) for name, value in values.items()})
+    return pj.QuadrotorLimits(**{name: np.array(value) for name, value in values.items()})
 
 
 # Motions that meet each limit exactly for k = 1: |(3, 0, 4)| = 5; |(10, -5, 10)| = 15; a jerk of
 # 4 g across the thrust in hover is 4 rad/s.
+ACC, JERK = np.array([10.0, -5.0, 10.0]), np.array([0.0, 4.0 * GRAVITY, 0.0])
 AT_LIMIT = {
-    "speed": lambda k: speed_excess(k * np.array([3.0, 0.0, 4.0]), limits()),
-    "acceleration": lambda k: acceleration_excess(k * np.array([10.0, -5.0, 10.0]), limits()),
-    "body rate": lambda k: body_rate_excess(
-        np.zeros(3), k * np.array([0.0, 4.0 * GRAVITY, 0.0]), GRAVITY, limits()
-    ),
+    "speed": lambda k: quadrotor.speed_excess(k * np.array([3.0, 0.0, 4.0]), limits()),
+    "acceleration": lambda k: quadrotor.acceleration_excess(k * ACC, limits()),
+    "body rate": lambda k: quadrotor.body_rate_excess(np.zeros(3), k * JERK, GRAVITY, limits()),
 }
 
 
@@ -113,18 +106,12 @@ def test_the_excess_is_zero_at_the_limit_and_the_square_of_the_share_less_one(na
     shares = np.array([0.0, 0.5, 1.0, 2.0])
     excess = jax.jit(jax.vmap(AT_LIMIT[name]))(shares)
     np.testing.assert_allclose(excess, shares**2 - 1.0, atol=1e-14)
-    np.testing.assert_allclose(relative(excess), shares - 1.0, atol=1e-6)
-
-
-def excesses_of_squares(limits, vel, acc, jerk):
-    rate = body_rate_excess(acc, jerk, GRAVITY, limits)
-    return speed_excess(vel, limits), acceleration_excess(acc, limits), rate
+    np.testing.assert_allclose(quadrotor.relative(excess), shares - 1.0, atol=1e-6)
 
 
 def test_the_ground_is_exceeded_in_metres_from_below():
-    np.testing.assert_allclose(
-        ground_excess(np.array([1.0, 0.25, 0.0, -1.0]), limits()), [-0.75, 0.0, 0.25, 1.25]
-    )
+    excess = quadrotor.ground_excess(np.array([1.0, 0.25, 0.0, -1.0]), limits())
+    np.testing.assert_allclose(excess, [-0.75, 0.0, 0.25, 1.25])
 
 
 def test_gradients_are_finite_at_zero_speed_in_hover_and_near_free_fall():
@@ -132,8 +119,10 @@ def test_gradients_are_finite_at_zero_speed_in_hover_and_near_free_fall():
     fall = np.array([0.0, 0.0, -GRAVITY], np.float32)
 
     def total(vel, acc, jerk):
-        squares = excesses_of_squares(limits(), vel, acc, jerk)
-        return sum(squares) + sum(map(relative, squares))
+        bounds = limits()
+        squares = [quadrotor.speed_excess(vel, bounds), quadrotor.acceleration_excess(acc, bounds)]
+        squares.append(quadrotor.body_rate_excess(acc, jerk, GRAVITY, bounds))
+        return sum(squares) + sum(map(quadrotor.relative, squares))
 
     gradient = jax.jit(jax.grad(total, argnums=(0, 1, 2)))
     for acc in (still, fall, fall + np.float32(1e-4)):

@@ -12,14 +12,8 @@ from planner_jax.ball.estimation import EkfModel, ekf_init, ekf_predict, ekf_upd
 from planner_jax.ball.flight import BallState, drag_free_flight
 from planner_jax.sims import segment
 from planner_jax.sims.calibrate import calibrate, hand_eye, pose, rigid_motion
+from planner_jax.studies.block import flight_fit
 from planner_jax.studies.block.camera import back_project, in_view, looking_at, project
-from planner_jax.studies.block.flight_fit import (
-    Sight,
-    across_std,
-    belief_at,
-    error_across,
-    fit_flight,
-)
 from planner_jax.studies.block.noise import IsotropicNoise, information, sightings, stereo_noise
 
 GRAVITY = 9.81
@@ -32,17 +26,17 @@ VIEW = {"size": (320, 192), "field_of_view": np.deg2rad(110.0)}
 CAMERA = looking_at((-0.5, 0.1, 1.7), (5.0, 0.4, 1.0), **VIEW)
 
 paths = jax.jit(jax.vmap(drag_free_flight, (None, 0, None)))
-fit_one = jax.jit(fit_flight)
-fit_many = jax.jit(jax.vmap(fit_flight, (0, 0, 0, None)))
-believed = jax.jit(belief_at)
+fit_one = jax.jit(flight_fit.fit_flight)
+fit_many = jax.jit(jax.vmap(flight_fit.fit_flight, (0, 0, 0, None)))
+believed = jax.jit(flight_fit.belief_at)
 sighting_one = jax.jit(segment.sighting)
 
 
 @jax.jit
 def errors(fits, truth):
-    beliefs = jax.vmap(belief_at, (0, None, None))(fits, AHEAD, GRAVITY)
-    stds = jax.vmap(across_std)(beliefs)
-    return beliefs, stds, jax.vmap(error_across, (0, None))(beliefs, truth)
+    beliefs = jax.vmap(flight_fit.belief_at, (0, None, None))(fits, AHEAD, GRAVITY)
+    stds = jax.vmap(flight_fit.across_std)(beliefs)
+    return beliefs, stds, jax.vmap(flight_fit.error_across, (0, None))(beliefs, truth)
 
 
 def draw_positions(num, rng, std=STD):
@@ -70,19 +64,18 @@ def test_the_covariance_is_that_of_many_fits():
     truth = drag_free_flight(BALL, AHEAD, GRAVITY)
     beliefs, stds, off = errors(fits, truth)
     off_mean = np.asarray(beliefs.mean) - np.concatenate([truth.pos, truth.vel])
-    believed_covariance = np.asarray(beliefs.covariance[0])
-    deviations = np.sqrt(np.diag(believed_covariance))
-    scale = np.outer(deviations, deviations)
-    np.testing.assert_allclose(np.cov(off_mean.T) / scale, believed_covariance / scale, atol=0.06)
+    expected = np.asarray(beliefs.covariance[0])
+    scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
+    np.testing.assert_allclose(np.cov(off_mean.T) / scale, expected / scale, atol=0.06)
     assert np.sqrt(np.mean(off**2)) == pytest.approx(float(stds[0]), rel=0.04)
     assert np.sqrt(np.mean(fits.misfit**2)) == pytest.approx(1.0, abs=0.02)
 
 
 def test_the_estimate_is_that_of_polynomials():
-    """With equal weights each axis is a line, z without the fall [Natarajan2024, eq. 8]."""
+    """With equal weights, x, y and z plus the fall are lines in time [Natarajan2024, eq. 8]."""
     places = draw_positions(1, np.random.default_rng(1))[0]
     fit = fit_one(TIMES, places, 1.0, GRAVITY)
-    assert fit.status == Sight.SEEN and fit.num == NUM
+    assert fit.status == flight_fit.Sight.SEEN and fit.num == NUM
     there = believed(fit, 0.0, GRAVITY)
     fallen = places.astype(float)
     fallen[:, 2] += 0.5 * GRAVITY * TIMES**2
@@ -105,12 +98,12 @@ def test_a_ball_that_is_not_seen_at_two_times_has_a_status_and_a_sentence():
     places = draw_positions(1, np.random.default_rng(4))[0]
     never, once = np.full_like(places, np.nan), np.full_like(places, np.nan)
     once[7] = places[7]
-    for given, status in ((never, Sight.NEVER_SEEN), (once, Sight.SEEN_ONCE)):
+    for given, status in ((never, flight_fit.Sight.NEVER_SEEN), (once, flight_fit.Sight.SEEN_ONCE)):
         fit = fit_one(TIMES, given, 1.0, GRAVITY)
         assert fit.status == status and np.isnan(fit.belief.mean).all() and np.isnan(fit.misfit)
-    assert "never sees the ball" in Sight.NEVER_SEEN.message
+    assert "never sees the ball" in flight_fit.Sight.NEVER_SEEN.message
     same_time = np.full_like(TIMES, 0.3)
-    assert fit_one(same_time, places, 1.0, GRAVITY).status == Sight.SEEN_ONCE
+    assert fit_one(same_time, places, 1.0, GRAVITY).status == flight_fit.Sight.SEEN_ONCE
 
 
 def test_the_fit_is_what_a_kalman_filter_with_a_wide_prior_comes_to(float64):
@@ -134,8 +127,9 @@ def test_gradients_of_a_fit_are_finite_with_and_without_a_ball():
     places[3] = np.nan
 
     def across(places):
-        fit = fit_flight(TIMES, places, 1.0, GRAVITY)
-        return across_std(belief_at(fit, AHEAD, GRAVITY)) + jnp.sum(fit.ball.pos)
+        fit = flight_fit.fit_flight(TIMES, places, 1.0, GRAVITY)
+        ahead = flight_fit.belief_at(fit, AHEAD, GRAVITY)
+        return flight_fit.across_std(ahead) + jnp.sum(fit.ball.pos)
 
     found = jax.jit(jax.grad(across))(places)
     assert np.isfinite(found).all() and np.abs(found[4]).max() > 0.01
@@ -232,7 +226,7 @@ def test_the_mask_compares_hue_saturation_and_value(hues):
 
 
 def ball_frame(place, radius=0.05):
-    """Render image and depth of an orange ball at (3,) [m] before a grey wall, ray by ray."""
+    """Render image and depth of an orange ball at a position (3,) [m] before a grey wall."""
     column, row = np.meshgrid(*(np.arange(size) for size in CAMERA.size))
     across = (np.stack([column, row], axis=-1) - CAMERA.centre[None, None]) / CAMERA.focal
     ray = np.concatenate([across, np.ones((*across.shape[:2], 1))], axis=-1)
@@ -275,13 +269,9 @@ def test_pixels_of_little_confidence_or_another_depth_are_dropped():
 
 def test_a_frame_without_the_ball_shows_nothing():
     image, depth = ball_frame(np.array([2.0, 0.3, 1.3]))
-    trust = np.ones_like(depth)
-    for frame in (
-        (np.full_like(image, 90), depth, trust),
-        (image, np.full_like(depth, np.nan), trust),
-        (image, depth, 0.0 * trust),
-        (image, 20.0 * depth, trust),
-    ):
+    trust, grey, unknown = np.ones_like(depth), np.full_like(image, 90), np.full_like(depth, np.nan)
+    frames = [(grey, depth, trust), (image, unknown, trust), (image, depth, 0.0 * trust)]
+    for frame in (*frames, (image, 20.0 * depth, trust)):
         found = sighting_one(*frame, CAMERA, segment.ball_thresholds())
         assert found.pixels == 0 and np.isnan(found.place).all() and np.isnan(found.depth)
 

@@ -43,10 +43,9 @@ def test_the_distance_of_a_polygon_is_the_distance_to_its_boundary(float64):
     assert (distance[1] > 100.0).all()
     step = 1e-6
     for axis in range(2):
-        ahead, _ = measure(points + step * np.eye(2)[axis])
-        slope = (ahead[0] - distance[0]) / step
-        close = np.isclose(slope, away[axis][0], atol=1e-4)
-        assert close.mean() > 0.99  # except where the nearest edge changes
+        slope = (measure(points + step * np.eye(2)[axis])[0][0] - distance[0]) / step
+        # Differences are wrong where the nearest edge changes.
+        assert np.isclose(slope, away[axis][0], atol=1e-4).mean() > 0.99
 
 
 def test_a_rectangle_is_separate_from_a_polygon_if_no_point_is_in_both(float64):
@@ -111,27 +110,18 @@ STEP = 10.0 / 19.5  # [s], from layer to layer
 
 
 def find_layers(target, walls=(), movers=(), velocities=0.0):
-    """Return whether the rear axle can be at a position in each layer, bool (layers + 1,)."""
-    case = pj.intercept.case(
-        pj.TurningPath(jnp.asarray(target, jnp.float32), jnp.zeros(2), jnp.array(0.0)),
-        10.0,
-        start=(0.8, 4.0, 0.0),
-        walls=walls,
-        movers=movers,
-        mover_velocities=velocities,
-    )
+    """Return whether a car can reach a target in each layer of time, bool (layers + 1,)."""
+    still = pj.TurningPath(jnp.asarray(target, jnp.float32), jnp.zeros(2), jnp.array(0.0))
+    obstacles = {"walls": walls, "movers": movers, "mover_velocities": velocities}
+    case = pj.intercept.case(still, 10.0, start=(0.8, 4.0, 0.0), **obstacles)
     return np.asarray(_find_layers(case))
 
 
 @jax.jit
 def _find_layers(case):
     grid = reach.grid_of(LATTICE, case.start, case.time, case.limits.speed, case.lower, case.upper)
-    vehicle = reach.Vehicle(
-        radius=jnp.array(0.16),
-        ahead=jnp.array([0.05, 0.25]),
-        speed=case.limits.speed,
-        turn_rates=jnp.array([0.0, 1.0, 0.8, 0.53]),
-    )
+    ahead, turn_rates = jnp.array([0.05, 0.25]), jnp.array([0.0, 1.0, 0.8, 0.53])
+    vehicle = reach.Vehicle(jnp.array(0.16), ahead, case.limits.speed, turn_rates)
     field = distance_field(case.walls, grid.corner, grid.cell, LATTICE.cells)
     bits = reach.reach_set(grid, field.values, case.movers, vehicle, case.speed, grid.num).bits
     every = jnp.ones(LATTICE.headings, bool)

@@ -236,12 +236,8 @@ def test_the_chance_within_a_radius_follows_from_shifted_gaussians():
     distance, none = np.linalg.norm(offsets, axis=1), np.zeros(())
     for std in (1e-3, 0.2, 30.0):
         among = Alternatives(
-            chance=chances,
-            turn_rate=np.zeros(3),
-            velocity=offsets,
-            lever=np.tile([2.0, 0.0], (3, 1)),
-            centre=np.zeros(2),
-            middle=none,
+            **{"chance": chances, "turn_rate": np.zeros(3), "velocity": offsets},
+            **{"lever": np.tile([2.0, 0.0], (3, 1)), "centre": np.zeros(2), "middle": none},
             centre_variance=np.array(0.75 * std**2),
             velocity_variance=np.full(3, 0.25 * std**2),
         )

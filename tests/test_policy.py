@@ -1,4 +1,4 @@
-"""A learned decision about catches: valid whatever its weights, and trained bit for bit."""
+"""Learned decisions about the order of catches: valid whatever the weights, and stored exactly."""
 
 import dataclasses
 import json
@@ -12,7 +12,6 @@ from flax import traverse_util
 
 import planner_jax as pj
 from planner_jax.cli.main import main
-from planner_jax.core.errors import ArgumentError
 from planner_jax.planning.decided import first_choice
 from planner_jax.policies.checkpoint import load_checkpoint, save_checkpoint
 from planner_jax.policies.networks import NETWORKS
@@ -74,8 +73,7 @@ def test_attention_does_not_see_the_order_of_targets_or_absent_ones(fresh):
 
 def test_the_shipped_policy_is_solved_and_confirmed_by_the_referee():
     cases = cases_of()
-    plans = pj.plan(pj.catch.planner(decide="policy"), cases)
-    assert pj.catch.judge(cases, plans).success.all()
+    assert pj.catch.judge(cases, pj.plan(pj.catch.planner(decide="policy"), cases)).success.all()
 
 
 def test_the_policy_of_hurried_targets_keeps_more_deadlines_than_greedy():
@@ -95,8 +93,7 @@ def test_a_lane_of_nan_spoils_no_other():
     whole = pj.plan(planner, cases)
     head = np.array(cases.head_state)
     head[3] = np.nan
-    broken = dataclasses.replace(cases, head_state=head)
-    plans = pj.plan(planner, jax.tree.map(jnp.asarray, broken))
+    plans = pj.plan(planner, dataclasses.replace(cases, head_state=head))
     assert plans.status[3] == pj.Status.BAD_INPUT
     others = np.arange(NUM) != 3
     np.testing.assert_array_equal(plans.times[others], whole.times[others])
@@ -129,7 +126,7 @@ def test_a_file_that_is_no_checkpoint_is_named(tmp_path, fresh):
     save_checkpoint(odd, fresh["mlp"], NETWORKS["mlp"](), {"sizes": {"depth": 9}})
     says = {missing: "none", torn: "torn", other: "format 99", odd: "'mlp'.* got depth"}
     for path, words in says.items():
-        with pytest.raises(ArgumentError, match=words):
+        with pytest.raises(pj.ArgumentError, match=words):
             load_checkpoint(path)
 
 
@@ -167,14 +164,9 @@ def test_cases_drawn_by_a_key_are_of_the_suites_distribution(suite):
 
 def test_a_reward_pays_early_catches_only_where_they_are_made():
     environment = pytest.importorskip("planner_jax.policies.environment", exc_type=ImportError)
-    terms = {
-        "solved": jnp.array([1.0, 0.0]),
-        "last": jnp.array([0.1, 0.9]),
-        "ratio": jnp.array([0.05, 0.0]),
-        "caught": jnp.array([0.0, 0.5]),
-        "violation": jnp.array([0.0, 1.0]),
-    }
-    reward = environment.weight_terms(terms, WEIGHTS)
+    names = ("solved", "last", "ratio", "caught", "violation")
+    terms = jnp.array([[1.0, 0.1, 0.05, 0.0, 0.0], [0.0, 0.9, 0.0, 0.5, 1.0]])
+    reward = environment.weight_terms(dict(zip(names, terms.T, strict=True)), WEIGHTS)
     np.testing.assert_allclose(reward, [1.0 + 0.5 - 0.25, -0.5])
 
 

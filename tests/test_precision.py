@@ -7,12 +7,7 @@ import pytest
 from jax import lax
 from jaxpr import assert_full_precision
 
-from planner_jax.trajectory.proportional_minco import (
-    proportional_minco,
-    proportional_trajectory,
-    sample_motion,
-    trajectory_energy,
-)
+from planner_jax.trajectory import proportional_minco as minco
 
 MATRIX, ROWS = np.eye(3, dtype=np.float32), np.ones((8, 3), np.float32)
 
@@ -28,13 +23,11 @@ def custom_derivative(product):
 
 
 def proportional_values(rows, offsets, duration):
-    args = proportional_minco(4, (1.0,) * 4), rows, offsets, duration
-    parts = (
-        proportional_trajectory(*args),
-        sample_motion(args[0], 5, jnp.concatenate(args[1:3]), args[3]),
-        trajectory_energy(*args),
-    )
-    return sum(jnp.sum(leaf) for leaf in jax.tree.leaves(parts))
+    maps = minco.proportional_minco(4, (1.0,) * 4)
+    args = maps, rows, offsets, duration
+    parts = minco.proportional_trajectory(*args), minco.trajectory_energy(*args)
+    samples = minco.sample_motion(maps, 5, jnp.concatenate([rows, offsets]), duration)
+    return sum(jnp.sum(leaf) for leaf in jax.tree.leaves((parts, samples)))
 
 
 NESTED = {

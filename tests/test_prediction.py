@@ -109,25 +109,22 @@ def test_value_and_slope_are_continuous_across_every_node(node):
 
 
 @float64
-@pytest.mark.parametrize(("end", "outwards"), [(0.0, -1.0), (HORIZON, 1.0)])
-def test_at_both_ends_the_value_is_continuous_and_the_target_keeps_its_velocity(end, outwards):
+@pytest.mark.parametrize(("end", "outwards", "later"), [(0.0, -1.0, 0.4), (HORIZON, 1.0, 2.0)])
+def test_at_both_ends_the_value_is_continuous_and_the_target_keeps_its_velocity(
+    end, outwards, later
+):
     table = path()
-    inside, at, outside = (target_and_rate(table, end + outwards * e) for e in (-1e-9, 0.0, 1e-9))
+    inside, at, outside, far = (
+        target_and_rate(table, end + outwards * e) for e in (-1e-9, 0.0, 1e-9, later)
+    )
     assert_close(inside[0], at[0], atol=1e-7)
     assert_close(outside[0], at[0], atol=1e-7)
     for rate in (inside[1], at[1]):
         np.testing.assert_allclose(rate.pos, outside[1].pos, atol=0.05)
     np.testing.assert_array_equal(outside[1].pos, outside[0].vel)
     np.testing.assert_array_equal(outside[1].vel, 0.0)
-
-
-@float64
-@pytest.mark.parametrize(("time", "end"), [(-0.4, 0.0), (HORIZON + 2.0, HORIZON)])
-def test_a_time_outside_the_table_continues_at_constant_velocity(time, end):
-    table = path()
-    state, last = (target_and_rate(table, t)[0] for t in (time, end))
-    np.testing.assert_allclose(state.vel, last.vel, rtol=1e-14)
-    np.testing.assert_allclose(state.pos, last.pos + last.vel * (time - end), rtol=1e-14)
+    np.testing.assert_allclose(far[0].vel, at[0].vel, rtol=1e-14)
+    np.testing.assert_allclose(far[0].pos, at[0].pos + at[0].vel * outwards * later, rtol=1e-14)
 
 
 def somewhere_on_the_path(point):

@@ -1,8 +1,5 @@
 """The names a user imports from the top of the package, and from a task."""
 
-import subprocess
-import sys
-
 import pytest
 
 import planner_jax as pj
@@ -51,11 +48,3 @@ def test_a_draw_says_which_suites_there_are(task):
 def test_unknown_name_is_an_attribute_error():
     with pytest.raises(AttributeError, match="attribute plans"):
         pj.plans  # noqa: B018
-
-
-@pytest.mark.parametrize(
-    "code", ["planner_jax", "planner_jax.core.registry", "planner_jax.task.hit.spec"]
-)
-def test_importing_the_package_or_what_names_the_tasks_does_not_import_jax(code):
-    code = f"import sys, {code}; sys.exit('jax' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

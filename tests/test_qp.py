@@ -67,10 +67,8 @@ def test_single_precision_is_as_cheap_to_a_millionth_and_keeps_the_bounds(solved
 @float64
 def test_the_least_square_sum_on_a_line_beside_a_bound_and_a_row_that_the_line_decides():
     template = qp_template(np.eye(2), [[1.0, 1.0]], [[1.0, 0.0], [1.0, 1.0]])
-    solve = jax.jit(
-        jax.vmap(lambda low: solve_qp(template, jnp.ones(1), low, jnp.full(2, jnp.inf)))
-    )
-    found = solve(np.array([[2.0, -1.0], [2.0, 1.1]]))
+    lowest = lambda low: solve_qp(template, jnp.ones(1), low, jnp.full(2, jnp.inf))  # noqa: E731
+    found = jax.jit(jax.vmap(lowest))(np.array([[2.0, -1.0], [2.0, 1.1]]))
     np.testing.assert_allclose(found.point[0], [2.0, -1.0], atol=1e-12)
     np.testing.assert_allclose(found.multiplier[0], [3.0, 0.0], atol=1e-12)
     np.testing.assert_allclose(found.cost[0], 2.5, atol=1e-12)
@@ -93,12 +91,12 @@ def test_multipliers_are_cost_slopes_and_gradients_match_differences(solved):
     np.testing.assert_allclose(slopes[2][0], np.minimum(pressure, 0.0), atol=1e-8)
     for _ in range(3):
         direction = [RNG.normal(size=each.shape) for each in given]
-        ends = [
+        ahead, behind = (
             one(*(each + h * step for each, step in zip(given, direction, strict=True)))
             for h in (1e-6, -1e-6)
-        ]
-        found = [np.stack([end.cost, end.point @ weights]) for end in ends]
-        expected = (found[0] - found[1]) / 2e-6
+        )
+        change = [ahead.cost - behind.cost, (ahead.point - behind.point) @ weights]
+        expected = np.stack(change) / 2e-6
         actual = sum(slope @ step for slope, step in zip(slopes, direction, strict=True))
         np.testing.assert_allclose(actual, expected, rtol=1e-6, atol=1e-7)
 

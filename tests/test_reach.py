@@ -7,8 +7,6 @@ import numpy as np
 import pytest
 
 import planner_jax as pj
-from planner_jax.ball.flight import BallState
-from planner_jax.ball.target import BallPath
 from planner_jax.core.protocol import Status, is_unsolved
 from planner_jax.robot.quadrotor import ALLOWED, QuadrotorLimits, beyond_reach
 from planner_jax.task.catch.context import is_too_far as is_catch_too_far
@@ -17,7 +15,6 @@ from planner_jax.task.hit.context import is_too_far as is_hit_too_far
 from planner_jax.task.hit.context import prepare_hit
 
 HIT, CATCH = pj.hit.planner("exact"), pj.catch.planner("exact", decide="greedy")
-TARGET = (4.0, 0.0, 0.0)
 
 hits_too_far = jax.jit(jax.vmap(lambda case: is_hit_too_far(prepare_hit(case, 36))))
 catches_too_far = jax.jit(jax.vmap(lambda case: is_catch_too_far(order_targets(case))))
@@ -46,7 +43,11 @@ def test_a_quadrotor_at_rest_accelerates_and_then_flies_at_its_greatest_speed():
     assert early == pytest.approx(100.0 - 0.5 * most * 0.25, rel=1e-5)
     late = beyond(far, 3.0, head(), acceleration=8.0)
     assert late == pytest.approx(100.0 - (3.0 * speed - 0.5 * speed**2 / most), rel=1e-5)
-    assert beyond(far, 3.0, head()) == pytest.approx(100.0 - 3.0 * speed, rel=1e-5)
+    unlimited = beyond(far, 3.0, head())
+    assert unlimited == pytest.approx(100.0 - 3.0 * speed, rel=1e-5)
+    # An infinite thrust is no limit.
+    infinite = beyond(far, 3.0, head(), min_thrust=0.0, max_thrust=np.inf)
+    assert infinite == pytest.approx(unlimited, rel=1e-6)
 
 
 def test_an_initial_velocity_moves_the_quadrotor_away_from_a_point_behind():
@@ -61,12 +62,6 @@ def test_thrust_accelerates_less_upwards_than_sideways():
     aside = beyond((11.0, 2.0, 3.0), 0.4, head(), **bounds)
     assert up == pytest.approx(10.0 - 0.08 * (20.0 * ALLOWED - 9.8), rel=1e-5)
     assert aside < up
-
-
-def test_an_infinite_thrust_is_no_limit():
-    far = (101.0, 2.0, 3.0), 3.0, head()
-    unlimited = beyond(*far, min_thrust=0.0, max_thrust=np.inf)
-    assert unlimited == pytest.approx(beyond(*far), rel=1e-6)
 
 
 @pytest.fixture(scope="module")
@@ -90,23 +85,22 @@ def test_impossible_hits_are_given_up_after_the_first_round(serves):
 def test_a_ball_above_the_greatest_apex_until_it_lands_far_away_is_too_far(serves):
     high = serves.ball.pos.copy(), serves.ball.vel.copy()
     high[0][0], high[1][0] = (-3.0, 0.0, 6.5), (20.0, 0.0, 8.0)
-    assert hits_too_far(dataclasses.replace(serves, ball=BallState(*high)))[0]
+    assert hits_too_far(dataclasses.replace(serves, ball=pj.BallState(*high)))[0]
 
 
 def test_a_number_that_is_not_finite_rules_out_nothing(serves):
     pos = serves.ball.pos.copy()
     pos[1, 0] = np.nan
-    broken = dataclasses.replace(serves, ball=BallState(pos, serves.ball.vel))
+    broken = dataclasses.replace(serves, ball=pj.BallState(pos, serves.ball.vel))
     assert hits_too_far(broken).tolist() == [False, False, True, False]
 
 
 def throw(*balls, horizon=1.2, **options):
     pos, vel = (np.asarray(part, np.float32)[None] for part in zip(*balls, strict=True))
     shape = pos.shape[:2]
-    path = BallPath(BallState(pos, vel), 0.0 * pos, np.full(shape, 9.81, np.float32))
-    return jax.tree.map(
-        np.asarray, pj.catch.case(path, np.full(shape, horizon, np.float32), **options)
-    )
+    path = pj.BallPath(pj.BallState(pos, vel), 0.0 * pos, np.full(shape, 9.81, np.float32))
+    case = pj.catch.case(path, np.full(shape, horizon, np.float32), **options)
+    return jax.tree.map(np.asarray, case)
 
 
 NEAR = ((2.0, 0.0, 2.0), (-2.0, 0.0, 3.0))
@@ -129,17 +123,14 @@ def test_one_target_out_of_reach_is_enough_unless_it_is_optional_or_absent():
     assert not catches_too_far(throw(NEAR, AWAY, present=np.array([[True, False]])))[0]
 
 
-@pytest.mark.parametrize(
-    ("draw", "too_far", "planner"),
-    [
-        (lambda: pj.hit.draw(256, seed=5, limit_scale=0.35), hits_too_far, HIT),
-        (lambda: pj.catch.draw(256, "hard", 5, limit_scale=0.45), catches_too_far, CATCH),
-    ],
-    ids=["hits", "catches"],
-)
+@pytest.mark.parametrize("task", ["hits", "catches"])
 @pytest.mark.slow
-def test_no_solved_case_is_too_far_with_tight_limits(draw, too_far, planner):
-    cases = draw()
+def test_no_solved_case_is_too_far_with_tight_limits(task):
+    if task == "hits":
+        cases, too_far, planner = pj.hit.draw(256, seed=5, limit_scale=0.35), hits_too_far, HIT
+    else:
+        cases = pj.catch.draw(256, "hard", 5, limit_scale=0.45)
+        too_far, planner = catches_too_far, CATCH
     plans = pj.plan(planner, jax.tree.map(np.asarray, cases))
     ruled_out = np.asarray(too_far(cases))
     assert ruled_out.any() and pj.are_solved(plans).any()

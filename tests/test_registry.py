@@ -113,9 +113,8 @@ def test_a_broken_task_is_left_out_with_a_warning(others, place, problem):
 
 
 def test_a_task_and_a_planner_with_a_used_name_are_left_out(others):
-    others(
-        tasks={"hit": "planner_jax_others:THEIRS"}, planners={"hit.exact": "planner_jax_others:low"}
-    )
+    theirs, low = (f"planner_jax_others:{name}" for name in ("THEIRS", "low"))
+    others(tasks={"hit": theirs}, planners={"hit.exact": low})
     problem = "^task 'hit' .* left out: the name is taken by planner_jax.task.hit$"
     with pytest.warns(UserWarning, match=problem):
         assert all_tasks()["hit"].home == "planner_jax.task.hit"

@@ -198,8 +198,7 @@ def test_mjcf_without_mujoco_names_the_file_and_the_extra(monkeypatch):
 
 def test_mjcf_alone_takes_tool_and_limits_from_keywords():
     robot = pj.read_robot(DATA / "quadrotor.xml", tool=TOOL, limits=LIMITS, name="other")
-    beside = pj.read_robot(DATA / "quadrotor_of_mjcf.yaml", name="other")
-    assert robot == beside
+    assert robot == pj.read_robot(DATA / "quadrotor_of_mjcf.yaml", name="other")
     with pytest.raises(RobotError, match="quadrotor.xml: tool must be given, got nothing$"):
         pj.read_robot(DATA / "quadrotor.xml", limits=LIMITS)
 

@@ -10,20 +10,12 @@ import pytest
 from flax import struct
 
 import planner_jax as pj
-from planner_jax.core.protocol import Plan
 from planner_jax.optimise.implicit import newton_refine, optimal_plan
 from planner_jax.optimise.inverse_kernel import inverse_kernel
 from planner_jax.optimise.multistart import minimise
-from planner_jax.optimise.planner import OptimisedPlanner, pending
 from planner_jax.optimise.preconditioner import positive_inverse
 from planner_jax.optimise.sensitivity import _with_part, gradient_at, part_of
-from planner_jax.optimise.settings import Evaluation, LbfgsConfig, Round
 from planner_jax.planning.decided import first_choice
-from planner_jax.planning.gradient import gradient
-from planner_jax.task.catch.decide import Greedy
-from planner_jax.task.catch.default_planner import ExactCatch
-from planner_jax.task.catch.suites import draw
-from planner_jax.task.hit.default_planner import ExactHit
 from planner_jax.task.hit.suites import generate_serves, to_cases
 from tests.derivatives import double
 
@@ -44,17 +36,17 @@ class Bowl:
 
 
 @struct.dataclass
-class BowlPlan(Plan):
+class BowlPlan(pj.Plan):
     point: jax.Array
 
 
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
-class BowlPlanner(OptimisedPlanner):
+class BowlPlanner(pj.OptimisedPlanner):
     weight: float = 1.0
     rounds: tuple = (
-        Round(starts=2, solver=LbfgsConfig(max_steps=40, tolerance=1e-14), settings=()),
-        Round(starts=1, solver=LbfgsConfig(max_steps=5), settings=(("weight", 2.0),)),
+        pj.Round(starts=2, solver=pj.LbfgsConfig(max_steps=40, tolerance=1e-14), settings=()),
+        pj.Round(starts=1, solver=pj.LbfgsConfig(max_steps=5), settings=(("weight", 2.0),)),
     )
 
     def prepare(self, case):
@@ -65,10 +57,10 @@ class BowlPlanner(OptimisedPlanner):
 
     def objective(self, point, context):
         energy = 0.5 * self.weight * jnp.sum(point * (CURVED @ point))
-        return Evaluation(energy - jnp.sum(point * context["force"]), -jnp.ones(()))
+        return pj.Evaluation(energy - jnp.sum(point * context["force"]), -jnp.ones(()))
 
     def decode(self, point, context):
-        return BowlPlan(point=point, **pending(-jnp.ones(())))
+        return BowlPlan(point=point, **pj.pending(-jnp.ones(())))
 
 
 def square(plan):
@@ -83,7 +75,7 @@ def bowls(float64):
 
 @pytest.mark.parametrize("options", [{"steps": 3}, {"steps": 1, "curvature": "whole"}])
 def test_gradient_of_a_quadratic_is_the_closed_form(bowls, options):
-    found = gradient(BowlPlanner(), bowls, of=square, by=("b", "k"), **options)
+    found = pj.gradient(BowlPlanner(), bowls, of=square, by=("b", "k"), **options)
     inverse = np.linalg.inv(CURVED)
     best = (bowls.b + bowls.k[:, None] * np.eye(3)[0]) @ inverse
     np.testing.assert_allclose(found.plans.point, best, atol=1e-6)
@@ -95,17 +87,17 @@ def test_gradient_of_a_quadratic_is_the_closed_form(bowls, options):
 
 def test_the_gradient_is_nan_where_the_hessian_is_not_positive(bowls):
     """A maximum has no derivative as a minimum; the direct part alone would be zero."""
-    planner = BowlPlanner(weight=-1.0, rounds=(Round(1, LbfgsConfig(max_steps=0)),))
-    found = gradient(planner, bowls, of=lambda plan: plan.point[0], by="b")
+    planner = BowlPlanner(weight=-1.0, rounds=(pj.Round(1, pj.LbfgsConfig(max_steps=0)),))
+    found = pj.gradient(planner, bowls, of=lambda plan: plan.point[0], by="b")
     assert np.isnan(found.by["b"]).all() and np.isnan(found.residual).all()
 
 
 def test_gradient_of_the_cost_needs_no_adjoint(bowls):
-    found = gradient(BowlPlanner(), bowls, of="cost", by=("b",), steps=0)
+    found = pj.gradient(BowlPlanner(), bowls, of="cost", by=("b",), steps=0)
     np.testing.assert_allclose(found.by["b"], -found.plans.point, atol=1e-12)
     np.testing.assert_allclose(found.value, found.plans.cost, atol=1e-12)
     for by in ("b", ["b"]):  # one name, or a list
-        again = gradient(BowlPlanner(), bowls, of="cost", by=by, steps=0)
+        again = pj.gradient(BowlPlanner(), bowls, of="cost", by=by, steps=0)
         np.testing.assert_array_equal(again.by["b"], found.by["b"])
 
 
@@ -127,11 +119,11 @@ def test_a_batch_equals_its_lanes_and_a_broken_lane_affects_no_other(bowls):
     b = bowls.b.copy()
     b[2] = np.nan
     how = {"of": square, "by": ("b", "k"), "steps": 3}
-    found = gradient(BowlPlanner(), bowls.replace(b=b), **how)
+    found = pj.gradient(BowlPlanner(), bowls.replace(b=b), **how)
     assert np.isnan(found.by["b"][2]).all() and found.plans.point.shape == (5, 3)
     for lane in (0, 1, 3, 4):
         one = jax.tree.map(lambda leaf, k=lane: leaf[k], bowls)
-        alone = gradient(BowlPlanner(), one, **how)
+        alone = pj.gradient(BowlPlanner(), one, **how)
         np.testing.assert_allclose(found.by["b"][lane], alone.by["b"], rtol=1e-9)
 
 
@@ -165,7 +157,7 @@ def test_the_kernel_gives_the_same_inverses():
 )
 def test_invalid_arguments_are_named(bowls, options, line):
     with pytest.raises(ValueError, match=line):
-        gradient(BowlPlanner(), bowls, **{"of": "cost", "by": ("b",), **options})
+        pj.gradient(BowlPlanner(), bowls, **{"of": "cost", "by": ("b",), **options})
 
 
 def late_serve():
@@ -177,18 +169,18 @@ def easy_serve():
 
 
 def throw():
-    return first_choice(Greedy(), draw(1, "throws", 3))
+    return first_choice(pj.catch.Greedy(), pj.catch.draw(1, "throws", 3))
 
 
-HIT = ExactHit(proportions=(0.2, 0.5, 1.0, 1.0, 1.0, 1.0))
-TIMES = {HIT: lambda plan: plan.stroke.time, ExactCatch(): lambda plan: plan.times[-1]}
+HIT = pj.hit.ExactHit(proportions=(0.2, 0.5, 1.0, 1.0, 1.0, 1.0))
+TIMES = {HIT: lambda plan: plan.stroke.time, pj.catch.ExactCatch(): lambda plan: plan.times[-1]}
 HEIGHT, RATE, DRAG = {"racket_height": 1e-3}, {"limits.body_rate": 1e-3}, {"drag": 1e-4}
 THROW = {"net.height": 1e-3, "gravity": 1e-3, "limits.speed": 1e-3}
 CASES = {  # planner, case, steps of the differences by places in the case, options
     "hit": (HIT, late_serve, HEIGHT | DRAG | RATE, {"curvature": "whole"}),
     "hit by products": (HIT, late_serve, HEIGHT | RATE, {}),
     "hit without active limits": (HIT, easy_serve, HEIGHT | DRAG, {}),
-    "catch": (ExactCatch(), throw, THROW, {"curvature": "whole"}),
+    "catch": (pj.catch.ExactCatch(), throw, THROW, {"curvature": "whole"}),
 }
 
 
@@ -197,7 +189,7 @@ CASES = {  # planner, case, steps of the differences by places in the case, opti
 def test_the_gradient_at_an_optimum_matches_differences_of_optima(name, float64):
     planner, make, steps, options = CASES[name]
     case, quantity = double(pj.take(make(), 0)), TIMES[planner]
-    config = LbfgsConfig(max_steps=200, tolerance=1e-7, patience=6)
+    config = pj.LbfgsConfig(max_steps=200, tolerance=1e-7, patience=6)
 
     def objective_of(case):
         context = planner.prepare(case)

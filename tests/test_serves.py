@@ -11,21 +11,10 @@ import planner_jax as pj
 from planner_jax.ball import flight
 from planner_jax.baselines.hit.published import read_published_rates
 from planner_jax.core.errors import ArgumentError, CaseError
-from planner_jax.task.hit import court
+from planner_jax.task.hit import court, suites
 from planner_jax.task.hit.case import GRAVITY
 from planner_jax.task.hit.court import check_cases, fly, landing
 from planner_jax.task.hit.spec import DRAG
-from planner_jax.task.hit.suites import (
-    DEPTH,
-    MAX_FLIGHT_TIME,
-    MIN_APPROACH_SPEED,
-    RISE_SPEED,
-    SERVE_HEIGHT,
-    advance,
-    generate_serves,
-    read_serves,
-    to_cases,
-)
 from tests.trees import assert_same
 
 PUBLISHED = Path(__file__).resolve().parents[2] / "shared" / "data" / "serves"
@@ -33,10 +22,7 @@ needs_published = pytest.mark.skipif(
     not PUBLISHED.is_dir(), reason="the published trial files are not beside the repository"
 )
 
-HEADER = (
-    "number,serve position,serve velocity,landing position,target,"
-    "drone hitting positon,drone hitting velocity,drone hitting attitude"
-)
+HEADER = "number,serve position,serve velocity,landing position,target,position,velocity,attitude"
 HIT = " -2.1 -0.3   1.5,  1.8 -0.2 1.1,-0.01  0.2  -0.002  0.97"
 MISS = "failed,failed,failed"
 
@@ -70,9 +56,8 @@ def floor_points(position, velocity, step=1e-3):
 def test_the_court_has_36_scenarios_without_mirror_images():
     assert len(court.SCENARIOS) == len(set(court.SCENARIOS)) == 36
     mirror = str.maketrans("LR", "RL")
-    assert not [
-        n for n in court.SCENARIOS if (m := n.translate(mirror)) != n and m in court.SCENARIOS
-    ]
+    mirrored = {name.translate(mirror) for name in court.SCENARIOS if set(name) & {*"LR"}}
+    assert not mirrored & {*court.SCENARIOS}
     assert court.SCENARIOS[:4] == ("NNN", "NNF", "NNL", "NFN") and court.SCENARIOS[-1] == "LRR"
 
 
@@ -94,7 +79,7 @@ def test_trial_files_are_read_with_the_outcome_of_each_planner(tmp_path):
     write(tmp_path, "1_1_2_l.csv", row(1, hit=MISS), row(2, position="  1.5  0.2       2"))
     write(tmp_path, "1_1_2_b.csv", row(1, hit=MISS), row(2, position="1.5 0.2 2", hit=MISS))
     (tmp_path / "README.md").write_text("not a trial file")
-    serves = read_serves(tmp_path)
+    serves = suites.read_serves(tmp_path)
     np.testing.assert_array_equal(serves.position, [[2.5, -0.3, 2.0], [1.5, 0.2, 2.0]])
     np.testing.assert_array_equal(serves.velocity[0], [-4.3, 0.02, 7.3])
     np.testing.assert_array_equal(serves.target[0], [1.75, 0.0, 0.0])
@@ -106,7 +91,7 @@ def test_trial_files_are_read_with_the_outcome_of_each_planner(tmp_path):
 def test_a_missing_planner_is_nan_and_scenarios_take_turns(tmp_path):
     write(tmp_path, "3_4_4_l.csv", row(1), row(2, hit=MISS))
     write(tmp_path, "1_1_1_p.csv", row(1), row(2), row(3))
-    serves = read_serves(tmp_path)
+    serves = suites.read_serves(tmp_path)
     names = [court.SCENARIOS[s] for s in serves.scenario]
     assert names == ["NNN", "LRR", "NNN", "LRR", "NNN"]
     np.testing.assert_array_equal(serves.published[1], [np.nan, 1, np.nan])
@@ -115,12 +100,12 @@ def test_a_missing_planner_is_nan_and_scenarios_take_turns(tmp_path):
 
 def test_an_absent_or_unsuitable_folder_is_named(tmp_path):
     with pytest.raises(ArgumentError, match="existing folder, got .*nowhere"):
-        read_serves(tmp_path / "nowhere")
+        suites.read_serves(tmp_path / "nowhere")
     with pytest.raises(ArgumentError, match="S_L_T_M.csv files, got none"):
-        read_serves(tmp_path)
+        suites.read_serves(tmp_path)
     write(tmp_path, "1_1_4_p.csv", row())
     with pytest.raises(ArgumentError, match=r"36 scenarios, got 1_1_4_p.csv \(NNR"):
-        read_serves(tmp_path)
+        suites.read_serves(tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -138,7 +123,7 @@ def test_an_absent_or_unsuitable_folder_is_named(tmp_path):
 def test_a_bad_row_is_named_by_file_line_rule_and_value(tmp_path, bad, says):
     write(tmp_path, "1_1_1_p.csv", row(), bad)
     with pytest.raises(ArgumentError) as caught:
-        read_serves(tmp_path)
+        suites.read_serves(tmp_path)
     assert f"1_1_1_p.csv:3: {says}" in str(caught.value)
     assert "\n" not in str(caught.value) and len(caught.value.value) == 1
 
@@ -147,12 +132,12 @@ def test_all_bad_rows_and_empty_files_are_collected_and_the_first_few_spelled_ou
     write(tmp_path, "1_1_1_p.csv", *["broken"] * 4, row())
     write(tmp_path, "1_1_2_p.csv", *["broken"] * 3)
     with pytest.raises(ArgumentError, match="1_1_2_p.csv:2: .*; and 2 more$") as caught:
-        read_serves(tmp_path)
+        suites.read_serves(tmp_path)
     assert len(caught.value.value) == 7
     for text in ("", HEADER + "\n"):
         (tmp_path / "1_1_1_p.csv").write_text(text)
         with pytest.raises(ArgumentError, match="1_1_1_p.csv: file must have a row") as caught:
-            read_serves(tmp_path)
+            suites.read_serves(tmp_path)
         assert len(caught.value.value) == 4
 
 
@@ -160,17 +145,16 @@ def test_files_of_one_scenario_must_hold_the_same_serves(tmp_path):
     write(tmp_path, "1_1_1_b.csv", row(), row(2), row(3))
     write(tmp_path, "1_1_1_p.csv", row(), row(2, position="2.6 0 2"))
     with pytest.raises(ArgumentError) as caught:
-        read_serves(tmp_path)
+        suites.read_serves(tmp_path)
     changed, missing = caught.value.value
-    assert changed.startswith(
-        "1_1_1_p.csv:3: serve must be the one in 1_1_1_b.csv, [2.5, -0.3, 2.0"
-    )
-    assert missing == "1_1_1_p.csv:4: serve must be the one in 1_1_1_b.csv, got no such line"
+    rule = "serve must be the one in 1_1_1_b.csv"
+    assert changed.startswith(f"1_1_1_p.csv:3: {rule}, [2.5, -0.3, 2.0")
+    assert missing == f"1_1_1_p.csv:4: {rule}, got no such line"
 
 
 @needs_published
 def test_the_published_serves_are_read_with_their_rates():
-    serves = read_serves(PUBLISHED)
+    serves = suites.read_serves(PUBLISHED)
     assert len(serves) == 9000
     np.testing.assert_array_equal(np.bincount(serves.scenario), np.full(36, 250))
     np.testing.assert_allclose(serves.target, court.target_of(serves.scenario))
@@ -208,45 +192,43 @@ def test_the_landing_point_agrees_with_a_fine_integration(drag):
 
 
 def test_fewer_serves_are_the_first_of_more_and_chunks_join():
-    whole = generate_serves(4700, 7)  # across two blocks
-    assert_same(vars(generate_serves(40, 7)), vars(whole[:40]))
-    assert_same(vars(generate_serves(200, 7, first=4500)), vars(whole[4500:]))
-    assert not np.allclose(generate_serves(40, 8).velocity, whole.velocity[:40])
+    whole = suites.generate_serves(4700, 7)  # across two blocks
+    assert_same(vars(suites.generate_serves(40, 7)), vars(whole[:40]))
+    assert_same(vars(suites.generate_serves(200, 7, first=4500)), vars(whole[4500:]))
+    assert not np.allclose(suites.generate_serves(40, 8).velocity, whole.velocity[:40])
 
 
 def test_every_run_of_36_serves_covers_the_court_in_shuffled_order():
-    runs = generate_serves(360, 0).scenario.reshape(10, 36)
+    runs = suites.generate_serves(360, 0).scenario.reshape(10, 36)
     np.testing.assert_array_equal(np.sort(runs, axis=1), np.tile(np.arange(36), (10, 1)))
     assert len(np.unique(runs, axis=0)) == 10
-    some = generate_serves(20, 0, ["LRR", "FFN"]).scenario
+    some = suites.generate_serves(20, 0, ["LRR", "FFN"]).scenario
     first, every = ({court.SCENARIOS[s] for s in part} for part in (some[:2], some))
     assert first == every == {"LRR", "FFN"}
 
 
 def test_serves_start_and_land_in_their_regions():
-    serves = generate_serves(36 * 20, 3)
+    serves = suites.generate_serves(36 * 20, 3)
     regions = court.scenario_regions(serves.scenario)
     x, y, z = serves.position.T
-    assert (x > 0.0).all() and (z == SERVE_HEIGHT).all()
+    assert (x > 0.0).all() and (z == suites.SERVE_HEIGHT).all()
     np.testing.assert_array_equal(region_of(x, y), regions[:, 0])
     point = floor_points(serves.position, serves.velocity)
     # A landing point within the error of the two integrations of a line may fall beyond it.
-    inward = [
-        region_of(point[:, 0] + dx, point[:, 1] + dy)
-        for dx, dy in [(0, 0), (1e-3, 0), (-1e-3, 0), (0, 1e-3), (0, -1e-3)]
-    ]
-    assert (np.stack(inward) == regions[:, 1]).any(axis=0).all()
-    assert (point[:, 0] < 0.0).all() and (np.abs(point[:, 0]) < DEPTH + 1e-3).all()
+    shifts = 1e-3 * np.array([(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)])[:, None]
+    near = region_of(*np.moveaxis(point[:, :2] + shifts, -1, 0))
+    assert (near == regions[:, 1]).any(axis=0).all()
+    assert (point[:, 0] < 0.0).all() and (np.abs(point[:, 0]) < suites.DEPTH + 1e-3).all()
     np.testing.assert_allclose(serves.target, court.target_of(serves.scenario))
 
 
 def test_serves_keep_the_declared_law():
-    serves = generate_serves(3600, 1)
+    serves = suites.generate_serves(3600, 1)
     time, _ = landing(serves.position, serves.velocity, DRAG, GRAVITY)
-    assert time.max() < MAX_FLIGHT_TIME + 1e-5 and time.min() > 1.49
-    assert serves.velocity[:, 0].max() <= -MIN_APPROACH_SPEED
+    assert time.max() < suites.MAX_FLIGHT_TIME + 1e-5 and time.min() > 1.49
+    assert serves.velocity[:, 0].max() <= -suites.MIN_APPROACH_SPEED
     rise = serves.velocity[:, 2]
-    assert rise.min() >= RISE_SPEED[0] and rise.max() <= RISE_SPEED[1]
+    assert rise.min() >= suites.RISE_SPEED[0] and rise.max() <= suites.RISE_SPEED[1]
 
 
 def test_the_shortcut_of_the_generator_draws_uniform_serves():
@@ -254,9 +236,9 @@ def test_the_shortcut_of_the_generator_draws_uniform_serves():
     low, high = [0.5, 0.84, 2.0, -8.5, -5.5, 6.5], [4.5, 2.5, 2.0, -2.0, -0.5, 8.73]
     plain = random.uniform(low, high, (40000, 6))
     time, point = landing(plain[:, :3], plain[:, 3:], DRAG, GRAVITY)
-    accepted = (region_of(point[:, 0], point[:, 1]) == 4) & (time < MAX_FLIGHT_TIME)
-    plain = plain[accepted & (point[:, 0] < 0.0) & (point[:, 0] > -DEPTH)]
-    serves = generate_serves(8000, 0, ["LRN"])
+    accepted = (region_of(point[:, 0], point[:, 1]) == 4) & (time < suites.MAX_FLIGHT_TIME)
+    plain = plain[accepted & (point[:, 0] < 0.0) & (point[:, 0] > -suites.DEPTH)]
+    serves = suites.generate_serves(8000, 0, ["LRN"])
     shortcut = np.hstack([serves.position, serves.velocity])
     deciles = np.linspace(0.1, 0.9, 9)
     spread = np.maximum(plain.std(axis=0), 1e-9)
@@ -266,7 +248,7 @@ def test_the_shortcut_of_the_generator_draws_uniform_serves():
 
 @needs_published
 def test_generated_serves_are_distributed_as_the_published_ones():
-    published, generated = read_serves(PUBLISHED), generate_serves(36000, 0)
+    published, generated = suites.read_serves(PUBLISHED), suites.generate_serves(36000, 0)
     pair = np.array([name[:2] for name in court.SCENARIOS])
 
     def features(serves):
@@ -284,9 +266,9 @@ def test_generated_serves_are_distributed_as_the_published_ones():
 
 
 def test_two_delays_in_a_row_are_their_sum():
-    serves = generate_serves(36, 0)
-    late = advance(serves, 0.8)
-    twice = advance(advance(serves, 0.5), 0.3)
+    serves = suites.generate_serves(36, 0)
+    late = suites.advance(serves, 0.8)
+    twice = suites.advance(suites.advance(serves, 0.5), 0.3)
     np.testing.assert_allclose(late.position, twice.position, atol=1e-5)
     np.testing.assert_allclose(late.velocity, twice.velocity, atol=1e-5)
     time, point = landing(serves.position, serves.velocity, DRAG, GRAVITY)
@@ -296,16 +278,16 @@ def test_two_delays_in_a_row_are_their_sum():
 
 
 def test_a_delay_beyond_the_flight_names_the_serve():
-    serves = generate_serves(50, 0)
+    serves = suites.generate_serves(50, 0)
     time, _ = landing(serves.position, serves.velocity, DRAG, GRAVITY)
     first = np.argmax(time <= 1.6)
     with pytest.raises(ArgumentError, match=f"{time[first]:.3f} s for serve {first}, got 1.6"):
-        to_cases(serves, delay=1.6)
+        suites.to_cases(serves, delay=1.6)
 
 
 def test_cases_carry_the_serves_and_the_setting_of_the_paper():
-    serves = generate_serves(5, 0)
-    cases = to_cases(serves, limit_scale=0.5)
+    serves = suites.generate_serves(5, 0)
+    cases = suites.to_cases(serves, limit_scale=0.5)
     np.testing.assert_allclose(cases.ball.pos, serves.position, rtol=1e-6)
     np.testing.assert_allclose(cases.target, serves.target, rtol=1e-6)
     np.testing.assert_allclose(cases.head_state[:, 0], np.tile([-3.0, 0.0, 1.5], (5, 1)))
@@ -319,15 +301,15 @@ def test_cases_carry_the_serves_and_the_setting_of_the_paper():
 
 
 def test_uniform_starts_fill_the_half_court_and_belong_to_their_serve():
-    serves = generate_serves(3000, 0)
-    start = np.asarray(to_cases(serves, start="uniform", seed=1).head_state[:, 0])
+    serves = suites.generate_serves(3000, 0)
+    start = np.asarray(suites.to_cases(serves, start="uniform", seed=1).head_state[:, 0])
     assert (start[:, 2] == 1.5).all()
     np.testing.assert_allclose(start[:, :2].min(axis=0), [-5.0, -2.5], atol=0.01)
     np.testing.assert_allclose(start[:, :2].max(axis=0), [-0.5, 2.5], atol=0.01)
     np.testing.assert_allclose(start[:, :2].mean(axis=0), [-2.75, 0.0], atol=0.1)
-    part = to_cases(serves[1000:1100], start="uniform", seed=1).head_state[:, 0]
+    part = suites.to_cases(serves[1000:1100], start="uniform", seed=1).head_state[:, 0]
     np.testing.assert_array_equal(part, start[1000:1100])
-    other = to_cases(serves[:10], start="uniform", seed=2).head_state[:, 0]
+    other = suites.to_cases(serves[:10], start="uniform", seed=2).head_state[:, 0]
     assert not np.allclose(other, start[:10])
 
 
@@ -345,8 +327,8 @@ def test_uniform_starts_fill_the_half_court_and_belong_to_their_serve():
 def test_arguments_of_generator_and_cases_out_of_range_are_named(arguments, says):
     with pytest.raises(ArgumentError, match=says):
         if "num" in arguments:
-            generate_serves(**{"seed": 0, **arguments})
-        to_cases(generate_serves(1, 0), **arguments)
+            suites.generate_serves(**{"seed": 0, **arguments})
+        suites.to_cases(suites.generate_serves(1, 0), **arguments)
 
 
 SERVE = ([2.0, 0.0, 2.0], [-4.0, 0.0, 7.0], [4.0, 0.0, 0.0])
@@ -374,16 +356,17 @@ def test_a_malformed_argument_is_named_in_one_line(change, error, says):
 
 def test_the_first_bad_lane_is_named_and_the_others_counted():
     batch = [np.tile(part, (6, 1)) for part in SERVE]
-    message = r"^drag must be >= 0, got -1 in lane 2 \(1 more such lane\)$"
-    with pytest.raises(CaseError, match=message):
-        check_cases(pj.hit.case(*batch, drag=[0.1, 0.1, -1.0, 0.1, -2.0, 0.1]))
+
+    def assert_refused(message, **options):
+        with pytest.raises(CaseError, match=f"^{message}$"):
+            check_cases(pj.hit.case(*batch, **options))
+
+    drag = [0.1, 0.1, -1.0, 0.1, -2.0, 0.1]
+    assert_refused(r"drag must be >= 0, got -1 in lane 2 \(1 more such lane\)", drag=drag)
     batch[1][4] = [2.0, 0.0, 7.0]
-    message = r"^landing point of ball must be in the hitting half, x < 0, got 4\.\d+ in lane 4$"
-    with pytest.raises(CaseError, match=message):
-        check_cases(pj.hit.case(*batch))
+    message = r"landing point of ball must be in the hitting half, x < 0, got 4\.\d+ in lane 4"
+    assert_refused(message)
     batch[0][1, 1] = np.nan
-    with pytest.raises(CaseError, match="^ball_pos must be finite, got nan in lane 1$"):
-        check_cases(pj.hit.case(*batch))
+    assert_refused("ball_pos must be finite, got nan in lane 1")
     batch[0][1] = [2.0, 0.0, -1.0]
-    with pytest.raises(CaseError, match="^ball_pos must be at a height >= 0 m, got -1 in lane 1$"):
-        check_cases(pj.hit.case(*batch))
+    assert_refused("ball_pos must be at a height >= 0 m, got -1 in lane 1")

@@ -42,7 +42,6 @@ from planner_jax.sims.view import Viewer
 from planner_jax.studies.block.observation import eye, see
 from planner_jax.studies.block.receding import Decided
 from planner_jax.task.block.motion import polynomial, profiles
-from planner_jax.task.block.plan import BlockPlan
 
 HOME, LANES = np.asarray(irb1600().home), 4  # all batches are of one size: one program
 TURN = np.array([-0.4, -0.5, 0.4, 0.6, -0.5, 0.8])  # [rad], of a motion without collisions
@@ -50,9 +49,7 @@ MOVING = 0.5  # [s], duration of a motion
 
 
 def motion(turn, duration=MOVING, ends_at_rest=True):
-    """Return a motion from home by an angle (6,) [rad], with the profile of the quickest straight
-    motion.
-    """
+    """Return a motion from home by joint angles (6,) [rad], straight, and as quick as possible."""
     shape = profiles(10, ends_at_rest)[-1]
     steps = jnp.asarray(shape[:, None] * turn, jnp.float32)
     return polynomial(jnp.asarray(HOME), jnp.zeros(6), steps, jnp.float32(duration))
@@ -67,14 +64,8 @@ def plans(*motions, contact, status=None):
     none: Any = np.zeros(num, np.float32)
     states: Any = np.zeros(num, np.int32) if status is None else np.array(status, np.int32)
     contacts: Any = np.full(num, contact, np.float32)
-    return BlockPlan(
-        cost=none,
-        violation=none,
-        iterations=none.astype(np.int32),
-        status=states,
-        motion=batch(*motions),
-        contact_time=contacts,
-    )
+    outcome = none, none, none.astype(np.int32), states
+    return pj.block.BlockPlan(*outcome, motion=batch(*motions), contact_time=contacts)
 
 
 STILL = motion(0.0 * TURN)
@@ -158,10 +149,9 @@ def test_noise_lag_and_mass_errors_hardly_matter_and_a_seed_gives_the_same_bits(
 
 
 def throw_at_shield(places, speed=8.0):
-    """Return balls that fly straight at the shield of an arm at home.
+    """Return balls that fly straight at the shield of an arm at home, and reach it after 0.5 s.
 
-    They pass the shield's centre at offsets `places` (B, 2), and are in the plane of its face after
-    0.5 s.
+    `places` (B, 2) [m] are the positions on the shield, relative to its centre.
     """
     turn, middle = map(np.asarray, shield_pose(irb1600(), jnp.asarray(HOME)))
     goal = middle + np.asarray(places) @ turn[:, 1:].T
@@ -194,8 +184,8 @@ def test_a_ball_that_comes_from_behind_or_too_late_is_not_blocked():
     from_behind = throw_at_shield([(0.0, 0.0)], speed=-8.0)
     assert not score_standstill(from_behind, HOME).blocked.any()
     cases = throw_at_shield([(0.0, 0.0)])
-    lower, upper = np.full((1, 3), -50.0), np.full((1, 3), 50.0)
-    everywhere = dataclasses.replace(cases.scene.inner, lower=lower, upper=upper)
+    far = np.full((1, 3), 50.0)
+    everywhere = dataclasses.replace(cases.scene.inner, lower=-far, upper=far)
     inside = dataclasses.replace(cases, scene=dataclasses.replace(cases.scene, inner=everywhere))
     found = score_standstill(inside, HOME)
     assert not found.blocked.any() and np.isnan(found.miss).all()
@@ -242,8 +232,7 @@ def test_the_parts_of_the_time_budget_add_up_and_a_late_plan_starts_late():
     assert np.abs(found.flown.angles[3] - HOME).max() < 1e-4  # without a plan it stays
     inside = budget.flight[:, None] + np.array([-1e-3, 1e-3])
     box, ball = cases.cases.scene.inner, cases.cases.ball
-    pos, vel = ball.pos[:, None], ball.vel[:, None]
-    places = pos + vel * inside[..., None]
+    places = ball.pos[:, None] + ball.vel[:, None] * inside[..., None]
     places[..., 2] -= 0.5 * 9.81 * inside**2
     within = ((places > box.lower[:, None]) & (places < box.upper[:, None])).all(axis=2)
     assert within.tolist() == [[False, True]] * LANES
@@ -253,13 +242,10 @@ def test_arms_that_observe_their_balls_execute_the_motions_they_decided():
     cases = throws("open", LANES, 1, regime="R1", delay=0.15)
     plan = plans(*MOTIONS, contact=0.15 + MOVING)
     sights = [see(cases.cases, eye(std=std), 0.1) for std in (0.02, 1e-5)]
-    none = np.zeros(LANES, np.float32)
     decided = Decided(
         cases=jax.tree.map(jnp.asarray, cases.cases),
-        plans=plan,
-        fits=batch(*[sight.fits for sight in sights]),
-        start=jnp.asarray(none),
-        motions=jnp.asarray(2 + np.arange(LANES)),
+        **{"plans": plan, "fits": batch(*[sight.fits for sight in sights])},
+        **{"start": jnp.zeros(LANES), "motions": 2 + jnp.arange(LANES)},
     )
     found = fly_blocks(BLOCK_WORLD, cases, decided=decided, planning_budget=0.05)
     known = fly_blocks(BLOCK_WORLD, cases, plan=plan, planning_budget=0.05)
@@ -372,9 +358,8 @@ def test_another_robot_arm_or_time_is_refused_in_one_line():
         carried = dataclasses.replace(BLOCK_WORLD, timestep=2.0 * TIMESTEP)
         nothing: Any = (None, None)
         execute(carried, *nothing, since=np.zeros(1), until=np.zeros(1), end=1.0)
-    with pytest.raises(
-        ValueError, match="^planning_budget must be >= 0 and <= the delay 0.1, got 0.2$"
-    ):
+    rule = "planning_budget must be >= 0 and <= the delay 0.1, got 0.2"
+    with pytest.raises(ValueError, match=f"^{rule}$"):
         fly_blocks(BLOCK_WORLD, cases, planning_budget=0.2)
     heavy = dataclasses.replace(cases.cases.arm, mass=2.0 * cases.cases.arm.mass)
     with pytest.raises(ValueError, match="^mass must be the same in plan and simulated arm$"):

@@ -1,7 +1,4 @@
-"""Rendered images of the arm's scene, and measurements from them. Skipped without OpenGL.
-
-A small image, so that rendering without a graphics card takes some milliseconds.
-"""
+"""Rendered images of the arm's scene, and measurements from them; skipped without OpenGL."""
 
 import jax
 import jax.numpy as jnp
@@ -19,9 +16,8 @@ from planner_jax.studies.block.camera import project
 from planner_jax.studies.block.flight_fit import belief_at, error_across, fit_flight
 from planner_jax.studies.block.noise import information, stereo_noise
 from planner_jax.studies.block.observation import mast_camera
-from planner_jax.task.block.scene import paper_scene
 
-CAMERA = mast_camera(size=(640, 360))
+CAMERA = mast_camera(size=(640, 360))  # small, as a processor alone may render it
 GRAVITY = 9.81
 see = jax.jit(sighting)
 
@@ -29,7 +25,7 @@ see = jax.jit(sighting)
 @pytest.fixture(scope="module")
 def scene():
     try:
-        with SceneCamera(CAMERA, paper_scene()) as scene:
+        with SceneCamera(CAMERA, pj.block.paper_scene()) as scene:
             yield scene
     except RenderError as error:
         pytest.skip(str(error))
@@ -51,15 +47,14 @@ def test_rendered_depths_match_the_scene(scene):
     expected = CAMERA.rotation[:2, 2] @ pole * (1.0 - 0.05 / np.linalg.norm(pole))
     expected = expected + CAMERA.rotation[2, 2] * (1.5 - CAMERA.position[2])
     assert depth[row, column] == pytest.approx(expected, abs=0.01)
-    column, row = np.round(project(CAMERA, jnp.array([4.0, -2.0, -0.4826]))[0]).astype(int)
-    _, expected = project(CAMERA, jnp.array([4.0, -2.0, -0.4826]))
+    pixel, expected = project(CAMERA, jnp.array([4.0, -2.0, -0.4826]))
+    column, row = np.round(pixel).astype(int)
     assert depth[row, column] == pytest.approx(float(expected), rel=0.02)
 
 
 def test_a_ball_behind_the_pole_or_out_of_view_is_not_seen(scene):
-    behind = np.asarray(CAMERA.position) + 3.0 * (
-        np.array([0.806, 0.0, 1.5]) - np.asarray(CAMERA.position)
-    )
+    camera = np.asarray(CAMERA.position)
+    behind = camera + 3.0 * (np.array([0.806, 0.0, 1.5]) - camera)
     half_hidden = behind + 0.5 * 0.15 * np.asarray(CAMERA.rotation)[:, 0]
     for place in (behind, half_hidden, np.array([-4.0, 0.0, 1.0]), None):
         image, depth = scene.take(place)
@@ -90,7 +85,7 @@ def test_missing_opengl_is_reported_in_one_line(monkeypatch):
 
     monkeypatch.setattr(scene_camera, "_context_class", lambda: none)
     with pytest.raises(RenderError, match="images need OpenGL .*: no library$") as caught:
-        SceneCamera(CAMERA, paper_scene())
+        SceneCamera(CAMERA, pj.block.paper_scene())
     assert "\n" not in str(caught.value)
 
 

@@ -12,7 +12,6 @@ from jax import lax
 
 import planner_jax as pj
 from planner_jax.cli.main import main
-from planner_jax.plane.target import TurningPath
 from planner_jax.sims.drive import DriveLoop, drive_on, start_drives
 from planner_jax.sims.film import draw_flight
 from planner_jax.sims.model import step
@@ -22,19 +21,8 @@ from planner_jax.sims.robots.car.tyres import tyre_forces
 from planner_jax.sims.robots.car.vehicle import Tyres, Vehicle
 from planner_jax.sims.scenery import Prism
 from planner_jax.sims.settings import InterceptFly
+from planner_jax.sims.tasks import intercept as driving
 from planner_jax.sims.tasks.catch import CATCH_WORLD
-from planner_jax.sims.tasks.intercept import (
-    CAR_WORLD,
-    Driven,
-    Meetings,
-    fly_intercepts,
-    meetings,
-    predict_scene,
-    require_car,
-    score,
-)
-from planner_jax.task import intercept
-from planner_jax.task.intercept.plan import InterceptPlan
 from tests.recordings import recording
 
 CAR = Vehicle()
@@ -52,26 +40,18 @@ EXACT, NOISY = PlaneSensing(), PlaneSensing(pose_stds=(0.01, 0.01))
 def plans(speed, curvature):
     num = len(speed)
     zero, none = jnp.zeros(num), jnp.zeros(num, jnp.int32)
-    knots = {"speed": speed, "curvature": curvature}
-    return InterceptPlan(
-        cost=zero,
-        violation=zero,
-        iterations=none,
-        status=none,
-        start=jnp.zeros((num, 3)),
-        time=zero + END,
-        meeting=jnp.zeros((num, 2)),
-        **{name: jnp.asarray(np.stack(value), jnp.float32) for name, value in knots.items()},
-    )
+    knots = (jnp.asarray(np.stack(value), jnp.float32) for value in (speed, curvature))
+    drive = jnp.zeros((num, 3)), zero + END, *knots, jnp.zeros((num, 2))
+    return pj.intercept.InterceptPlan(zero, zero, none, none, *drive)
 
 
 def drive_paths(sensing):
-    loop = DriveLoop(CAR_WORLD, sensing)
+    loop = DriveLoop(driving.CAR_WORLD, sensing)
     keys = jax.random.split(jax.random.key(3), len(PATHS))
     drives = start_drives(loop, plans(*zip(*PATHS.values(), strict=True)), keys)
     until = np.full(len(PATHS), END, np.float32)  # shares its program with the flights
     for _ in range(2):
-        drives, frames = drive_on(CAR_WORLD, drives, until, num_frames=100)
+        drives, frames = drive_on(driving.CAR_WORLD, drives, until, num_frames=100)
     return jax.device_get((drives.replace(key=None), frames))
 
 
@@ -85,15 +65,13 @@ def open_loop():
     @jax.jit
     def drive(physics, commands):
         def advance(physics, command):
-            physics = step(CAR_WORLD, physics, command, jnp.zeros(0))
+            physics = step(driving.CAR_WORLD, physics, command, jnp.zeros(0))
             return physics, physics
 
         return lax.scan(advance, physics, commands)[1]
 
-    curvature = np.float32([CURVATURE, 0.0])
-    physics = jax.jit(jax.vmap(Car().moving))(
-        np.zeros((2, 3), np.float32), np.float32([1.0, 0.5]), curvature
-    )
+    start, speed = np.zeros((2, 3), np.float32), np.float32([1.0, 0.5])
+    physics = jax.jit(jax.vmap(Car().moving))(start, speed, np.float32([CURVATURE, 0.0]))
     side = np.where(np.arange(400) % 200 < 100, 1.0, -1.0)
     angles = np.stack([np.full(400, np.arctan(CAR.wheelbase * CURVATURE)), side])
     commands = jnp.asarray(np.stack([0.0 * angles, angles], axis=2), jnp.float32)
@@ -140,16 +118,15 @@ def test_a_circle_has_the_radius_of_wheelbase_over_tangent(open_loop):
 
 def test_the_steering_angle_changes_no_faster_than_its_limit(open_loop):
     angles = open_loop.act[1, :, 1].astype(float)
-    rates = np.abs(np.diff(angles)) / CAR_WORLD.timestep
+    rates = np.abs(np.diff(angles)) / driving.CAR_WORLD.timestep
     assert rates.max() <= CAR.steering_rate * (1.0 + 1e-4)
     assert rates.max() >= CAR.steering_rate * (1.0 - 1e-3)
     assert np.abs(angles).max() <= CAR.steering * (1.0 + 1e-6)
 
 
 def test_stiff_tyres_act_like_tyres_without_slip():
-    np.testing.assert_allclose(
-        forces(tyres_without_sliding(1e6), 1.0), forces(None, 1.0), rtol=1e-3, atol=1e-3
-    )
+    stiff = forces(tyres_without_sliding(1e6), 1.0)
+    np.testing.assert_allclose(stiff, forces(None, 1.0), rtol=1e-3, atol=1e-3)
     soft = forces(tyres_without_sliding(5.0), 1.0)
     assert np.abs(soft - forces(None, 1.0)).max() > 1.0
 
@@ -172,22 +149,19 @@ def test_friction_bounds_the_lateral_force_of_a_tyre():
 
 
 def test_contacts_of_planned_poses_equal_those_of_the_referee():
-    cases = intercept.draw(6, "hard", 1)
+    cases = pj.intercept.draw(6, "hard", 1)
     speed, curvature = np.full((6, PIECES + 1), 0.6), np.tile(0.6 * np.sin(6.0 * SHARE), (6, 1))
     plan = plans(speed, curvature).replace(start=cases.start, time=cases.time)
     setpoints = plan.sample(50.0)
     poses = np.concatenate([setpoints.pos, setpoints.heading[..., None]], axis=2).astype(float)
-    flown = Driven(
+    flown = driving.Driven(
         times=setpoints.time,
         poses=poses,
-        wanted=poses[..., :2],
-        meeting=np.asarray(cases.time, float),
-        tracking=np.zeros((6, 2)),
-        saturation=np.zeros((6, 2)),
-        plans=np.ones(6, int),
-        paths=np.zeros((6, len(setpoints.time), 0, 2)),
+        **{"wanted": poses[..., :2], "meeting": np.asarray(cases.time, float)},
+        **{"tracking": np.zeros((6, 2)), "saturation": np.zeros((6, 2))},
+        **{"plans": np.ones(6, int), "paths": np.zeros((6, len(setpoints.time), 0, 2))},
     )
-    found, verdict = score(cases, plan, flown), intercept.judge(cases, plan)
+    found, verdict = driving.score(cases, plan, flown), pj.intercept.judge(cases, plan)
     for name in ("wall_clearance", "mover_clearance", "miss"):
         np.testing.assert_allclose(getattr(found, name), getattr(verdict, name), atol=2e-4)
     assert found.touched.any() and not found.touched.all()
@@ -195,14 +169,16 @@ def test_contacts_of_planned_poses_equal_those_of_the_referee():
 
 
 def test_predictions_use_only_observations_that_have_arrived():
-    loop = DriveLoop(CAR_WORLD, dataclasses.replace(EXACT, target_std=0.1, latency=0.05))
-    seen = meetings("easy", 2, seed=4, observation_rate=1.0)
-    of = jax.jit(functools.partial(predict_scene, loop, known_target=False, predict_movers=True))
+    loop = DriveLoop(driving.CAR_WORLD, dataclasses.replace(EXACT, target_std=0.1, latency=0.05))
+    seen = driving.meetings("easy", 2, seed=4, observation_rate=1.0)
+    of = jax.jit(
+        functools.partial(driving.predict_scene, loop, known_target=False, predict_movers=True)
+    )
     path, movers = jax.device_get(of(seen, np.float32(3.04)))
     later = dataclasses.replace(seen, target=seen.target + 9.0 * (seen.times > 2.5)[..., None])
     np.testing.assert_array_equal(path.pos, of(later, np.float32(3.04))[0].pos)
     assert np.abs(path.pos - of(later, np.float32(3.06))[0].pos).max() > 0.1
-    truth = intercept.case(seen.cases.target, seen.cases.time).target
+    truth = pj.intercept.case(seen.cases.target, seen.cases.time).target
     place = jax.jit(jax.vmap(lambda one: one.at(3.04).pos))(truth)
     assert np.linalg.norm(path.pos - place, axis=1).max() < 0.2
     there = seen.cases.movers.centre + 3.04 * seen.cases.movers.velocity
@@ -212,7 +188,7 @@ def test_predictions_use_only_observations_that_have_arrived():
 
 @dataclasses.dataclass
 class StraightOn(pj.Planner):
-    case_type = intercept.InterceptCase
+    case_type = pj.intercept.InterceptCase
     attempts = (pj.Attempt(),)
     solved: int
     starts: list = dataclasses.field(default_factory=list)
@@ -224,33 +200,24 @@ class StraightOn(pj.Planner):
         way = np.sum(goal * ahead, axis=1) - cases.body.length / 2.0 + cases.body.rear_overhang
         last = 2.0 * way / cases.time - cases.speed
         status = pj.Status.CONVERGED if len(self.starts) <= self.solved else pj.Status.INFEASIBLE
-        nothing = np.zeros(len(way), np.float32)
-        return InterceptPlan(
-            cost=nothing,
-            violation=nothing,
-            iterations=nothing.astype(np.int32),
-            status=np.full(len(way), status, np.int32),
-            start=cases.start,
-            time=cases.time,
-            speed=np.float32(cases.speed[:, None] * (1.0 - SHARE) + last[:, None] * SHARE),
-            curvature=np.zeros((len(way), PIECES + 1), np.float32),
-            meeting=cases.target.pos,
-        )
+        speed = np.float32(cases.speed[:, None] * (1.0 - SHARE) + last[:, None] * SHARE)
+        plan = plans(speed, 0.0 * speed)
+        plan = plan.replace(start=cases.start, time=cases.time, meeting=cases.target.pos)
+        states = np.full(len(way), status, np.int32)
+        return jax.tree.map(np.asarray, plan.replace(status=states))
 
 
 @pytest.mark.parametrize("solved", [1, 2])
 def test_a_new_plan_starts_at_the_estimated_pose_and_is_driven_if_it_is_solved(solved):
     start = np.array([[0.8, 2.0, 0.0], [0.8, 4.0, 0.0], [0.8, 6.0, 0.0]], np.float32)
     goal = start[:, :2] + np.float32([[2.0, 0.0], [2.5, 0.0], [3.0, 0.0]])
-    still = TurningPath(pos=goal, vel=0.0 * goal, turn_rate=np.zeros(3, np.float32))
-    cases = jax.tree.map(np.asarray, intercept.case(still, np.full(3, END), start=start))
-    seen = Meetings(
-        np.arange(3), cases, np.zeros((3, 1)), goal[:, None], np.zeros((3, 1, 1, 2), np.float32)
-    )
-    planner = StraightOn(solved)
-    flights = fly_intercepts(
-        DriveLoop(CAR_WORLD, NOISY), seen, 5, replan=0.5, planner=planner, known_target=True
-    )
+    still = pj.TurningPath(pos=goal, vel=0.0 * goal, turn_rate=np.zeros(3, np.float32))
+    cases = jax.tree.map(np.asarray, pj.intercept.case(still, np.full(3, END), start=start))
+    movers = np.zeros((3, 1, 1, 2), np.float32)
+    seen = driving.Meetings(np.arange(3), cases, np.zeros((3, 1)), goal[:, None], movers)
+    planner, loop = StraightOn(solved), DriveLoop(driving.CAR_WORLD, NOISY)
+    options = {"replan": 0.5, "planner": planner, "known_target": True}
+    flights = driving.fly_intercepts(loop, seen, 5, **options)
     assert flights.flown.plans.tolist() == [solved] * 3
     assert flights.success.all() and flights.miss.max() < 0.03
     first, again = planner.starts
@@ -264,12 +231,12 @@ def test_another_robot_or_car_is_refused_in_one_line():
     with pytest.raises(ValueError, match="^world must hold a car, got a Quadrotor$"):
         DriveLoop(CATCH_WORLD)
     with pytest.raises(ValueError, match="^timestep must be 0.005, got 0.002$"):
-        DriveLoop(dataclasses.replace(CAR_WORLD, timestep=0.002))
+        DriveLoop(dataclasses.replace(driving.CAR_WORLD, timestep=0.002))
     with pytest.raises(TypeError, match="^robot must carry a tool, got a Car$"):
-        _ = CAR_WORLD.carrier
-    cases = intercept.draw(1, "easy")
+        _ = driving.CAR_WORLD.carrier
+    cases = pj.intercept.draw(1, "easy")
     with pytest.raises(ValueError, match="^wheelbase must be the same in plan and simulated car"):
-        require_car(dataclasses.replace(CAR, wheelbase=0.25), cases)
+        driving.require_car(dataclasses.replace(CAR, wheelbase=0.25), cases)
 
 
 def test_a_prism_moves_at_constant_velocity_and_its_mesh_has_sides_and_top():
@@ -298,7 +265,7 @@ def test_a_picture_shows_walls_movers_and_the_predicted_path(tmp_path):
 @pytest.mark.slow
 def test_the_reachable_set_begins_at_the_start_and_avoids_walls():
     task = InterceptFly(suite="hard", seed=2).flight()
-    layers, cases = task.reachable(1), intercept.draw(1, "hard", 2, first=1)
+    layers, cases = task.reachable(1), pj.intercept.draw(1, "hard", 2, first=1)
     times = [time for time, _ in layers]
     assert times == sorted(times) and times[-1] == pytest.approx(float(cases.time[0]), rel=1e-5)
     start, cell = np.asarray(cases.start[0, :2]), 8.0 / 64
@@ -314,8 +281,7 @@ def test_two_hard_cases_are_driven_from_the_command_line(tmp_path, capsys):
     assert main([*command, str(out)]) == 0
     assert "of 2 flights met the target within 0.3 m" in capsys.readouterr().out
     manifest = json.loads((out / "manifest.json").read_text())
-    assert manifest["kind"] == "fly intercept"
-    assert manifest["summary"]["tracking_worst"] < 0.05
+    assert manifest["kind"] == "fly intercept" and manifest["summary"]["tracking_worst"] < 0.05
     assert (out / "figures" / "flight.png").exists()
     page = (out / "index.html").read_text()
     assert main(["report", str(out)]) == 0

@@ -12,9 +12,7 @@ from flax import struct
 from test_solve import GOALS, Well, WellPlanner
 
 import planner_jax as pj
-from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import Status, is_solved, is_unsolved
-from planner_jax.optimise.settings import LbfgsConfig
 from planner_jax.planning.plan import plan
 from planner_jax.sims.loop_state import Loop
 from planner_jax.sims.noise import NOISES
@@ -24,16 +22,14 @@ from planner_jax.sims.tasks.catch import CATCH_WORLD, fly_catches, throws
 from planner_jax.sims.tasks.catch_ahead import LIMITS, bounds, compile_attempts, plan_ahead, within
 from planner_jax.sims.tasks.catch_pilot import is_worth_flying
 from planner_jax.sims.tasks.hit import HIT_WORLD, fly_hits, volleys
-from planner_jax.task import catch
 from planner_jax.task.hit.spec import REAL_SCENARIOS
-from planner_jax.trajectory.polynomial import evaluate
 
 TRACES = []
 
 
 def evaluate_contact_positions(flown):
     times = flown.contact.planned_time[:, 0] - flown.began
-    return np.asarray(jax.vmap(evaluate)(flown.plan.trajectory, times))
+    return np.asarray(jax.vmap(pj.evaluate)(flown.plan.trajectory, times))
 
 
 def contact_errors(flown):
@@ -72,9 +68,8 @@ def test_a_plan_of_the_other_task_is_refused(catches, hits):
     with pytest.raises(ValueError, match="^plan must be a CatchPlan, got a HitPlan$"):
         fly_catches(Loop(CATCH_WORLD), throws(3, seed=1), plan=hits.first_plan)
     with pytest.raises(ValueError, match="^plan must be a HitPlan, got a CatchPlan$"):
-        fly_hits(
-            Loop(HIT_WORLD), volleys(3, REAL_SCENARIOS["S.1"], seed=1), plan=catches.first_plan
-        )
+        served = volleys(3, REAL_SCENARIOS["S.1"], seed=1)
+        fly_hits(Loop(HIT_WORLD), served, plan=catches.first_plan)
 
 
 @pytest.mark.slow
@@ -107,10 +102,9 @@ def test_a_world_other_than_the_planned_one_is_refused(fly, world, message):
     name, planned, flown = message
     with pytest.raises(ValueError) as error:
         fly(Loop(world), throws(2) if fly is fly_catches else volleys(2))
-    assert str(error.value) == (
-        f"{name} must be the same in plan and flown world, "
-        f"got {planned} in the plan's case and {flown} in the world"
-    )
+    rule = f"{name} must be the same in plan and flown world"
+    found = f"got {planned} in the plan's case and {flown} in the world"
+    assert str(error.value) == f"{rule}, {found}"
 
 
 WIDER = [bounds(Loop(CATCH_WORLD), distance) for distance in LIMITS]
@@ -118,11 +112,11 @@ WIDER = [bounds(Loop(CATCH_WORLD), distance) for distance in LIMITS]
 
 @pytest.mark.slow
 def test_a_ball_is_planned_alone_where_no_plan_can_include_the_next_ball():
-    suite = jax.tree.map(np.asarray, catch.draw(2, "throws", seed=4, num_targets=2))
+    suite = jax.tree.map(np.asarray, pj.catch.draw(2, "throws", seed=4, num_targets=2))
     both = dataclasses.replace(suite, present=np.ones((2, 2), bool))
     # The next ball of the second case must be caught immediately.
     both = dataclasses.replace(both, horizon=both.horizon * np.array([[1.0, 2.0], [1.0, 0.02]]))
-    known, plans = plan_ahead(catch.planner(decide="greedy"), both, 0, WIDER)
+    known, plans = plan_ahead(pj.catch.planner(decide="greedy"), both, 0, WIDER)
     assert not known.present[1, 1] and known.present[1, 0]
     assert not is_unsolved(plans.status).any()
 
@@ -155,33 +149,32 @@ def test_the_next_ball_is_given_up_only_where_no_limits_admit_both(
         return Outcome(np.array([status]), np.array([violation]))
 
     monkeypatch.setattr(catch_ahead, "plan_all", fake_plan_all)
-    both = jax.tree.map(np.asarray, catch.draw(1, "parabola2", seed=4))
-    known, plans = plan_ahead(catch.planner(), within(both, WIDER[0]), 0, WIDER)
+    both = jax.tree.map(np.asarray, pj.catch.draw(1, "parabola2", seed=4))
+    known, plans = plan_ahead(pj.catch.planner(), within(both, WIDER[0]), 0, WIDER)
     assert (known.present.all(), known.limits.body_rate[0]) == chosen
     assert plans.violation[0] == (pair if chosen[0] else alone)[chosen[1]]
 
 
+def in_lab(num_balls):
+    """Return a loop with the noise and latency of a lab, which replans the catches of balls."""
+    world = dataclasses.replace(CATCH_WORLD, num_balls=num_balls)
+    return Loop(world, NOISES["lab"], replan=100.0)
+
+
 @pytest.mark.slow
 def test_with_noise_latency_and_wrong_drag_balls_are_caught_by_replanning():
-    flights = fly_catches(
-        Loop(CATCH_WORLD, NOISES["lab"], replan=100.0), throws(8, drag_error=0.15)
-    )
-    assert flights.caught.all()
+    assert fly_catches(in_lab(1), throws(8, drag_error=0.15)).caught.all()
 
 
 @pytest.mark.slow
 def test_a_second_ball_is_caught_after_the_first():
-    world = dataclasses.replace(CATCH_WORLD, num_balls=2)
-    flights = fly_catches(Loop(world, NOISES["lab"], replan=100.0), throws(4, 2, drag_error=0.15))
-    assert flights.caught.sum() >= 7
+    assert fly_catches(in_lab(2), throws(4, 2, drag_error=0.15)).caught.sum() >= 7
 
 
 @pytest.mark.slow
 def test_balls_that_would_be_missed_are_caught_by_new_decisions():
-    world = dataclasses.replace(CATCH_WORLD, num_balls=3)
     missed = throws(200, 3, seed=102, drag_error=0.15)[[58, 62, 71, 73, 92, 131, 143, 188]]
-    flights = fly_catches(Loop(world, NOISES["lab"], replan=100.0), missed, seed=102)
-    assert flights.success.sum() >= 6
+    assert fly_catches(in_lab(3), missed, seed=102).success.sum() >= 6
 
 
 @pytest.mark.parametrize(
@@ -205,10 +198,9 @@ def test_a_plan_from_scratch_is_flown_if_it_violates_less_or_costs_less(fresh, w
 
 @pytest.mark.slow
 def test_a_replanned_hit_lands_on_the_target():
-    exact = fly_hits(Loop(HIT_WORLD, replan=50.0), volleys(4, REAL_SCENARIOS["S.4"]))
-    assert exact.miss.max() < 0.05
-    noisy = fly_hits(Loop(HIT_WORLD, NOISES["lab"], replan=50.0), volleys(4, REAL_SCENARIOS["S.4"]))
-    assert noisy.miss.max() < 0.5
+    served = volleys(4, REAL_SCENARIOS["S.4"])
+    assert fly_hits(Loop(HIT_WORLD, replan=50.0), served).miss.max() < 0.05
+    assert fly_hits(Loop(HIT_WORLD, NOISES["lab"], replan=50.0), served).miss.max() < 0.5
 
 
 @pytest.mark.slow
@@ -240,7 +232,7 @@ class TracedPlanner(WellPlanner):
 
 def test_attempts_compiled_ahead_are_not_traced_again():
     first, second = WellPlanner().rounds
-    own = dataclasses.replace(first, solver=LbfgsConfig(max_steps=41, step_cap=0.2))
+    own = dataclasses.replace(first, solver=pj.LbfgsConfig(max_steps=41, step_cap=0.2))
     planner, easy = TracedPlanner(rounds=(own, second, own)), Well(GOALS[:1].repeat(3))
     compile_attempts(planner, easy)
     before = len(TRACES)
@@ -253,7 +245,7 @@ def test_attempts_compiled_ahead_are_not_traced_again():
 def test_compiling_ahead_also_accepts_a_planner_on_the_host():
     tried = []
 
-    class OnHost(Planner):
+    class OnHost(pj.Planner):
         attempts = WellPlanner().rounds
 
         def solve_on_host(self, cases, attempt):

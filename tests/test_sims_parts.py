@@ -13,9 +13,9 @@ import pytest
 from sweeps import quick_hit
 
 import planner_jax as pj
-from planner_jax.ball.flight import BallState, fly
 from planner_jax.robot.quadrotor import flat_attitude
 from planner_jax.robot.quadrotor_model import FlightLimits
+from planner_jax.sims import sensing as estimation
 from planner_jax.sims.launch import await_ball, ready, require_plan, require_world
 from planner_jax.sims.loop import predict_balls
 from planner_jax.sims.loop_state import Loop, shapes_of_plans
@@ -27,23 +27,12 @@ from planner_jax.sims.robots.quadrotor.reference import with_rest
 from planner_jax.sims.robots.quadrotor.robot import Quadrotor
 from planner_jax.sims.scenery import machine_parts, outlines
 from planner_jax.sims.scoring import Moment, nearest, no_contact, passage
-from planner_jax.sims.sensing import (
-    anchor_energy,
-    first_estimate,
-    observe,
-    predict,
-    update_estimate,
-    with_drag,
-)
 from planner_jax.sims.tasks.catch import CATCH_WORLD
 from planner_jax.sims.tasks.catch_ahead import LIMITS, bounds
 from planner_jax.sims.tasks.hit import HIT_WORLD, court_parts
-from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
 
 NET = CATCH_WORLD.robot.tool
 GRAVITY = jnp.float32(9.81)
-
-
 ROTORS = CATCH_WORLD.robot.model.rotors
 LOPSIDED = dataclasses.replace(
     ROTORS, places=((0.14, 0.08), (-0.09, 0.13), (-0.12, -0.09), (0.11, -0.1)), min_thrust=0.3
@@ -104,9 +93,8 @@ def test_at_rest_the_rotors_carry_the_robot_without_turning_it(rotors):
 def test_plans_in_flight_stay_within_the_limits_of_the_robot(distance, thrust, rate):
     found = bounds(Loop(CATCH_WORLD), distance)
     np.testing.assert_allclose(list(found.values()), [thrust * 9.81, rate])
-    model = dataclasses.replace(
-        CATCH_WORLD.robot.model, limits=FlightLimits(speed=5.0, body_rate=8.0, thrust=(6.0, 14.0))
-    )
+    limits = FlightLimits(speed=5.0, body_rate=8.0, thrust=(6.0, 14.0))
+    model = dataclasses.replace(CATCH_WORLD.robot.model, limits=limits)
     world = dataclasses.replace(CATCH_WORLD, robot=Quadrotor(model))
     own = bounds(Loop(world), distance)
     assert 6.0 <= own["min_thrust"] < 9.81 and own["body_rate"] <= 8.0
@@ -132,20 +120,18 @@ def wiggle():
     coeffs = np.zeros((1, 8, 3), np.float32)
     coeffs[0, :, 0] = [0.0, 0.0, 0.0, 0.0, 3.0, -2.0, 0.0, 0.0]
     coeffs[0, :, 2] = [1.0, 0.0, 0.0, 0.0, 1.0, -0.7, 0.0, 0.0]
-    return PiecewisePolynomial(jnp.asarray(coeffs), jnp.array([1.0], jnp.float32))
+    return pj.PiecewisePolynomial(jnp.asarray(coeffs), jnp.array([1.0], jnp.float32))
 
 
 def test_a_trajectory_comes_to_rest_smoothly_after_its_end():
-    resting, at = jax.jit(with_rest), jax.jit(evaluate, static_argnums=2)
+    resting, at = jax.jit(with_rest), jax.jit(pj.evaluate, static_argnums=2)
     path = resting(wiggle())
     end, rest = (np.sum(each.durations) for each in (wiggle(), path))
     for order in range(4):
         before, after = at(wiggle(), end, order), at(path, np.float32(end + 1e-5), order)
         np.testing.assert_allclose(after, before, rtol=2e-3, atol=1e-3)
-    absent = PiecewisePolynomial(
-        np.concatenate([wiggle().coeffs, np.zeros((2, 8, 3), np.float32)]),
-        np.array([1.0, 0.0, 0.0], np.float32),
-    )
+    more = np.concatenate([wiggle().coeffs, np.zeros((2, 8, 3), np.float32)])
+    absent = pj.PiecewisePolynomial(more, np.array([1.0, 0.0, 0.0], np.float32))
     braking = np.asarray(resting(absent).coeffs)[-1]
     np.testing.assert_allclose(braking, np.asarray(path.coeffs)[-1], atol=1e-5)
     for order in (1, 2, 3):
@@ -163,11 +149,10 @@ def tracked():
         start = start.replace(qpos=start.qpos.at[3:7].set(quat))
 
         def advance(physics, time):
-            reference = jax.tree.map(
-                lambda leaf: leaf[0], robot.references(plan, time[None], world)
-            )
+            references = robot.references(plan, time[None], world)
+            reference = jax.tree.map(lambda leaf: leaf[0], references)
             rotors = robot.command(robot.state(physics), reference, world)
-            away = jnp.linalg.norm(physics.qpos[:3] - evaluate(path, time))
+            away = jnp.linalg.norm(physics.qpos[:3] - pj.evaluate(path, time))
             return step(world, physics, rotors, jnp.zeros(1)), (away, rotors)
 
         return jax.lax.scan(advance, start, world.timestep * jnp.arange(400))[1]
@@ -182,11 +167,10 @@ def test_a_trajectory_is_tracked_within_two_centimetres_and_a_tilt_of_one_radian
 
 def test_hover_is_an_equilibrium_and_mjx_agrees_with_mujoco():
     world = CATCH_WORLD
-    balls = BallState(jnp.array([[0.5, 0.0, 2.0]]), jnp.array([[1.0, -2.0, 3.0]]))
+    balls = pj.BallState(jnp.array([[0.5, 0.0, 2.0]]), jnp.array([[1.0, -2.0, 3.0]]))
     drag = jnp.array([0.06])
-    start = place_balls(
-        world, at_rest(world, jnp.array([0.0, 0.0, 1.0])), balls, drag, jnp.array([True])
-    )
+    still = at_rest(world, jnp.array([0.0, 0.0, 1.0]))
+    start = place_balls(world, still, balls, drag, jnp.array([True]))
     late = np.arange(400)[:, None] > 200
     pulses = 0.1 * late * np.sin(0.05 * np.arange(400)[:, None] * np.arange(1, 5))
     rotors = jnp.asarray(np.asarray(start.act) + pulses, jnp.float32)
@@ -208,7 +192,7 @@ def test_hover_is_an_equilibrium_and_mjx_agrees_with_mujoco():
         reference.append(data.qpos.copy())
     assert np.ptp(np.array(reference)[:, 3:7], axis=0).max() > 0.01  # the quadrotor rotates
     np.testing.assert_allclose(path, reference, atol=1e-4)
-    flown = jax.jit(functools.partial(fly, num_steps=100))
+    flown = jax.jit(functools.partial(pj.fly, num_steps=100))
     truth = flown(jax.tree.map(lambda x: x[0], balls), 0.8, drag[0], GRAVITY)[0]
     np.testing.assert_allclose(path[-1, 7:], truth.pos, atol=1e-3)
 
@@ -229,15 +213,10 @@ def test_court_and_machine_are_visible_and_touch_nothing(world):
 
 def moments(gap_before, gap_after, aside):
     """Return a level tool at rest at the origin, and one ball over it before and after a step."""
-    at = lambda gap: Moment(  # noqa: E731
-        robot_pos=jnp.zeros(3),
-        robot_vel=jnp.zeros(3),
-        rate=jnp.zeros(3),
-        normal=jnp.array([0.0, 0.0, 1.0]),
-        ball_pos=jnp.array([[aside, 0.0, NET.height + gap]]),
-        ball_vel=jnp.array([[0.0, 0.0, -5.0]]),
-    )
-    return at(gap_before), at(gap_after)
+    tool = [jnp.zeros(3)] * 3 + [jnp.array([0.0, 0.0, 1.0])]
+    vel = jnp.array([[0.0, 0.0, -5.0]])
+    places = (jnp.array([[aside, 0.0, NET.height + gap]]) for gap in (gap_before, gap_after))
+    return (Moment(*tool, place, vel) for place in places)
 
 
 @jax.jit
@@ -261,24 +240,24 @@ def test_a_ball_is_caught_from_above_inside_the_radius_at_the_interpolated_time(
 
 def test_the_drag_is_estimated_from_the_lost_energy():
     sensing, true = Sensing(position_std=0.002), jnp.float32(0.0616)
-    ball = BallState(jnp.array([4.0, 0.0, 0.8]), jnp.array([-4.0, 0.5, 7.0]))
-    flown = jax.jit(functools.partial(fly, num_steps=130))(ball, 1.3, true, GRAVITY)
+    ball = pj.BallState(jnp.array([4.0, 0.0, 0.8]), jnp.array([-4.0, 0.5, 7.0]))
+    flown = jax.jit(functools.partial(pj.fly, num_steps=130))(ball, 1.3, true, GRAVITY)
     path, ahead = flown[1].pos[:120], flown[0].pos
-    seen = jax.jit(lambda path: observe(jax.random.key(0), path, sensing))(path)
+    seen = jax.jit(lambda path: estimation.observe(jax.random.key(0), path, sensing))(path)
 
     def advance(estimate, now):
         number, at = now
-        estimate = update_estimate(estimate, at, sensing, GRAVITY)
-        fresh = anchor_energy(estimate, GRAVITY)
-        later = with_drag(estimate, GRAVITY)
+        estimate = estimation.update_estimate(estimate, at, sensing, GRAVITY)
+        fresh = estimation.anchor_energy(estimate, GRAVITY)
+        later = estimation.with_drag(estimate, GRAVITY)
         return jax.tree.map(lambda a, b: jnp.where(number < 30, a, b), fresh, later), None
 
-    first = first_estimate(path[0], 1.15 * true)
+    first = estimation.first_estimate(path[0], 1.15 * true)
 
     @jax.jit
     def estimate_drag(first):
         last = jax.lax.scan(advance, first, (jnp.arange(120), seen))[0]
-        return last.drag, predict(last, 0.1, GRAVITY).pos
+        return last.drag, estimation.predict(last, 0.1, GRAVITY).pos
 
     drag, later = estimate_drag(first)
     assert abs(drag / true - 1.0) < 0.06
@@ -287,7 +266,7 @@ def test_the_drag_is_estimated_from_the_lost_energy():
 
 def test_the_estimate_of_an_awaited_ball_predicts_the_guessed_throw():
     loop = Loop(dataclasses.replace(CATCH_WORLD, num_balls=2), NOISES["lab"], replan=100.0)
-    coming = BallState(jnp.array([2.9, 0.1, 2.4]), jnp.array([-3.0, 0.5, 4.0]))
+    coming = pj.BallState(jnp.array([2.9, 0.1, 2.4]), jnp.array([-3.0, 0.5, 4.0]))
 
     @jax.jit
     def predict_both(coming):
@@ -309,7 +288,9 @@ def test_the_estimate_of_an_awaited_ball_predicts_the_guessed_throw():
 
 def test_a_missing_observation_is_nan():
     sensing = Sensing(dropout=0.25)
-    seen = jax.jit(lambda key: observe(key, jnp.zeros((2000, 3)), sensing))(jax.random.key(1))
+    seen = jax.jit(lambda key: estimation.observe(key, jnp.zeros((2000, 3)), sensing))(
+        jax.random.key(1)
+    )
     assert abs(np.isnan(seen[:, 0]).mean() - 0.25) < 0.04
 
 
@@ -340,7 +321,7 @@ def test_a_plan_or_world_of_another_robot_is_refused():
 
     @dataclasses.dataclass
     class Plan:
-        trajectory: PiecewisePolynomial
+        trajectory: pj.PiecewisePolynomial
 
     plan = Plan(jax.tree.map(lambda leaf: np.asarray(leaf)[None], wiggle()))
     heads = np.zeros((1, 4, 3))

@@ -13,23 +13,15 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from planner_jax.ball.flight import BallState
+import planner_jax as pj
 from planner_jax.cli.main import main
 from planner_jax.core.errors import ArgumentError, install_line
 from planner_jax.runs.dataset import Dataset
 from planner_jax.runs.run_folder import RunFolder
+from planner_jax.sims import recording as recordings
 from planner_jax.sims import view
 from planner_jax.sims.loop_state import Flown, Record
 from planner_jax.sims.model import BALL_RADIUS
-from planner_jax.sims.recording import (
-    FLIGHTS,
-    Launches,
-    Recording,
-    frame,
-    make_recording,
-    read_recording,
-    to_rows,
-)
 from planner_jax.sims.robot import Physics
 from planner_jax.sims.scoring import no_contact
 from planner_jax.sims.settings import CatchFly
@@ -57,23 +49,19 @@ def flight_with_return():
     qpos = np.concatenate([np.tile([0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 0.0], (50, 1)), balls], axis=1)
     still = np.zeros((1, 50, 9)), np.zeros((1, 50, 4))
     record = Record(times[None], Physics(qpos[None], *still), qpos[None, :, :3], None, None)
-    contact = no_contact(1)
-    contact = contact.replace(
-        met=np.array([[True]]),
-        time=np.array([[0.2]]),
-        ball_pos=drag_free(pos, vel, np.array([0.2]))[None],
-    )
-    back = BallState(contact.ball_pos[:, 0], np.array([[0.0, 0.0, 5.0]]))
+    met = {"met": np.array([[True]]), "time": np.array([[0.2]])}
+    contact = no_contact(1).replace(**met, ball_pos=drag_free(pos, vel, np.array([0.2]))[None])
+    back = pj.BallState(contact.ball_pos[:, 0], np.array([[0.0, 0.0, 5.0]]))
     flown = Flown(contact, None, np.zeros(1), np.zeros((1, 2)), record)
-    launched = BallState(pos[None, None], vel[None, None])
+    launched = pj.BallState(pos[None, None], vel[None, None])
     return flown, launched, back
 
 
 def record_flight(flown, balls, begins, **more):
     drag = np.zeros((1, len(begins)))
-    launches = Launches(balls, drag, np.array(begins), seen=0.3, **more)
+    launches = recordings.Launches(balls, drag, np.array(begins), seen=0.3, **more)
     one = {"index": np.array([0]), "success": np.array([True])}
-    return make_recording(CATCH_WORLD, flown, launches, **one)
+    return recordings.make_recording(CATCH_WORLD, flown, launches, **one)
 
 
 def test_a_recording_contains_the_ball_from_the_machine_to_the_ground():
@@ -99,15 +87,11 @@ def test_a_second_ball_is_recorded_from_its_own_launch():
     flown, launched, _ = flight_with_return()
     physics, begin = flown.record.physics, 0.4
     waiting = np.full((1, 50, 3), 100.0)
-    flown = dataclasses.replace(
-        flown,
-        contact=no_contact(2).replace(
-            met=np.zeros((1, 2), bool), time=np.zeros((1, 2)), ball_pos=np.zeros((1, 2, 3))
-        ),
-        record=flown.record.replace(
-            physics=physics.replace(qpos=np.concatenate([physics.qpos, waiting], axis=2))
-        ),
-    )
+    none = {"met": np.zeros((1, 2), bool), "time": np.zeros((1, 2))}
+    contact = no_contact(2).replace(**none, ball_pos=np.zeros((1, 2, 3)))
+    physics = physics.replace(qpos=np.concatenate([physics.qpos, waiting], axis=2))
+    record = flown.record.replace(physics=physics)
+    flown = dataclasses.replace(flown, contact=contact, record=record)
     balls = jax.tree.map(lambda leaf: np.repeat(leaf, 2, axis=1), launched)
     whole = record_flight(flown, balls, [0.0, begin])
     times, second = whole.time[0], whole.balls[0, :, 1]
@@ -122,8 +106,8 @@ def test_a_second_ball_is_recorded_from_its_own_launch():
 
 def test_a_recording_is_read_as_it_was_written(tmp_path):
     written = recording()
-    Dataset(tmp_path / FLIGHTS).write_rows(to_rows(written))
-    read = read_recording(Dataset(tmp_path / FLIGHTS).read())
+    Dataset(tmp_path / recordings.FLIGHTS).write_rows(recordings.to_rows(written))
+    read = recordings.read_recording(Dataset(tmp_path / recordings.FLIGHTS).read())
     for field in dataclasses.fields(written):
         before, after = getattr(written, field.name), getattr(read, field.name)
         assert before.shape == after.shape
@@ -131,24 +115,25 @@ def test_a_recording_is_read_as_it_was_written(tmp_path):
 
 
 def test_a_frame_holds_all_positions_at_a_sample():
-    now = frame(recording(), NET, 0, 2)
+    now = recordings.frame(recording(), NET, 0, 2)
     assert now.time == 0.02
     np.testing.assert_allclose(now.robot[:3], [0.0, 0.0, 1.02])
     np.testing.assert_allclose(now.wanted, [0.01, 0.01, 1.03])
     np.testing.assert_allclose(now.balls, [[0.3, 0.0, 1.98]])
     with pytest.raises(ValueError, match="^flight must be >= 0 and < 1, got 1$"):
-        frame(recording(), NET, 1, 0)
+        recordings.frame(recording(), NET, 1, 0)
     for sample in (-1, 6):
         with pytest.raises(ValueError, match=f"^sample must be >= 0 and < 6, got {sample}$"):
-            frame(recording(), NET, 0, sample)
+            recordings.frame(recording(), NET, 0, sample)
 
 
 def test_after_its_end_a_flight_stands_still_and_a_caught_ball_lies_in_the_net():
-    last = frame(recording(), NET, 0, 5)
+    last = recordings.frame(recording(), NET, 0, 5)
     np.testing.assert_allclose(last.robot[:3], [0.0, 0.0, 1.04])
     inside = [[0.0, 0.0, 1.04 + NET.tool.height - BALL_RADIUS]]
     np.testing.assert_allclose(last.balls, inside)
-    assert np.isnan(frame(recording(), HIT_WORLD.robot, 0, 5).balls).all()  # a racket holds none
+    beside_racket = recordings.frame(recording(), HIT_WORLD.robot, 0, 5).balls
+    assert np.isnan(beside_racket).all()  # a racket holds no ball
 
 
 def test_an_address_that_cannot_be_served_is_refused_in_one_line():
@@ -176,7 +161,7 @@ def run_folder(tmp_path):
         },
     }
     with folder.lock():
-        Dataset(folder.path / FLIGHTS).write_rows(to_rows(recording()))
+        Dataset(folder.path / recordings.FLIGHTS).write_rows(recordings.to_rows(recording()))
         folder.plans.write_rows(pa.table({"index": [0]}))
         folder.write_manifest(manifest)
     return folder
@@ -199,7 +184,7 @@ def test_a_folder_without_flights_is_refused_in_one_line(run_folder, tmp_path, c
     ):
         run_folder.write_manifest(manifest | change)
         if not change:
-            Dataset(run_folder.path / FLIGHTS).files()[0].write_bytes(b"half of it")
+            Dataset(run_folder.path / recordings.FLIGHTS).files()[0].write_bytes(b"half of it")
         assert read_error(capsys, run_folder.path).startswith(f"RUN must be {says}")
 
 
@@ -214,7 +199,7 @@ def test_a_flight_is_served_scrubbed_and_played():
     two = jax.tree.map(lambda leaf: np.repeat(leaf, 2, axis=0), vars(recording()))
     two["time"] = two["time"].astype(np.float32)
     two["index"] = np.arange(2)
-    viewer = Viewer(CatchFly().flight(), Recording(**two), port=0)
+    viewer = Viewer(CatchFly().flight(), recordings.Recording(**two), port=0)
     try:
         with urllib.request.urlopen(viewer.url, timeout=10) as page:
             assert page.status == 200 and b"<html" in page.read()

@@ -12,7 +12,6 @@ from planner_jax.cli.plan.answer import Margin
 from planner_jax.cli.plan.catch import SingleCatch
 from planner_jax.cli.plan.hit import SingleHit
 from planner_jax.cli.plan.settings import SingleCatchSettings, SingleHitSettings
-from planner_jax.task.hit.plan import HitPlan
 
 HIT = "--pos 4 0.3 1.2 --vel -7 -1e-1 6 --target 4 0 0"
 CATCH = "--pos 3 0 1 --vel -3 0.3 5 --horizon 1.1"
@@ -102,7 +101,7 @@ def test_the_command_writes_plan_setpoints_and_pictures(hit, tmp_path, capsys):
     assert names == {"plan.npz", "setpoints.csv", "path.png", "motion.png"}
     told = capsys.readouterr().out
     assert all(str(out / name) in told for name in names)
-    kept = HitPlan.load(out / "plan.npz")
+    kept = pj.hit.HitPlan.load(out / "plan.npz")
     np.testing.assert_array_equal(kept.stroke.time, hit[1].plan.stroke.time)
     rows = list(csv.reader((out / "setpoints.csv").read_text().splitlines()))
     assert float(rows[2][0]) == pytest.approx(0.02)

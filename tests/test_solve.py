@@ -9,11 +9,10 @@ import pytest
 from flax import struct
 from jax import Array
 
+import planner_jax as pj
 from planner_jax.core.protocol import Plan, Status, is_solved
-from planner_jax.optimise.planner import OptimisedPlanner, pending
 from planner_jax.optimise.settings import Evaluation, LbfgsConfig, Round, Stage
 from planner_jax.planning import batch, searches
-from planner_jax.planning.plan import plan, solve
 from tests.trees import assert_same
 
 
@@ -33,7 +32,7 @@ class Reached(Plan):
 
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
-class WellPlanner(OptimisedPlanner):
+class WellPlanner(pj.OptimisedPlanner):
     rounds: tuple[Round, ...] = (
         Round(1, LbfgsConfig(max_steps=40, step_cap=0.2)),
         Round(2, LbfgsConfig(max_steps=40, step_cap=0.2)),
@@ -51,15 +50,15 @@ class WellPlanner(OptimisedPlanner):
         return Evaluation(cost=away + ridge, violation=jnp.sqrt(away) - 0.05)
 
     def decode(self, point, context):
-        return Reached(point=point, **pending(self.objective(point, context).violation))
+        return Reached(point=point, **pj.pending(self.objective(point, context).violation))
 
 
 GOALS = np.array([0.5, 3.5, -1.0, 4.5, 1.0], np.float32)
 
 
 def test_lanes_unsolved_in_one_round_are_solved_in_the_next():
-    first = plan(WellPlanner(rounds=WellPlanner().rounds[:1]), Well(GOALS))
-    both = plan(WellPlanner(), Well(GOALS))
+    first = pj.plan(WellPlanner(rounds=WellPlanner().rounds[:1]), Well(GOALS))
+    both = pj.plan(WellPlanner(), Well(GOALS))
     assert list(is_solved(first.status)) == [True, False, True, False, True]
     assert is_solved(both.status).all()
     np.testing.assert_allclose(both.point[:, 0], GOALS, atol=0.05)
@@ -73,36 +72,42 @@ def keep_starts(keep):
 
 @pytest.mark.parametrize("keep", [1, 5])
 def test_the_starts_that_a_stage_keeps_are_those_that_cost_least_by_then(keep):
-    plans = plan(keep_starts(keep), Well(GOALS))
+    plans = pj.plan(keep_starts(keep), Well(GOALS))
     assert is_solved(plans.status).all()
     np.testing.assert_allclose(plans.point[:, 0], GOALS, atol=0.05)
     for lane, goal in enumerate(GOALS):
-        alone = plan(keep_starts(keep), Well(goal))
+        alone = pj.plan(keep_starts(keep), Well(goal))
         np.testing.assert_allclose(alone.point, plans.point[lane], rtol=1e-5, atol=1e-5)
         assert alone.status == plans.status[lane]
         assert alone.iterations == plans.iterations[lane] > 3
 
 
-def test_a_start_whose_cost_is_not_finite_is_the_last_to_bekeep_starts():
+def test_a_start_whose_cost_is_not_finite_is_the_last_to_be_kept():
     @jax.tree_util.register_static
     class Cliff(WellPlanner):
         def guesses(self, context, num):
             return jnp.array([[jnp.nan], [context.goal]])[:num]
 
-    plans = plan(Cliff(rounds=keep_starts(1).rounds), Well(GOALS))
+    plans = pj.plan(Cliff(rounds=keep_starts(1).rounds), Well(GOALS))
     np.testing.assert_allclose(plans.point[:, 0], GOALS, atol=0.05)
 
 
-@pytest.mark.parametrize("keep", [0, -1, 1.5, True])
-def test_a_stage_that_keeps_no_starts_is_refused(keep):
-    with pytest.raises((TypeError, ValueError), match=r"^keep must be (a whole number|>= 1), got"):
-        Stage(LbfgsConfig(), keep=keep)
+def test_a_stage_that_keeps_no_starts_and_a_round_within_no_violation_are_refused():
+    rule = r"^keep must be (a whole number|>= 1), got"
+    for keep in (0, -1, 1.5, True):
+        with pytest.raises((TypeError, ValueError), match=rule):
+            Stage(LbfgsConfig(), keep=keep)
+    for within in (0.0, -1.0, np.nan):
+        with pytest.raises(ValueError, match="^within must be "):
+            Round(within=within)
+    with pytest.raises(TypeError, match="^within must be "):
+        Round(within="near")
 
 
 def test_chunks_and_padding_change_nothing():
     goals = np.linspace(-1.0, 5.0, 41).astype(np.float32)
-    whole = plan(WellPlanner(), Well(goals))
-    chunked = plan(WellPlanner(), Well(goals), chunk=16)
+    whole = pj.plan(WellPlanner(), Well(goals))
+    chunked = pj.plan(WellPlanner(), Well(goals), chunk=16)
     np.testing.assert_array_equal(whole.status, chunked.status)
     np.testing.assert_allclose(whole.point, chunked.point, rtol=1e-5, atol=1e-5)
 
@@ -110,7 +115,7 @@ def test_chunks_and_padding_change_nothing():
 def test_all_chunks_are_computed_in_the_callers_type_of_numbers():
     goals = np.pi / 4.0 * np.linspace(-1.0, 1.0, 64)
     with jax.enable_x64(True):
-        found = plan(WellPlanner(), Well(goals), chunk=16).point[:, 0]
+        found = pj.plan(WellPlanner(), Well(goals), chunk=16).point[:, 0]
     assert found.dtype == np.float64
     assert (found != found.astype(np.float32)).all()  # no number has passed through float32
 
@@ -130,7 +135,7 @@ def test_unsolvable_lanes_keep_the_least_violation_found():
             found = super().objective(point, context)
             return Evaluation(found.cost, found.violation + 1.0)
 
-    found = plan(Hopeless(), Well(GOALS))
+    found = pj.plan(Hopeless(), Well(GOALS))
     assert not is_solved(found.status).any()
     np.testing.assert_allclose(found.violation, 0.95, atol=0.02)
 
@@ -140,8 +145,8 @@ def test_arrays_on_a_device_stay_there_and_give_the_same_plans(apart, monkeypatc
     if apart:
         monkeypatch.setattr(batch, "is_one_cpu", lambda mesh: False)
     goals = np.linspace(-1.0, 5.0, 41).astype(np.float32)
-    host = plan(WellPlanner(), Well(goals), chunk=16)
-    resident = plan(WellPlanner(), Well(jnp.asarray(goals)), chunk=16)
+    host = pj.plan(WellPlanner(), Well(goals), chunk=16)
+    resident = pj.plan(WellPlanner(), Well(jnp.asarray(goals)), chunk=16)
     for plans, kind in ((resident, jax.Array), (host, np.ndarray)):
         assert all(isinstance(leaf, kind) for leaf in jax.tree.leaves(plans))
     assert_same(resident, host)
@@ -149,21 +154,20 @@ def test_arrays_on_a_device_stay_there_and_give_the_same_plans(apart, monkeypatc
 
 def test_a_later_round_takes_only_what_is_unsolved(monkeypatch):
     monkeypatch.setattr(batch, "is_one_cpu", lambda mesh: False)
-    sizes, solve_on_devices, divide_batch = [], batch.solve_on_devices, searches.divide_batch
+    sizes = []
 
-    def note_size(planner, attempt, mesh, cases, **options):
-        sizes.append(cases.goal.size)
-        return solve_on_devices(planner, attempt, mesh, cases, **options)
+    def note_size(function):
+        def noting(planner, attempt, mesh, cases, **options):
+            sizes.append(cases.goal.size)
+            return function(planner, attempt, mesh, cases, **options)
 
-    def note_divided(planner, attempt, mesh, cases):
-        sizes.append(cases.goal.size)
-        return divide_batch(planner, attempt, mesh, cases)
+        return noting
 
-    monkeypatch.setattr(batch, "solve_on_devices", note_size)
-    monkeypatch.setattr(searches, "divide_batch", note_divided)
+    monkeypatch.setattr(batch, "solve_on_devices", note_size(batch.solve_on_devices))
+    monkeypatch.setattr(searches, "divide_batch", note_size(searches.divide_batch))
     goals = np.full(300, 0.5, np.float32)
     goals[[7, -1]] = 3.5
-    assert is_solved(plan(WellPlanner(), Well(jnp.asarray(goals))).status).all()
+    assert is_solved(pj.plan(WellPlanner(), Well(jnp.asarray(goals))).status).all()
     assert sorted(sizes[:2]) == [128, 256] and sizes[2:] == [2]  # the first two calls run at once
 
 
@@ -178,14 +182,14 @@ def test_a_round_leaves_alone_what_is_farther_off_than_it_says(kind, monkeypatch
 
     def plan_goals(planner):
         if kind == "one by one":
-            plans = [plan(planner, Well(goal)) for goal in goals]
+            plans = [pj.plan(planner, Well(goal)) for goal in goals]
             return jax.tree.map(lambda *leaves: np.stack(leaves), *plans)
         if kind == "compiled":
-            return jax.jit(lambda goals: solve(planner, Well(goals)))(goals)
+            return jax.jit(lambda goals: pj.solve(planner, Well(goals)))(goals)
         if kind == "as on a GPU":
             monkeypatch.setattr(batch, "is_one_cpu", lambda mesh: False)
-            return plan(planner, Well(jnp.asarray(goals)))
-        return plan(planner, Well(goals))
+            return pj.plan(planner, Well(jnp.asarray(goals)))
+        return pj.plan(planner, Well(goals))
 
     first = plan_goals(WellPlanner(rounds=WellPlanner().rounds[:1]))
     near = plan_goals(retry_within(2.0))
@@ -200,26 +204,17 @@ def test_a_round_behind_one_that_had_nothing_to_try_is_made():
     first, second = WellPlanner().rounds
     planner = WellPlanner(rounds=(first, dataclasses.replace(second, within=1e-3), second))
     for goals in (GOALS, jnp.asarray(GOALS)):
-        assert is_solved(np.asarray(plan(planner, Well(goals)).status)).all()
-    assert is_solved(plan(planner, Well(GOALS[1])).status)
-
-
-@pytest.mark.parametrize(
-    ("within", "error"),
-    [(0.0, ValueError), (-1.0, ValueError), (np.nan, ValueError), ("near", TypeError)],
-)
-def test_a_round_within_no_violation_is_refused(within, error):
-    with pytest.raises(error, match="^within must be "):
-        Round(within=within)
+        assert is_solved(np.asarray(pj.plan(planner, Well(goals)).status)).all()
+    assert is_solved(pj.plan(planner, Well(GOALS[1])).status)
 
 
 def test_wrong_batches_are_refused():
     with pytest.raises(ValueError, match="batch shape"):
-        plan(WellPlanner(), Well(np.zeros((2, 3), np.float32)))
+        pj.plan(WellPlanner(), Well(np.zeros((2, 3), np.float32)))
 
     @struct.dataclass
     class Pair(Well):
         other: Array
 
     with pytest.raises(ValueError, match=r"cases.other must have 5 lanes, got shape \(3,\)"):
-        plan(WellPlanner(), Pair(GOALS, np.zeros(3, np.float32)))
+        pj.plan(WellPlanner(), Pair(GOALS, np.zeros(3, np.float32)))

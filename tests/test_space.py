@@ -9,25 +9,15 @@ import pytest
 from derivatives import assert_gradient_matches_differences
 from scipy.optimize import lsq_linear
 
-from planner_jax.space.distances import (
-    approach,
-    lowest_of_rectangle,
-    lowest_of_segment,
-    nearest_points,
-    rectangle_to_vertical_line,
-    segment_to_box,
-    segment_to_rectangle,
-    segment_to_segment,
-    segment_to_vertical_line,
-)
+from planner_jax.space import distances as space
 
 NUM = 60  # pairs of every kind, so that rare arrangements occur
 DISTANCES = {
-    "segments": segment_to_segment,
-    "rectangle": segment_to_rectangle,
-    "box": segment_to_box,
-    "line": segment_to_vertical_line,
-    "rectangle to line": rectangle_to_vertical_line,
+    "segments": space.segment_to_segment,
+    "rectangle": space.segment_to_rectangle,
+    "box": space.segment_to_box,
+    "line": space.segment_to_vertical_line,
+    "rectangle to line": space.rectangle_to_vertical_line,
 }
 every_distance = pytest.mark.parametrize("name", DISTANCES)
 
@@ -150,15 +140,12 @@ def test_a_second_derivative_includes_the_motion_of_the_nearest_points(name, flo
 @pytest.mark.parametrize("name", [*DISTANCES, "low segment", "low rectangle"])
 def test_an_approach_gives_the_derivative_by_a_rotation_and_a_translation(name, float64):
     if name == "low segment":
-        distance, first, others = lowest_of_segment, smooth_pairs("segments")[:1], ()
+        distance, first, others = space.lowest_of_segment, smooth_pairs("segments")[:1], ()
     elif name == "low rectangle":
-        distance, first, others = lowest_of_rectangle, smooth_pairs("rectangle")[1:], ()
+        distance, first, others = space.lowest_of_rectangle, smooth_pairs("rectangle")[1:], ()
     else:
-        distance, bodies, num = (
-            DISTANCES[name],
-            smooth_pairs(name),
-            1 + (name == "rectangle to line"),
-        )
+        distance, bodies = DISTANCES[name], smooth_pairs(name)
+        num = 1 + (name == "rectangle to line")
         first, others = bodies[:num], bodies[num:]
 
     def slopes(first, others):
@@ -171,8 +158,8 @@ def test_an_approach_gives_the_derivative_by_a_rotation_and_a_translation(name, 
             ]
             return distance(*moved, *others)
 
-        _, nearest = nearest_points(distance, *first, *others)
-        line = approach(distance, nearest, *first, *others)
+        _, nearest = space.nearest_points(distance, *first, *others)
+        line = space.approach(distance, nearest, *first, *others)
         expected = jax.grad(at)(jnp.zeros(6))
         return expected, jnp.concatenate([jnp.stack(line.moment), jnp.stack(line.direction)])
 
@@ -221,8 +208,7 @@ def test_the_lowest_points_are_corners():
     ends, edges = rng.normal(size=(2, NUM, 2, 3))
     middle = rng.normal(size=(NUM, 3))
     corners = [middle + a * edges[:, 0] + b * edges[:, 1] for a in (-1.0, 1.0) for b in (-1.0, 1.0)]
-    low = jax.jit(jax.vmap(lowest_of_rectangle))(middle, edges)
+    low = jax.jit(jax.vmap(space.lowest_of_rectangle))(middle, edges)
     np.testing.assert_allclose(low, np.min(corners, axis=0)[:, 2], atol=1e-6)
-    np.testing.assert_allclose(
-        jax.jit(jax.vmap(lowest_of_segment))(ends), ends[..., 2].min(axis=1), rtol=1e-6
-    )
+    low = jax.jit(jax.vmap(space.lowest_of_segment))(ends)
+    np.testing.assert_allclose(low, ends[..., 2].min(axis=1), rtol=1e-6)

@@ -21,8 +21,6 @@ from planner_jax.core.protocol import Status
 NUM = 32
 TRAPEZOID = SPEED_PLANNERS["trapezoid"]
 many = jax.jit(jax.vmap(plan_speed))
-
-
 PROBLEMS = speed_problems(NUM)
 # The speed limit is lower in the middle third of every second problem.
 LIMIT = np.repeat(PROBLEMS.speed_limit, 3, axis=1)

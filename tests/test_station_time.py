@@ -26,10 +26,8 @@ def problem(polygons=(), speed_limit=9.0, initial_speed=0.5, acceleration_limit=
     start, end, lower, upper = (np.array(each, float) for each in zip(*rows, strict=True))
     present = np.arange(POLYGONS) < len(polygons)
     return StationTimeProblem(
-        end_station=np.array(6.0),
-        horizon=np.array(10.0),
-        initial_speed=np.array(initial_speed),
-        initial_acceleration=np.array(0.0),
+        **{"end_station": np.array(6.0), "horizon": np.array(10.0)},
+        **{"initial_speed": np.array(initial_speed), "initial_acceleration": np.array(0.0)},
         speed_limit=np.broadcast_to(np.asarray(speed_limit, float), PARTS),
         acceleration_limit=np.array(acceleration_limit),
         blocked=Blocked(start=start, end=end, lower=lower, upper=upper, present=present),
@@ -73,10 +71,8 @@ def depth(problems, k, times, station):
     deepest = np.full(np.shape(times), -np.inf)
     for p in np.flatnonzero(blocked.present):
         share = (times - blocked.start[p]) / (blocked.end[p] - blocked.start[p])
-        lower, upper = (
-            edge[p, 0] + share * (edge[p, 1] - edge[p, 0])
-            for edge in (blocked.lower, blocked.upper)
-        )
+        edges = blocked.lower[p], blocked.upper[p]
+        lower, upper = (first + share * (last - first) for first, last in edges)
         inside = np.minimum(station - lower, upper - station)
         deepest = np.maximum(deepest, np.where((share > 0.0) & (share < 1.0), inside, -np.inf))
     return deepest
@@ -132,7 +128,7 @@ SHARES = np.linspace(0.0, 1.0, 9)
 @jax.jit
 @jax.vmap
 def around(problem, station):
-    """Return corridors of five pieces and their bounds (5, 9) at SHARES, by kind of lines."""
+    """Return, by kind, corridors of five pieces and bounds (5, 9) at nine shares of each piece."""
     kinds = {kind: corridor(problem, station, 5, kind) for kind in ("tilted", "edges", "flat")}
     return {kind: (found, found.bounds(SHARES)) for kind, found in kinds.items()}
 

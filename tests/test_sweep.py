@@ -10,8 +10,6 @@ from sweeps import RunTests, columns, quick_hit, stop_after
 
 import planner_jax as pj
 from planner_jax.baselines.hit.published import read_published_rates
-from planner_jax.core.errors import ArgumentError
-from planner_jax.planning.plan import plan
 from planner_jax.referee.hit import referee_hits
 from planner_jax.robot import quadrotor
 from planner_jax.runs.dataset import ROW_GROUP, Dataset, encode
@@ -25,7 +23,6 @@ from planner_jax.sweep.quadrotor import body_rate, net_thrust, sample_motion
 from planner_jax.sweep.run import SweepInterrupted, resume_sweep, start_sweep
 from planner_jax.task.hit import court
 from planner_jax.task.hit.spec import REAL_SCENARIOS
-from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
 
 TASK = pj.task_named("hit")
 open_source = HitSweep(TASK).open_source
@@ -130,23 +127,21 @@ def test_a_sweep_interrupted_behind_its_rows_is_resumed_to_its_report(tmp_path, 
 
 
 def test_resuming_with_another_setting_names_it(finished):
-    with pytest.raises(ArgumentError, match=r"delay must be 0.8 as in the run .*, got 0.5"):
+    with pytest.raises(pj.ArgumentError, match=r"delay must be 0.8 as in the run .*, got 0.5"):
         resume_sweep(TASK, finished[0], delay=0.5)
 
 
 def test_a_serve_drawn_late_that_breaks_a_rule_leaves_nothing_behind(tmp_path):
     # The first chunk holds no ball that is down by then; a later one does.
     settings = HitSettings(num=40, batch=4, delay=1.56, seed=0)
-    source = open_source(settings.of(TASK), batch=4)
-    source.check()
-    out = tmp_path / "runs" / "run"
-    with pytest.raises(ArgumentError, match="delay must be shorter than each serve's flight"):
-        start_sweep(TASK, settings, out, progress=False)
+    open_source(settings.of(TASK), batch=4).check()
+    with pytest.raises(pj.ArgumentError, match="delay must be shorter than each serve's flight"):
+        start_sweep(TASK, settings, tmp_path / "runs" / "run", progress=False)
     assert not list(tmp_path.iterdir())
 
 
 def trial_files(folder, num_rows=3):
-    """Write files of bat (odd rows planned) and juggle (no rows) for scenario NNN."""
+    """Write trial files of scenario NNN: planner bat solves the odd rows, juggle solves none."""
     folder.mkdir(exist_ok=True)
     serve = "2.5 -0.3 2,-4.3 0.02 7.{},-2.9 -0.3 0,1.75 0 0"
     for letter in "pb":
@@ -183,12 +178,10 @@ def test_a_single_chunk_is_timed_warm_too(tmp_path, no_report, monkeypatch):
     assert times["warm_plans"] == 3 and times["warm_seconds"] < times["first_seconds"]
 
 
-def test_a_planner_that_compiles_in_every_call_is_timed_all_the_same(
-    tmp_path, monkeypatch, no_report
-):
+def test_a_planner_that_compiles_in_every_call_is_timed_too(tmp_path, monkeypatch, no_report):
     def compiling(_, planner, cases):
         jax.jit(lambda x: x + 1.0)(0.0)
-        return plan(planner, cases)
+        return pj.plan(planner, cases)
 
     monkeypatch.setattr(HitSweep, "plan", compiling)
     manifest = start_sweep(TASK, HitSettings(num=2), tmp_path / "run", progress=False)
@@ -205,7 +198,7 @@ def test_resuming_needs_the_serves_that_the_run_began_with(tmp_path, monkeypatch
         resume_sweep(TASK, out, progress=False)
     for path in (tmp_path / "serves").iterdir():
         path.write_text(path.read_text().replace("7.2", "7.0"))
-    with pytest.raises(ArgumentError, match="serves must be the same as when the run started"):
+    with pytest.raises(pj.ArgumentError, match="serves must be the same as when the run started"):
         resume_sweep(TASK, out, progress=False)
 
 
@@ -230,15 +223,13 @@ def test_a_percentage_is_100_or_0_only_where_it_is_exact():
 
 def test_overlapping_compilations_are_counted_once():
     with CompileClock() as clock:
-        for event, start, end in [
-            ("/jax/core/compile/jaxpr_trace_duration", 10.0, 14.0),
-            ("/jax/core/compile/jaxpr_trace_duration", 11.0, 12.0),
-            ("/jax/core/compile/backend_compile_duration", 13.0, 16.0),
-            ("/jax/core/compile/backend_compile_duration", 20.0, 21.0),
-            ("/jax/elsewhere", 0.0, 100.0),
-        ]:
-            jax.monitoring.record_event_time_span(event, start, end)
-    jax.monitoring.record_event_time_span("/jax/core/compile/later", 30.0, 40.0)
+        record = jax.monitoring.record_event_time_span
+        for start, end in ((10.0, 14.0), (11.0, 12.0)):
+            record("/jax/core/compile/jaxpr_trace_duration", start, end)
+        for start, end in ((13.0, 16.0), (20.0, 21.0)):
+            record("/jax/core/compile/backend_compile_duration", start, end)
+        record("/jax/elsewhere", 0.0, 100.0)
+    record("/jax/core/compile/later", 30.0, 40.0)
     assert clock.seconds == pytest.approx(7.0) and clock.compiled
 
 
@@ -256,9 +247,9 @@ def test_sampled_motion_agrees_with_the_trajectory(float64):
     random = np.random.default_rng(0)
     coeffs, durations = random.normal(size=(3, 8, 3)), np.array([0.5, 0.2, 0.9])
     motion = sample_motion(coeffs.ravel(), durations, 23)
-    trajectory = PiecewisePolynomial(jnp.asarray(coeffs), jnp.asarray(durations))
+    trajectory = pj.PiecewisePolynomial(jnp.asarray(coeffs), jnp.asarray(durations))
     for order, samples in enumerate((motion.pos, motion.vel, motion.acc, motion.jerk)):
-        expected = jax.vmap(lambda t, order=order: evaluate(trajectory, t, order))(motion.time)
+        expected = jax.vmap(lambda t, order=order: pj.evaluate(trajectory, t, order))(motion.time)
         np.testing.assert_allclose(samples[:-1], expected[:-1], rtol=1e-9)
     acc, jerk = jnp.asarray(motion.acc), jnp.asarray(motion.jerk)
     squared = quadrotor.body_rate_squared(acc, jerk, jnp.asarray(9.8))
@@ -268,7 +259,7 @@ def test_sampled_motion_agrees_with_the_trajectory(float64):
 
 def test_the_truer_model_is_for_the_exact_planner_alone():
     assert HitSettings(drag_after_impact=True).planner_options() == {"drag_after_impact": True}
-    with pytest.raises(ArgumentError, match="drag_after_impact must be left out"):
+    with pytest.raises(pj.ArgumentError, match="drag_after_impact must be left out"):
         HitSettings(planner="bat", drag_after_impact=True)
 
 

@@ -8,7 +8,6 @@ from referees import flight
 from sweeps import RunTests, columns, quick_catch
 
 import planner_jax as pj
-from planner_jax.core.errors import ArgumentError
 from planner_jax.referee.catch import referee_catches
 from planner_jax.runs.columns import RefereedBatch
 from planner_jax.runs.columns import rows_of as columns_of
@@ -32,13 +31,10 @@ def open_source(settings, batch):
 
 @pytest.fixture(autouse=True, scope="module")
 def quick_planners():
+    quick = lambda settings: quick_catch(**settings.planner_options())  # noqa: E731
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(
-            CatchSweep, "planner", lambda _, settings: quick_catch(**settings.planner_options())
-        )
-        patch.setattr(
-            CatchSweep, "other_planners", lambda _, s: {"mpp": quick_catch(**s.planner_options())}
-        )
+        patch.setattr(CatchSweep, "planner", lambda _, settings: quick(settings))
+        patch.setattr(CatchSweep, "other_planners", lambda _, settings: {"mpp": quick(settings)})
         yield
 
 
@@ -98,7 +94,7 @@ def test_the_rows_alone_lead_the_referee_to_the_same_verdict(finished):
     ],
 )
 def test_a_run_is_resumed_as_what_it_is(finished, name, given, message):
-    with pytest.raises(ArgumentError, match=message):
+    with pytest.raises(pj.ArgumentError, match=message):
         resume_sweep(pj.task_named(name), finished[0], **given)
 
 
@@ -107,11 +103,9 @@ def test_cases_that_are_drawn_otherwise_are_not_mixed_into_a_run(finished, tmp_p
     with RunFolder(out).lock():
         RunFolder(out).write_manifest({**finished[1], "state": "interrupted"})
     real = pj.catch.draw
-    monkeypatch.setattr(
-        "planner_jax.task.catch.draw",
-        lambda num, suite, seed, **options: real(num, suite, seed + 1, **options),
-    )
-    with pytest.raises(ArgumentError, match="suite must be the same as when the run started"):
+    other = lambda num, suite, seed, **options: real(num, suite, seed + 1, **options)  # noqa: E731
+    monkeypatch.setattr("planner_jax.task.catch.draw", other)
+    with pytest.raises(pj.ArgumentError, match="suite must be the same as when the run started"):
         resume_sweep(TASK, out)
 
 

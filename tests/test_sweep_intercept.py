@@ -12,7 +12,6 @@ from sweeps import RunTests, columns
 
 import planner_jax as pj
 from planner_jax.plane.reach import Lattice
-from planner_jax.plane.target import PolynomialPath
 from planner_jax.referee.intercept import referee_intercepts
 from planner_jax.robot.car import CarBody, CarLimits
 from planner_jax.runs.columns import RefereedBatch
@@ -37,7 +36,7 @@ LIMITS = [field.name for field in dataclasses.fields(CarLimits)]
 
 
 def leaves_of(found, setting):
-    """Return the leaves of cases and plans, by name, of the rows' columns and the manifest."""
+    """Return arrays of cases and plans by name, from columns of rows and the manifest's setting."""
     due = found["due_time"]
     leaves = {"time": due, "speed": found["initial_speed"], "curvature": found["initial_curvature"]}
     names = ("start", "tolerance", "end_heading", "heading_tolerance")
@@ -64,11 +63,6 @@ def quick_planners():
         patch.setattr(InterceptSweep, "planner", lambda *_: one_search())
         patch.setattr(InterceptSweep, "other_planners", lambda *_: {"lattice": one_search()})
         yield
-
-
-@pytest.fixture
-def rows(finished):
-    return pq.read_table(finished[0] / "plans").to_pylist()
 
 
 class TestRun(RunTests):
@@ -105,9 +99,9 @@ def test_the_rows_alone_lead_the_referee_to_the_same_verdict(finished):
     np.testing.assert_allclose(verdict.mover_clearance, found["mover_clearance"], atol=1e-5)
 
 
-def test_a_row_s_drive_ends_where_the_referee_sees_it(finished, rows):
+def test_a_row_s_drive_ends_where_the_referee_sees_it(finished):
     setting = finished[1]["setting"]
-    for row in rows:
+    for row in pq.read_table(finished[0] / "plans").to_pylist():
         drive = sample_drive(row, setting, 41)
         away = np.linalg.norm(drive.middle[-1] - drive.target[-1])
         assert away == pytest.approx(row["miss"], abs=1e-4)
@@ -115,10 +109,8 @@ def test_a_row_s_drive_ends_where_the_referee_sees_it(finished, rows):
         sides = np.diff(drive.footprint(drive.pose[-1]), axis=0)
         lengths = np.linalg.norm(sides, axis=1)
         np.testing.assert_allclose(lengths, [0.4, 0.25, 0.4], rtol=1e-5)
-        # The body's middle is the mean of its corners.
-        np.testing.assert_allclose(
-            drive.footprint(drive.pose[20]).mean(axis=0), drive.middle[20], atol=1e-6
-        )
+        mean = drive.footprint(drive.pose[20]).mean(axis=0)
+        np.testing.assert_allclose(mean, drive.middle[20], atol=1e-6)
 
 
 def test_a_case_comes_back_from_its_row(finished):
@@ -138,7 +130,7 @@ def test_a_case_comes_back_from_its_row(finished):
 
 def test_a_target_of_another_class_has_a_way_and_no_leaves():
     coeffs = jnp.array([[[1.0, 2.0], [0.5, 0.0], [0.0, 0.1]]])
-    case = pj.intercept.case(PolynomialPath(coeffs, jnp.zeros(1)), np.full(1, 4.0))
+    case = pj.intercept.case(pj.PolynomialPath(coeffs, jnp.zeros(1)), np.full(1, 4.0))
     batch = RefereedBatch(Chunk(np.arange(1), case), None, None)
     of_target = {c.name: c.values(batch) for c in COLUMNS if c.name.startswith("target_")}
     assert of_target.pop("target_way").shape == (1, WAY_POINTS, 2)

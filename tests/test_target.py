@@ -11,11 +11,6 @@ from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicHermiteSpline, CubicSpline
 
 import planner_jax as pj
-from planner_jax.ball.flight import BallState
-from planner_jax.ball.target import BallPath, HarmonicPath
-from planner_jax.optimise.planner import pending
-from planner_jax.task.catch.plan import CatchPlan
-from planner_jax.trajectory.polynomial import PiecewisePolynomial
 
 HORIZON = 2.0
 GRAVITY = 9.81
@@ -24,12 +19,12 @@ TIMES = np.array([0.0, 0.02, 0.3, 0.9, 1.6])
 
 
 def ball_path(drag):
-    ball = BallState(jnp.asarray(POS), jnp.asarray(VEL))
-    return BallPath(ball, jnp.asarray(drag), jnp.asarray(GRAVITY))
+    ball = pj.BallState(jnp.asarray(POS), jnp.asarray(VEL))
+    return pj.BallPath(ball, jnp.asarray(drag), jnp.asarray(GRAVITY))
 
 
 def harmonic_path():
-    return HarmonicPath(*map(jnp.asarray, (POS, VEL, [0.0, 0.3, 0.8], 2.1, 0.7)))
+    return pj.HarmonicPath(*map(jnp.asarray, (POS, VEL, [0.0, 0.3, 0.8], 2.1, 0.7)))
 
 
 @jax.jit
@@ -88,8 +83,8 @@ def test_gradients_by_every_leaf_are_finite_at_time_zero_and_without_drag(name):
 
 
 def test_a_case_can_be_made_inside_a_compiled_function():
-    ball = BallState(jnp.zeros((1, 3)), jnp.zeros((1, 3)))
-    path = BallPath(ball, drag=jnp.zeros((1, 3)), gravity=jnp.full(1, 9.81))
+    ball = pj.BallState(jnp.zeros((1, 3)), jnp.zeros((1, 3)))
+    path = pj.BallPath(ball, drag=jnp.zeros((1, 3)), gravity=jnp.full(1, 9.81))
     scale = jax.jit(lambda speed: pj.catch.case(path, np.ones(1), speed=3.0).limits.speed * speed)
     assert scale(2.0) == 6.0
 
@@ -167,7 +162,7 @@ def test_a_malformed_table_is_rejected_in_one_line(change, message):
 
 @struct.dataclass
 class Falling:
-    start: BallState
+    start: pj.BallState
     gravity: Array  # () [m/s^2]
 
     def at(self, time):
@@ -178,24 +173,24 @@ class Falling:
 @struct.dataclass
 class Lying(Falling):
     def at(self, time):
-        return BallState(super().at(time), jnp.zeros(3))
+        return pj.BallState(super().at(time), jnp.zeros(3))
 
 
 @pytest.mark.parametrize("own", [Falling, Lying])
 def test_the_referee_uses_only_the_positions_of_a_class_of_the_user(own):
     rng = np.random.default_rng(3)
-    start = BallState(rng.normal(size=(2, 2, 3)), rng.normal(size=(2, 2, 3)))
+    start = pj.BallState(rng.normal(size=(2, 2, 3)), rng.normal(size=(2, 2, 3)))
     gravity = np.full((2, 2), 9.81)
     known = pj.BallPath(start, np.zeros((2, 2, 3)), gravity)
     cases = jax.tree.map(np.asarray, pj.catch.case(known, np.full((2, 2), 1.5)))
     zero = np.zeros(2, np.float32)
-    plans = CatchPlan(
-        trajectory=PiecewisePolynomial(rng.normal(size=(2, 4, 8, 3)), np.full((2, 4), 0.3)),
+    plans = pj.catch.CatchPlan(
+        trajectory=pj.PiecewisePolynomial(rng.normal(size=(2, 4, 8, 3)), np.full((2, 4), 0.3)),
         gravity=cases.gravity,
         order=np.array([[0, 1], [1, 0]]),
         decided_times=np.zeros((2, 2)),
         times=np.array([[0.6, 1.2]] * 2),
-        **pending(zero) | {"status": zero.astype(int), "iterations": zero.astype(int)},
+        **pj.pending(zero) | {"status": zero.astype(int), "iterations": zero.astype(int)},
     )
     exact = pj.catch.judge(cases.replace(targets=known), plans)
     found = pj.catch.judge(cases.replace(targets=own(start, gravity)), plans)
@@ -206,7 +201,7 @@ def test_the_referee_uses_only_the_positions_of_a_class_of_the_user(own):
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["table", "own"])
 def test_targets_of_the_user_are_caught_and_judged(kind):
-    start = BallState(np.float32([[1.5, 0.3, 2.5]]), np.float32([[-1.2, 0.1, 2.0]]))
+    start = pj.BallState(np.float32([[1.5, 0.3, 2.5]]), np.float32([[-1.2, 0.1, 2.0]]))
     own = Falling(start, np.full(1, 9.81, np.float32))
     times = np.linspace(-0.1, 1.2, 40)[:, None]
     thrown = start.pos + start.vel * times + np.array([0.0, 0.0, -4.905]) * times**2

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import sys
 from typing import Any
 
 import jax
@@ -18,6 +19,7 @@ from planner_jax.policies.networks import NETWORKS, Mlp
 from planner_jax.policies.observation import FEATURES
 from planner_jax.policies.policy import Policy
 from planner_jax.policies.progress import FILE, read_rows, to_text
+from planner_jax.policies.settings import NETWORK_NAMES
 from planner_jax.runs.manifest import to_write
 from planner_jax.task.catch.estimate import shortfall
 from planner_jax.task.catch.suites import draw_by_key
@@ -40,16 +42,9 @@ def hasty() -> Policy:
 def asked(hasty, tmp_path_factory) -> Any:
     path = tmp_path_factory.mktemp("hasty") / "hasty.npz"
     save_checkpoint(path, hasty.params, hasty.network, {})
-    return training.Training(
-        (SUITE,),
-        (PART,),
-        network="mlp",
-        num_envs=LANES,
-        minibatches=5,
-        eval_cases=0,
-        divergence=0.05,
-        init_from=str(path),
-    )
+    sizes = {"num_envs": LANES, "minibatches": 5, "eval_cases": 0}
+    options = {"network": "mlp", "divergence": 0.05, "init_from": str(path)}
+    return training.Training((SUITE,), (PART,), **sizes, **options)
 
 
 @pytest.fixture(scope="module")
@@ -82,9 +77,7 @@ def test_a_training_leaves_its_curve(trained):
     assert not [path for path in out.iterdir() if "tmp" in path.name]
 
 
-def test_curves_of_several_seeds_are_drawn_together_and_of_other_settings_are_not(
-    trained, tmp_path
-):
+def test_curves_are_drawn_together_of_several_seeds_but_not_of_other_settings(trained, tmp_path):
     _, out = trained
     other = tmp_path / "other"
     other.mkdir()
@@ -157,12 +150,9 @@ def test_weights_of_another_network_or_size_are_refused(network, begun, says, ca
 
 
 def test_a_training_without_brax_names_the_extra(capsys, tmp_path, monkeypatch):
-    import sys
-
     monkeypatch.delitem(sys.modules, "planner_jax.policies.training")
-    monkeypatch.setitem(sys.modules, "planner_jax.policies.brax_compat", None)
-    monkeypatch.setitem(sys.modules, "brax.training", None)
-    monkeypatch.setitem(sys.modules, "brax", None)
+    for name in ("planner_jax.policies.brax_compat", "brax.training", "brax"):
+        monkeypatch.setitem(sys.modules, name, None)
     assert main(["train", "--out", str(tmp_path / "run")]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert "train needs brax" in line and install_line("policies") in line
@@ -170,6 +160,4 @@ def test_a_training_without_brax_names_the_extra(capsys, tmp_path, monkeypatch):
 
 
 def test_every_network_is_named_in_settings():
-    from planner_jax.policies.settings import NETWORK_NAMES
-
     assert tuple(NETWORKS) == NETWORK_NAMES

@@ -83,11 +83,8 @@ def test_the_wheel_has_every_module_and_its_data_once(wheel):
     names = zipfile.ZipFile(wheel).namelist()
     packed = [name for name in names if not name.split("/")[0].endswith(".dist-info")]
     library = python_files(ROOT / "planner_jax")
-    outside = {
-        f"{room}/{name}"
-        for room in ("sims", "policies", "benchmarks")
-        for name in python_files(ROOT / room)
-    }
+    beside = ("sims", "policies", "benchmarks")
+    outside = {f"{name}/{file}" for name in beside for file in python_files(ROOT / name)}
     assert len(packed) == len(set(packed))
     assert set(packed) == {f"planner_jax/{name}" for name in library | outside}
 
@@ -159,9 +156,7 @@ def test_without_mujoco_a_flight_names_the_extra_in_one_line(
     installed, elsewhere, tmp_path, arguments
 ):
     (tmp_path / "sitecustomize.py").write_text("import sys\nsys.modules['mujoco'] = None\n")
-    commands, _ = installed
-    done = run(
-        commands / "planner-jax", *arguments.split(), cwd=elsewhere, PYTHONPATH=str(tmp_path)
-    )
+    command = [installed[0] / "planner-jax", *arguments.split()]
+    done = run(*command, cwd=elsewhere, PYTHONPATH=str(tmp_path))
     assert done.returncode == 2 and done.stderr.count("\n") == 1, done.stderr
     assert "pip install 'planner-jax[sims]'" in done.stderr
