@@ -93,7 +93,8 @@ def test_a_lane_of_nan_spoils_no_other():
     whole = pj.plan(planner, cases)
     head = np.array(cases.head_state)
     head[3] = np.nan
-    plans = pj.plan(planner, dataclasses.replace(cases, head_state=head))
+    broken = dataclasses.replace(cases, head_state=head)
+    plans = pj.plan(planner, jax.tree.map(jnp.asarray, broken))
     assert plans.status[3] == pj.Status.BAD_INPUT
     others = np.arange(NUM) != 3
     np.testing.assert_array_equal(plans.times[others], whole.times[others])
