@@ -112,7 +112,7 @@ def grid_index(axis: int) -> Array:
 
 
 def _spare_searches() -> None:
-    """Register an empty module that JAX searches in vain; kernels are lowered a third faster."""
+    """Register an empty module that JAX else searches for; kernels are lowered a third faster."""
     name = "jaxlib.mlir.dialects.tt"
     if name not in sys.modules and importlib.util.find_spec(name) is None:
         sys.modules[name] = types.ModuleType(name)

@@ -54,7 +54,7 @@ def number_of(path: Path) -> int:
 
 
 def check_part(path: Path) -> Entries:
-    """Return the JSON object in a row file's metadata; raise `DamagedPart` if it is damaged."""
+    """Return the JSON metadata of a file of rows; raise `DamagedPart` if the file is damaged."""
     number_of(path)
     with open_plain(path) as file:
         content = file.read()

@@ -125,7 +125,7 @@ class MppCatch(Planner):
             raise ArgumentError("speeds and thrusts", "an entry", verb="have", shown="none")
 
     def solve(self, case: CatchCase, attempt: Attempt) -> CatchPlan:
-        """Return the plan of one case, with the cheapest candidate of each segment.
+        """Return the plan of one case: from catch to catch, the cheapest candidate trajectory.
 
         The plan's cost is the mean squared jerk of the whole trajectory.
         """

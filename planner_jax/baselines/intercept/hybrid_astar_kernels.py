@@ -202,7 +202,7 @@ def _is_blocked(start, goal, scene, field):
 
 @njit(cache=True)
 def _compute_primitives(start_heading, rules):
-    """Compute the arcs from a node: longer than a cell's diagonal, sampled every half cell."""
+    """Compute the arcs that the search tries from a node: longer than the diagonal of a cell."""
     width = TURN / rules.headings
     turns = 2
     while turns * width / rules.curvature <= math.sqrt(2.0) * rules.cell:

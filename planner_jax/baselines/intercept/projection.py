@@ -183,10 +183,10 @@ def _least(values: list[Array]) -> Array:
 def _cover_run(
     own: Array, begin: Array, finish: Array, station: Array, half_step: Array, slabs: int
 ) -> Blocked:
-    """Cover what an obstacle blocks on consecutive points of a path with `slabs` quadrangles.
+    """Return `slabs` quadrangles that cover when an obstacle blocks consecutive points of a path.
 
-    The points, of N points of the path, are those where `own` (N,) bool is True. The obstacle
-    blocks each point from `begin` to `finish` (N,) [s].
+    `own` (N,) bool selects the points among N points of the path. The obstacle blocks each point
+    from `begin` to `finish` (N,) [s].
     """
     any_own = jnp.any(own)
     first = jnp.min(jnp.where(own, begin, jnp.inf))

@@ -46,7 +46,7 @@ class SingleCatch(Single[SingleCatchSettings]):
         return lines
 
     def task_margins(self, answer: Answer) -> list[Margin]:
-        """Return margins to the net's radius, its angle and the latest catch time (horizon)."""
+        """Return how close catches come to the limits of the net's radius, angle and time."""
         net, verdict = answer.case.net, answer.verdict
         times = np.asarray(verdict.catch_times)
         horizons = np.asarray(answer.case.horizon)[np.asarray(answer.plan.order)]

@@ -29,7 +29,7 @@ class SingleHit(Single[SingleHitSettings]):
         ]
 
     def task_margins(self, answer: Answer) -> list[Margin]:
-        """Return margins to the racket's radius, hitting speeds, and limits of the ball's apex."""
+        """Return how close a hit comes to the limits of racket radius, hitting speed and apex."""
         limits, verdict = answer.case.hit_limits, answer.verdict
         end = float(np.sum(answer.plan.trajectory.durations))
         speeds = np.abs(np.asarray(verdict.hitting_velocity))

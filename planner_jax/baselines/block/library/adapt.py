@@ -102,7 +102,7 @@ class AdaptBlock(Planner):
         return self.efforts
 
     def check(self, cases: BlockCase) -> None:
-        """Raise `ArgumentError` unless arm, limits, scene and start of a case are the library's."""
+        """Raise `ArgumentError` unless arm, limits, scene and start of a case fit the library."""
         self.stored.check(cases)
 
     def solve(self, case: BlockCase, attempt: Effort) -> BlockPlan:

@@ -55,7 +55,7 @@ class LibraryBlock(Planner):
         return (Attempt(),)
 
     def check(self, cases: BlockCase) -> None:
-        """Raise `ArgumentError` unless arm, limits, scene and start of a case are the library's."""
+        """Raise `ArgumentError` unless arm, limits, scene and start of a case fit the library."""
         first = jax.tree.map(lambda leaf: np.asarray(leaf), cases)
         if cases.batch_shape:
             first = jax.tree.map(lambda leaf: leaf[0], first)

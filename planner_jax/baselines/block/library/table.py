@@ -184,7 +184,7 @@ class Library:
 
     @property
     def found(self) -> np.ndarray:
-        """For which of P pairs of cells on two boxes H poses have a motion, (H, P) bool."""
+        """Mask (H, P) bool of stored motions: H start poses, P pairs of cells on two boxes."""
         return np.isfinite(np.asarray(unpack_rows(self.table.rows).duration))
 
     @property
