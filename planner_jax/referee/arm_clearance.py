@@ -16,16 +16,7 @@ from functools import partial
 
 import numpy as np
 
-from planner_jax.referee.solids import (
-    between_boxes,
-    between_segments,
-    dot,
-    from_segment,
-    length,
-    rotate,
-    rotate_back,
-    segment_to_box,
-)
+from planner_jax.referee import solids
 
 KINDS = ("floor", "pole", "rig", "base", "self")
 THICKNESS = 0.01  # [m], thickness of the shield's plate
@@ -51,16 +42,16 @@ class _Capsule:
     @property
     def reach(self) -> np.ndarray:
         """Radius (B, 1) [m] of the sphere around `middle` that contains the capsule."""
-        return 0.5 * length(self.second[..., :1] - self.first[..., :1]) + self.radius
+        return 0.5 * solids.length(self.second[..., :1] - self.first[..., :1]) + self.radius
 
     def lowest(self) -> np.ndarray:
         return np.minimum(self.first[2], self.second[2]) - self.radius
 
     def distance_to_point(self, point: np.ndarray) -> np.ndarray:
-        return from_segment(point, self.first, self.second) - self.radius
+        return solids.from_segment(point, self.first, self.second) - self.radius
 
     def distance_to_capsule(self, other: "_Capsule") -> np.ndarray:
-        apart = between_segments(self.first, self.second, other.first, other.second)
+        apart = solids.between_segments(self.first, self.second, other.first, other.second)
         return apart - self.radius - other.radius
 
     def at(self, lane: np.ndarray, sample: np.ndarray) -> "_Capsule":
@@ -79,25 +70,25 @@ class _Box:
 
     @property
     def reach(self) -> np.ndarray:
-        return length(self.half)
+        return solids.length(self.half)
 
     def lowest(self) -> np.ndarray:
         return self.middle[2] - sum(np.abs(self.turn[2, k]) * self.half[k] for k in range(3))
 
     def distance_to_point(self, point: np.ndarray) -> np.ndarray:
-        inside = rotate_back(self.turn, point - self.middle)
-        return length(np.maximum(np.abs(inside) - self.half, 0.0))
+        inside = solids.rotate_back(self.turn, point - self.middle)
+        return solids.length(np.maximum(np.abs(inside) - self.half, 0.0))
 
     def distance_to_capsule(self, other: _Capsule) -> np.ndarray:
         first, second = (
-            rotate_back(self.turn, end - self.middle) for end in (other.first, other.second)
+            solids.rotate_back(self.turn, end - self.middle) for end in (other.first, other.second)
         )
-        return segment_to_box(first, second, self.half) - other.radius
+        return solids.segment_to_box(first, second, self.half) - other.radius
 
     def distance_to_box(self, other: "_Box") -> np.ndarray:
-        middle = rotate_back(self.turn, other.middle - self.middle)
-        turn = np.stack([rotate_back(self.turn, other.turn[:, k]) for k in range(3)], axis=1)
-        return between_boxes(middle, turn, other.half, self.half)
+        middle = solids.rotate_back(self.turn, other.middle - self.middle)
+        turn = np.stack([solids.rotate_back(self.turn, other.turn[:, k]) for k in range(3)], axis=1)
+        return solids.between_boxes(middle, turn, other.half, self.half)
 
     def at(self, lane: np.ndarray, sample: np.ndarray) -> "_Box":
         middle, turn = (_pick_samples(each, lane, sample) for each in (self.middle, self.turn))
@@ -127,7 +118,7 @@ def links_of(case: dict, angles: np.ndarray) -> tuple[list, list]:
         origin, quaternion, axis = (
             case[f"arm.{name}"][:, k].T[..., None] for name in ("origin", "turn", "axis")
         )
-        position = position + rotate(turn, origin)
+        position = position + solids.rotate(turn, origin)
         # Multiply by the joint's fixed rotation, and by the rotation about its axis (Rodrigues).
         cos, sin = np.cos(angles[k]), np.sin(angles[k])
         own, along = _rotation(quaternion), axis[:, None] * axis[None]
@@ -143,7 +134,7 @@ def shield_middle(case: dict, turns: list, positions: list) -> np.ndarray:
 
     The outward normal of the face is the x axis of link 6.
     """
-    return positions[5] + rotate(turns[5], case["arm.shield_centre"].T[..., None])
+    return positions[5] + solids.rotate(turns[5], case["arm.shield_centre"].T[..., None])
 
 
 def clearances(case: dict, links: Sequence, angles: np.ndarray, sampled: np.ndarray) -> dict:
@@ -190,7 +181,9 @@ def _arm(case: dict, links: Sequence, angles: np.ndarray) -> tuple[list[_Capsule
     for k, link in enumerate(links):
         first, second = case["arm.capsule_ends"][:, k].transpose(1, 2, 0)[..., None]
         if link != _BASE:
-            first, second = (positions[link] + rotate(turns[link], end) for end in (first, second))
+            first, second = (
+                positions[link] + solids.rotate(turns[link], end) for end in (first, second)
+            )
         name = "the base" if link == _BASE else f"link {link + 1}"
         capsules.append(_Capsule(name, link, first, second, case["arm.capsule_radius"][:, k, None]))
     wide = case["arm.shield_half"][:, None]
@@ -299,7 +292,7 @@ def _pick_samples(values: np.ndarray, lane: np.ndarray, sample: np.ndarray) -> n
 
 
 def _product(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    return np.stack([rotate(first, second[:, k]) for k in range(3)], axis=1)
+    return np.stack([solids.rotate(first, second[:, k]) for k in range(3)], axis=1)
 
 
 def _cross(axis: np.ndarray) -> np.ndarray:
@@ -311,4 +304,4 @@ def _rotation(quaternion: np.ndarray) -> np.ndarray:
     """Convert unit quaternions (4, ...), w x y z, to rotations (3, 3, ...)."""
     w, v = quaternion[0], quaternion[1:]
     upright = np.eye(3).reshape(3, 3, *(1,) * w.ndim)
-    return (w * w - dot(v, v)) * upright + 2.0 * (v[:, None] * v[None] + w * _cross(v))
+    return (w * w - solids.dot(v, v)) * upright + 2.0 * (v[:, None] * v[None] + w * _cross(v))

@@ -11,19 +11,8 @@ import functools
 
 import numpy as np
 
+from planner_jax.referee import judging
 from planner_jax.referee.arm_clearance import KINDS, clearances, links_of, shield_middle
-from planner_jax.referee.judging import (
-    CONTACT_TIME_TOLERANCE,
-    SMALLEST_LIMIT,
-    Verdict,
-    above,
-    derivative,
-    finite_lanes,
-    first_failures,
-    flat,
-    judge_in_chunks,
-    read_leaves,
-)
 from planner_jax.referee.solids import rotate_back
 
 _SENTENCES = {
@@ -76,7 +65,7 @@ _SAMPLES = 16384  # number of poses whose clearances are computed together and f
 
 
 @dataclasses.dataclass(frozen=True)
-class BlockVerdict(Verdict):
+class BlockVerdict(judging.Verdict):
     """Verdict on B plans in which an arm blocks a ball with its shield.
 
     Measurements are NaN if a number of case or plan is not finite, or a time of the plan is wrong:
@@ -143,7 +132,7 @@ def referee_blocks(
     """
     leaves, links = _read(cases, plans)
     judge = functools.partial(_judge, links=links, relative=tolerance, contact=contact_tolerance)
-    return BlockVerdict(**judge_in_chunks(judge, leaves, chunk=256))
+    return BlockVerdict(**judging.judge_in_chunks(judge, leaves, chunk=256))
 
 
 def _read(cases, plans) -> tuple[dict[str, np.ndarray], tuple[int, ...]]:
@@ -163,9 +152,9 @@ def _read(cases, plans) -> tuple[dict[str, np.ndarray], tuple[int, ...]]:
         "scene.beam_ends": (*beams[1:], 2, 3),
         "scene.beam_radius": beams[1:],
     }
-    leaves = {"plan.motion.coeffs": coeffs} | read_leaves(cases, shapes, num_lanes)
+    leaves = {"plan.motion.coeffs": coeffs} | judging.read_leaves(cases, shapes, num_lanes)
     of_plan = {"motion.durations": coeffs.shape[1:2], "contact_time": ()}
-    leaves |= read_leaves(plans, of_plan, num_lanes, "plan.")
+    leaves |= judging.read_leaves(plans, of_plan, num_lanes, "plan.")
     absent = leaves["scene.has_pole"] == 0
     leaves["scene.pole"] = np.where(absent[:, None], 0.0, leaves["scene.pole"])
     leaves["scene.pole_radius"] = np.where(absent, 0.0, leaves["scene.pole_radius"])
@@ -173,7 +162,7 @@ def _read(cases, plans) -> tuple[dict[str, np.ndarray], tuple[int, ...]]:
 
 
 def _judge(case: dict, links: tuple, relative: float, contact: float) -> dict:
-    finite = finite_lanes(case, _UNBOUNDED_LEAVES)
+    finite = judging.finite_lanes(case, _UNBOUNDED_LEAVES)
     execution = case["plan.motion.durations"].sum(axis=1)
     # Time [s] from the end of the arm's motion to the contact with the ball.
     stays = case["plan.contact_time"] - case["delay"] - execution
@@ -202,7 +191,7 @@ def _judge(case: dict, links: tuple, relative: float, contact: float) -> dict:
         for name, (failed, excess, time) in tests.items()
     }
     tests["time"] = (wrong_times[0], np.where(finite, wrong_times[1], 0.0), wrong_times[2])
-    found = first_failures(tests, LIMITS, finite)
+    found = judging.first_failures(tests, LIMITS, finite)
     failed_part = np.full(len(finite), "")
     for name, part in parts.items():
         failed_part = np.where(found["failed_limit"] == name, part, failed_part)
@@ -213,7 +202,7 @@ def _times(case: dict, stays: np.ndarray) -> tuple:
     contact = case["plan.contact_time"]
     shortest = case["plan.motion.durations"].min(axis=1)
     off = np.maximum.reduce([case["delay"] - contact, -stays, contact - LONGEST_PLAN, -shortest])
-    return (off > CONTACT_TIME_TOLERANCE) | (shortest < 0.0), off, contact
+    return (off > judging.CONTACT_TIME_TOLERANCE) | (shortest < 0.0), off, contact
 
 
 @dataclasses.dataclass(frozen=True)
@@ -232,7 +221,7 @@ def _extremes(motion: _Motion) -> list[tuple[np.ndarray, np.ndarray]]:
     ends = np.stack([np.zeros(shape), np.broadcast_to(motion.durations, shape)])
     times, found = ends, []
     for order in range(max(degree, 2), -1, -1):
-        values = derivative(motion.coeffs, times, order)
+        values = judging.derivative(motion.coeffs, times, order)
         found.append((values, times))
         if order >= degree:
             continue  # a constant derivative has no extrema
@@ -241,7 +230,7 @@ def _extremes(motion: _Motion) -> list[tuple[np.ndarray, np.ndarray]]:
         low, high, is_below = times[:-1], times[1:], values[:-1] < 0.0
         for _ in range(_HALVINGS):
             middle = 0.5 * (low + high)
-            is_before = (derivative(motion.coeffs, middle, order) < 0.0) == is_below
+            is_before = (judging.derivative(motion.coeffs, middle, order) < 0.0) == is_below
             low, high = np.where(is_before, middle, low), np.where(is_before, high, middle)
         times = np.concatenate([ends[:1], high, ends[1:]])
     return found[:-4:-1]
@@ -249,7 +238,7 @@ def _extremes(motion: _Motion) -> list[tuple[np.ndarray, np.ndarray]]:
 
 def _worst(excess: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return each plan's greatest excess over all joints, pieces and times, its time and joint."""
-    by_lane = flat(np.moveaxis(excess, 2, 0))
+    by_lane = judging.flat(np.moveaxis(excess, 2, 0))
     lanes, top = np.arange(len(by_lane)), by_lane.argmax(axis=1)
     k, joint, piece = np.unravel_index(top, (*excess.shape[:2], excess.shape[3]))
     time = np.broadcast_to(times, excess.shape)[k, joint, lanes, piece]
@@ -270,7 +259,7 @@ def _judge_limits(case: dict, motion: _Motion, extremes: list, relative: float) 
     # Jumps of angles and rates: the values at the start of each piece minus the values at the end
     # of the preceding piece, or minus the case's values for the first piece.
     begin, end = (
-        np.stack([derivative(motion.coeffs, times, order) for order in range(2)])
+        np.stack([judging.derivative(motion.coeffs, times, order) for order in range(2)])
         for times in (np.zeros_like(motion.durations), motion.durations)
     )
     initial = np.stack([case["angles"].T, case["rates"].T])[..., None]
@@ -283,8 +272,9 @@ def _judge_limits(case: dict, motion: _Motion, extremes: list, relative: float) 
     test("position", np.maximum(angles - upper, lower - angles), motion.starts + times, relative)
     for name, (values, times) in zip(("velocity", "acceleration"), extremes[1:], strict=True):
         size, limit = np.abs(values), case[f"limits.{name}"].T[..., None]
-        test(name, above(size, limit, relative, times)[1], motion.starts + times, relative)
-        measured[f"{name}_share"] = (size / np.maximum(limit, SMALLEST_LIMIT)).max(axis=(0, 1, 3))
+        test(name, judging.above(size, limit, relative, times)[1], motion.starts + times, relative)
+        share = size / np.maximum(limit, judging.SMALLEST_LIMIT)
+        measured[f"{name}_share"] = share.max(axis=(0, 1, 3))
     return measured, tests, parts
 
 
@@ -293,16 +283,16 @@ def _rest(case: dict, motion: _Motion, stays: np.ndarray) -> tuple[tuple, np.nda
 
     `stays` (B,) [s] is the time from the motion's end to the contact.
     """
-    rates = np.abs(derivative(motion.coeffs[..., -1], motion.durations[:, -1], 1))
-    has_to = (case["ends_at_rest"] != 0.0) | (stays > CONTACT_TIME_TOLERANCE)
+    rates = np.abs(judging.derivative(motion.coeffs[..., -1], motion.durations[:, -1], 1))
+    has_to = (case["ends_at_rest"] != 0.0) | (stays > judging.CONTACT_TIME_TOLERANCE)
     time = motion.starts[:, -1] + motion.durations[:, -1]
     worst, time, joint = _worst(rates[None, ..., None], time[:, None])
     return (has_to & (worst > REST), worst, time), joint
 
 
 def _final(motion: _Motion, stays: np.ndarray) -> np.ndarray:
-    beyond = np.where(np.abs(stays) > CONTACT_TIME_TOLERANCE, 0.0, stays)
-    return derivative(motion.coeffs[..., -1], motion.durations[:, -1] + beyond, 0)
+    beyond = np.where(np.abs(stays) > judging.CONTACT_TIME_TOLERANCE, 0.0, stays)
+    return judging.derivative(motion.coeffs[..., -1], motion.durations[:, -1] + beyond, 0)
 
 
 def _clearances(case: dict, links: tuple, motion: _Motion, turning: np.ndarray) -> dict[str, tuple]:
@@ -346,7 +336,7 @@ def _sample(
     rows, lanes = np.arange(len(lanes))[:, None], lanes[:, None]
     share = np.minimum((sample - behind[rows, piece]) / count[rows, piece] + 1.0, 1.0)
     local = share * motion.durations[lanes, piece]
-    angles = derivative(motion.coeffs[:, :, lanes, piece], local, 0)
+    angles = judging.derivative(motion.coeffs[:, :, lanes, piece], local, 0)
     return motion.starts[lanes, piece] + local, angles
 
 

@@ -16,27 +16,7 @@ from typing import Literal
 
 import numpy as np
 
-from planner_jax.referee.judging import (
-    CONTACT_TIME_TOLERANCE,
-    FlightVerdict,
-    above,
-    check_leaf,
-    derivative,
-    finite_lanes,
-    first_failures,
-    judge_in_chunks,
-    read_leaves,
-)
-from planner_jax.referee.quadrotor import (
-    MOTION_SENTENCES,
-    MOTION_UNBOUNDED,
-    append_recovery,
-    check_coeffs,
-    intervals_of,
-    judge_motion,
-    pieces_of,
-    read_flight,
-)
+from planner_jax.referee import judging, quadrotor
 
 _ORDER_OF_MOTION = (
     *("head state", "continuity", "speed", "thrust low", "thrust high", "body rate"),
@@ -48,7 +28,7 @@ _SENTENCES = {
     "once, before the others",
     "catch time": "off by {excess:.3g} s at {time:.3f} s; catches must be at rising positive "
     "times, where their pieces end, and not after the target's horizon",
-    **{name: MOTION_SENTENCES[name] for name in _ORDER_OF_MOTION},
+    **{name: quadrotor.MOTION_SENTENCES[name] for name in _ORDER_OF_MOTION},
     "net": "the target is {excess:.2%} outside the hoop's radius at {time:.3f} s",
     "net plane": "the target is {excess:.3g} m off the hoop's plane at {time:.3f} s",
     "angle": "{excess:.2%} above its limit between the net's axis and minus the target's velocity "
@@ -62,7 +42,7 @@ SLOWEST_TARGET = 1e-6
 
 
 @dataclasses.dataclass(frozen=True)
-class CatchVerdict(FlightVerdict):
+class CatchVerdict(judging.FlightVerdict):
     """Verdict on B plans in which a quadrotor catches up to N targets each.
 
     Arrays (B, N) are in the order of the catches, like the plan's `order` and `times`. Their
@@ -70,7 +50,7 @@ class CatchVerdict(FlightVerdict):
     """
 
     SENTENCES = _SENTENCES
-    UNBOUNDED = MOTION_UNBOUNDED
+    UNBOUNDED = quadrotor.MOTION_UNBOUNDED
 
     net_distance: np.ndarray  # (B, N) [m], from the net's centre to the target at the catch
     net_offset: np.ndarray  # (B, N) [m], height of the target above the hoop's plane at the catch
@@ -148,12 +128,12 @@ def referee_catches(
             pos, vel = _follow_targets(cases.targets, order, times)
         else:
             pos, vel = target_states(cases.targets, order, times)
-    leaves["target pos"] = check_leaf("target_states' pos", pos, (*shape, 3))
-    leaves["target vel"] = check_leaf("target_states' vel", vel, (*shape, 3))
+    leaves["target pos"] = judging.check_leaf("target_states' pos", pos, (*shape, 3))
+    leaves["target vel"] = judging.check_leaf("target_states' vel", vel, (*shape, 3))
     judge = functools.partial(
         _judge,
         extras=cases.extras,
-        intervals=intervals_of(leaves["durations"].shape[1] // shape[1]),
+        intervals=quadrotor.intervals_of(leaves["durations"].shape[1] // shape[1]),
         net_test=net_test,
         optional=bool(cases.optional),
         tolerances={
@@ -162,22 +142,22 @@ def referee_catches(
             "continuity": continuity_tolerance,
         },
     )
-    return CatchVerdict(**judge_in_chunks(judge, leaves, chunk=2048))
+    return CatchVerdict(**judging.judge_in_chunks(judge, leaves, chunk=2048))
 
 
 def _read(cases, plans) -> dict[str, np.ndarray]:
-    coeffs, present = check_coeffs(plans.trajectory.coeffs), np.asarray(cases.present)
+    coeffs, present = quadrotor.check_coeffs(plans.trajectory.coeffs), np.asarray(cases.present)
     batch, pieces = coeffs.shape[:1], coeffs.shape[1]
     if present.ndim != 2 or present.shape[:1] != batch or 0 in present.shape[1:]:
         raise ValueError(f"present must be ({batch[0]}, N), got {present.shape}")
     num = present.shape[1]
     if pieces % num:
         raise ValueError(f"coeffs must have N * M pieces for N = {num} targets, got {pieces}")
-    leaves = read_flight(cases, plans) | {"present": present}
+    leaves = quadrotor.read_flight(cases, plans) | {"present": present}
     shapes = {"horizon": (num,), "head_state": (4, 3)}
     shapes |= {"net.height": (), "net.radius": (), "net.max_angle": ()}
-    leaves |= read_leaves(cases, shapes, len(coeffs))
-    return leaves | read_leaves(plans, {"order": (num,), "times": (num,)}, len(coeffs))
+    leaves |= judging.read_leaves(cases, shapes, len(coeffs))
+    return leaves | judging.read_leaves(plans, {"order": (num,), "times": (num,)}, len(coeffs))
 
 
 def _ends(durations: np.ndarray, num: int) -> np.ndarray:
@@ -190,7 +170,7 @@ def _follow_targets(targets, order: np.ndarray, times: np.ndarray) -> tuple[np.n
     lanes, finite = np.arange(len(order))[:, None], np.ones(order.shape, bool)
 
     def leaf(name: str, value, *trailing: int) -> np.ndarray:
-        value = check_leaf(f"targets.{name}", value, order.shape + trailing)
+        value = judging.check_leaf(f"targets.{name}", value, order.shape + trailing)
         value = value[lanes, order].astype(np.float64)
         finite[...] &= np.isfinite(value).all(axis=tuple(range(2, value.ndim)))
         return value
@@ -284,7 +264,7 @@ def _judge(
         number = np.minimum(planned.cumprod(axis=1).sum(axis=1, keepdims=True), number)
     due = np.arange(num) < number
     flown = np.repeat(due, each, axis=1) | (durations != 0.0)
-    pieces = pieces_of(case["coeffs"], durations, flown)
+    pieces = quadrotor.pieces_of(case["coeffs"], durations, flown)
     right, target = _test_order(case["order"], present, due, optional)
     lanes = np.arange(len(due))
     wrong = (~right).sum(axis=1).astype(np.float64)
@@ -300,8 +280,8 @@ def _judge(
         "target pos": np.where(held[..., None], case["target pos"], 0.0),
         "target vel": np.where(held[..., None], case["target vel"], 0.0),
     }
-    whole = append_recovery(pieces, case)
-    motion, tests = judge_motion(
+    whole = quadrotor.append_recovery(pieces, case)
+    motion, tests = quadrotor.judge_motion(
         whole, case, extras, intervals, tolerances["relative"], tolerances["continuity"]
     )
     flying = whole.flown.any(axis=1)
@@ -312,8 +292,8 @@ def _judge(
     measured, catch_tests = _judge_catches(case, pieces, held, ends, net_test, tolerances)
     tests |= {name: _worst(test, held) for name, test in catch_tests.items()}
     tests["order"] = order_test
-    finite = finite_lanes(case, ("horizon", "net.radius", "net.max_angle"))
-    verdict = first_failures(tests, LIMITS, finite)
+    finite = judging.finite_lanes(case, ("horizon", "net.radius", "net.max_angle"))
+    verdict = judging.first_failures(tests, LIMITS, finite)
     caught = held & (verdict["failed_limit"] != LIMITS[0])[:, None]
     for failed, _, _ in catch_tests.values():
         caught &= ~failed
@@ -348,7 +328,7 @@ def _judge_catches(case, pieces, held, ends, net_test: str, tolerances: dict) ->
     each = pieces.durations.shape[1] // held.shape[1]
     tail = np.moveaxis(pieces.coeffs[:, :, each - 1 :: each], -1, 0)
     spans = pieces.durations[:, each - 1 :: each]
-    pos, acc = (np.moveaxis(derivative(tail, spans, order), 0, -1) for order in (0, 2))
+    pos, acc = (np.moveaxis(judging.derivative(tail, spans, order), 0, -1) for order in (0, 2))
     thrust = acc + case["gravity"][:, None, None] * [0.0, 0.0, 1.0]
     size = np.linalg.norm(thrust, axis=-1, keepdims=True)
     # Without thrust the net's axis has no direction: it is set to 0, and the angle is set to pi.
@@ -367,9 +347,9 @@ def _judge_catches(case, pieces, held, ends, net_test: str, tolerances: dict) ->
     from_plane = np.zeros_like(offset) if net_test == "ball" else np.abs(offset)
     tests = {
         "catch time": _catch_time(case, held, ends),
-        "net": above(from_axis, radius[:, None], relative, ends),
+        "net": judging.above(from_axis, radius[:, None], relative, ends),
         "net plane": (from_plane > tolerances["contact"], from_plane, ends),
-        "angle": above(np.where(at_rest, 0.0, angle), widest[:, None], relative, ends),
+        "angle": judging.above(np.where(at_rest, 0.0, angle), widest[:, None], relative, ends),
     }
     measured = {
         "net_distance": np.where(held, distance, np.nan),
@@ -386,7 +366,8 @@ def _catch_time(case: dict, held: np.ndarray, ends: np.ndarray) -> tuple:
     after = np.where(held, 0.0, shortest).min(axis=1, keepdims=True)
     shortest = np.where(after < 0.0, np.minimum(shortest, after), shortest)
     off = np.maximum(np.abs(case["times"] - ends), ends - case["horizon"])
-    return (off > CONTACT_TIME_TOLERANCE) | (shortest <= 0.0), np.maximum(off, -shortest), ends
+    is_late = off > judging.CONTACT_TIME_TOLERANCE
+    return is_late | (shortest <= 0.0), np.maximum(off, -shortest), ends
 
 
 def _worst(test: tuple, held: np.ndarray) -> tuple:

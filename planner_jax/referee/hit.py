@@ -15,33 +15,14 @@ import functools
 
 import numpy as np
 
-from planner_jax.referee.judging import (
-    ABOVE_LIMIT,
-    CONTACT_TIME_TOLERANCE,
-    FlightVerdict,
-    above,
-    derivative,
-    finite_lanes,
-    first_failures,
-    judge_in_chunks,
-    read_leaves,
-)
-from planner_jax.referee.quadrotor import (
-    MOTION_SENTENCES,
-    MOTION_UNBOUNDED,
-    append_recovery,
-    intervals_of,
-    judge_motion,
-    pieces_of,
-    read_flight,
-)
+from planner_jax.referee import judging, quadrotor
 
 _SENTENCES = {
     "not finite": "the plan or its case is not finite",
     "contact time": "off by {excess:.3g} s; it must be positive, the end of the trajectory "
     "({time:.3f} s), and before the ball lands",
-    **MOTION_SENTENCES,
-    **{f"hitting speed {axis}": ABOVE_LIMIT for axis in "xyz"},
+    **quadrotor.MOTION_SENTENCES,
+    **{f"hitting speed {axis}": judging.ABOVE_LIMIT for axis in "xyz"},
     "contact": "the racket centre is {excess:.3g} m from the ball at {time:.3f} s",
     "wrong face": "the ball leaves the racket's face at {excess:.3g} m/s at {time:.3f} s",
     "apex low": "{excess:.2%} below the least apex at {time:.3f} s",
@@ -62,11 +43,11 @@ RIM = 0.9  # fraction of the racket's radius within which the ball must meet the
 
 
 @dataclasses.dataclass(frozen=True)
-class HitVerdict(FlightVerdict):
+class HitVerdict(judging.FlightVerdict):
     """Verdict on B plans in which a quadrotor hits a ball, with measurements of ball and impact."""
 
     SENTENCES = _SENTENCES
-    UNBOUNDED = MOTION_UNBOUNDED | {
+    UNBOUNDED = quadrotor.MOTION_UNBOUNDED | {
         "landing": "the ball never comes down to the target's height; its apex is at {time:.3f} s"
     }
 
@@ -117,9 +98,9 @@ def referee_hits(
     Raises:
         ValueError: an array has the wrong shape.
     """
-    leaves = read_flight(cases, plans)
-    leaves |= read_leaves(cases, _CASE_SHAPES, len(leaves["lane"]))
-    leaves |= read_leaves(plans, {"stroke.time": ()}, len(leaves["lane"]))
+    leaves = quadrotor.read_flight(cases, plans)
+    leaves |= judging.read_leaves(cases, _CASE_SHAPES, len(leaves["lane"]))
+    leaves |= judging.read_leaves(plans, {"stroke.time": ()}, len(leaves["lane"]))
     tolerances = {
         "relative": tolerance,
         "landing": landing_tolerance,
@@ -129,22 +110,23 @@ def referee_hits(
     judge = functools.partial(
         _judge,
         extras=cases.extras,
-        intervals=intervals_of(leaves["durations"].shape[1]),
+        intervals=quadrotor.intervals_of(leaves["durations"].shape[1]),
         drag_after_impact=drag_after_impact,
         tolerances=tolerances,
     )
-    return HitVerdict(**judge_in_chunks(judge, leaves, chunk=2048))
+    return HitVerdict(**judging.judge_in_chunks(judge, leaves, chunk=2048))
 
 
 def _judge(
     case: dict, extras: tuple, intervals: int, drag_after_impact: bool, tolerances: dict
 ) -> dict:
-    pieces = append_recovery(pieces_of(case["coeffs"], case["durations"]), case)
-    measured, tests = judge_motion(
+    pieces = quadrotor.append_recovery(quadrotor.pieces_of(case["coeffs"], case["durations"]), case)
+    measured, tests = quadrotor.judge_motion(
         pieces, case, extras, intervals, tolerances["relative"], tolerances["continuity"]
     )
     at_impact, impact_tests = _judge_impact(case, drag_after_impact, tolerances)
-    return first_failures(tests | impact_tests, LIMITS, finite_lanes(case)) | measured | at_impact
+    finite = judging.finite_lanes(case)
+    return judging.first_failures(tests | impact_tests, LIMITS, finite) | measured | at_impact
 
 
 def _ball_acc(vel: np.ndarray, drag: np.ndarray, gravity: np.ndarray) -> np.ndarray:
@@ -235,7 +217,7 @@ def _judge_impact(case: dict, drag_after_impact: bool, tolerances: dict) -> tupl
     for _ in range(_INCOMING_STEPS):
         state = _ball_step(state, end / _INCOMING_STEPS, drag, gravity)
     tail = case["coeffs"][:, -1].transpose(1, 2, 0)
-    pos, vel, normal = (derivative(tail, durations[:, -1], order) for order in range(3))
+    pos, vel, normal = (judging.derivative(tail, durations[:, -1], order) for order in range(3))
     normal[2] += gravity
     # Without thrust the racket's normal is zero. The ball's speed along it is then 0, so that the
     # test "wrong face", which requires a negative speed, fails.
@@ -274,13 +256,13 @@ def _impact_tests(case, measured, tolerances, end, apex_at, landing_at) -> dict:
     tests = {
         "contact": (~(contact <= widest), contact, end),
         "landing": (~(landing <= tolerances["landing"]), landing, landing_at),
-        "apex low": above(-measured["apex"], -lowest, relative, apex_at),
-        "apex high": above(measured["apex"], highest, relative, apex_at),
+        "apex low": judging.above(-measured["apex"], -lowest, relative, apex_at),
+        "apex high": judging.above(measured["apex"], highest, relative, apex_at),
     }
     for axis, name in enumerate("xyz"):
         speed = np.abs(measured["hitting_velocity"][:, axis])
         limit = case["hit_limits.hitting_speed"][:, axis]
-        tests[f"hitting speed {name}"] = above(speed, limit, relative, end)
+        tests[f"hitting speed {name}"] = judging.above(speed, limit, relative, end)
     return tests
 
 
@@ -291,4 +273,5 @@ def _contact_time(case: dict, end: np.ndarray, ball: np.ndarray) -> tuple:
     height = np.minimum(case["ball.pos"][:, 2], ball[2])
     grounded = np.maximum(-height, 0.0) / np.maximum(np.abs(ball[5]), 1e-3)
     excess = np.maximum(np.maximum(claim, -shortest), grounded)
-    return (claim > CONTACT_TIME_TOLERANCE) | (shortest <= 0.0) | (height <= 0.0), excess, end
+    is_late = claim > judging.CONTACT_TIME_TOLERANCE
+    return is_late | (shortest <= 0.0) | (height <= 0.0), excess, end

@@ -12,19 +12,8 @@ from collections.abc import Callable
 
 import numpy as np
 
+from planner_jax.referee import judging
 from planner_jax.referee.clearance import clearances
-from planner_jax.referee.judging import (
-    ABOVE_LIMIT,
-    CONTACT_TIME_TOLERANCE,
-    SMALLEST_LIMIT,
-    Verdict,
-    above,
-    check_leaf,
-    finite_lanes,
-    first_failures,
-    judge_in_chunks,
-    read_leaves,
-)
 
 _SENTENCES = {
     "not finite": "the plan or its case is not finite",
@@ -34,7 +23,7 @@ _SENTENCES = {
     "[m/s] or curvature [1/m]",
     "speed": "{excess:.2%} of its limit above it or below zero at {time:.3f} s",
     **dict.fromkeys(
-        ("acceleration", "curvature", "steering rate", "lateral acceleration"), ABOVE_LIMIT
+        ("acceleration", "curvature", "steering rate", "lateral acceleration"), judging.ABOVE_LIMIT
     ),
     "map": "the body's middle is {excess:.3g} m off the map at {time:.3f} s",
     "wall": "the body is {excess:.3g} m inside walls[{nearest_wall}] at {time:.3f} s",
@@ -55,7 +44,7 @@ _NODE, _WEIGHT = 0.5 * (_NODES[0] + 1.0), 0.5 * _NODES[1]
 
 
 @dataclasses.dataclass(frozen=True)
-class InterceptVerdict(Verdict):
+class InterceptVerdict(judging.Verdict):
     """Verdict on B plans in which a car drives to a moving target.
 
     Measurements are NaN where the inputs are not finite or the plan's time is not in (0, 3600] s. A
@@ -133,9 +122,9 @@ def referee_intercepts(
     # Very large numbers may overflow. The verdict reports them, so NumPy's warnings are off.
     with np.errstate(all="ignore"):
         where = (target_positions or target_positions_of)(target, times)
-    leaves["target"] = check_leaf("target_positions", where, (*times.shape, 2))
+    leaves["target"] = judging.check_leaf("target_positions", where, (*times.shape, 2))
     judge = functools.partial(_judge, relative=tolerance, contact=contact_tolerance)
-    return InterceptVerdict(**judge_in_chunks(judge, leaves, chunk=128))
+    return InterceptVerdict(**judging.judge_in_chunks(judge, leaves, chunk=128))
 
 
 _SHAPES: dict[str, tuple[int, ...]] = {
@@ -152,8 +141,8 @@ def _leaves(cases, plans) -> dict[str, np.ndarray]:
     if speed.ndim != 2 or speed.shape[1] < 2:
         raise ValueError(f"plan.speed must be (B, K + 1), K >= 1, got {speed.shape}")
     of_plan = {"start": (3,), "time": (), "curvature": speed.shape[1:], "speed": speed.shape[1:]}
-    leaves = read_leaves(plans, of_plan, len(speed), "plan.")
-    leaves |= read_leaves(cases, _SHAPES, len(speed))
+    leaves = judging.read_leaves(plans, of_plan, len(speed), "plan.")
+    leaves |= judging.read_leaves(cases, _SHAPES, len(speed))
     for name, group in (("walls", cases.walls), ("movers", cases.movers)):
         leaves |= _obstacle_leaves(name, group, len(speed))
     return leaves
@@ -164,9 +153,9 @@ def _obstacle_leaves(name: str, group, batch: int) -> dict[str, np.ndarray]:
     if corners.ndim != 4 or corners.shape[::3] != (batch, 2) or corners.shape[2] < 3:
         raise ValueError(f"{name}.corners must be ({batch}, N, V >= 3, 2), got {corners.shape}")
     shape = corners.shape[:2]
-    present = check_leaf(f"{name}.present", group.present, shape)
-    centre = check_leaf(f"{name}.centre", group.centre, (*shape, 2))
-    velocity = check_leaf(f"{name}.velocity", group.velocity, (*shape, 2))
+    present = judging.check_leaf(f"{name}.present", group.present, shape)
+    centre = judging.check_leaf(f"{name}.centre", group.centre, (*shape, 2))
+    velocity = judging.check_leaf(f"{name}.velocity", group.velocity, (*shape, 2))
     return {
         f"{name}.present": present,
         f"{name}.centre": np.where(present[..., None], centre, 0.0),
@@ -180,7 +169,8 @@ def target_positions_of(target: object, times: np.ndarray) -> np.ndarray:
     fields, batch = getattr(target, "__dict__", {}), times.shape
 
     def leaf(name: str, *trailing: int) -> np.ndarray:
-        return check_leaf(f"target.{name}", fields[name], batch + trailing).astype(np.float64)
+        array = judging.check_leaf(f"target.{name}", fields[name], batch + trailing)
+        return array.astype(np.float64)
 
     if fields.keys() >= {"path", "begin"}:
         return target_positions_of(fields["path"], leaf("begin") + times)
@@ -203,7 +193,7 @@ def target_positions_of(target: object, times: np.ndarray) -> np.ndarray:
 
 def _judge(case: dict, relative: float, contact: float) -> dict:
     end = case["plan.time"]
-    finite = finite_lanes(case, _UNBOUNDED)
+    finite = judging.finite_lanes(case, _UNBOUNDED)
     driven = finite & (end > 0.0) & (end <= LONGEST_PLAN)
     span = np.where(driven, end, 0.0) / (case["plan.speed"].shape[1] - 1)
     measured, tests = _judge_limits(case, span, relative)
@@ -222,14 +212,14 @@ def _judge(case: dict, relative: float, contact: float) -> dict:
     }
     late = end - np.minimum(case["time"], LONGEST_PLAN)
     tests["time"] = (
-        (late > CONTACT_TIME_TOLERANCE) | (finite & ~driven),
+        (late > judging.CONTACT_TIME_TOLERANCE) | (finite & ~driven),
         np.where(finite, np.maximum(late, -end), 0.0),
         end,
     )
     measured |= {"miss": miss, "meeting_time": end}
     for name, value in measured.items():
         measured[name] = np.where(driven, value, -1 if value.dtype.kind == "i" else np.nan)
-    return first_failures(tests, LIMITS, finite) | measured
+    return judging.first_failures(tests, LIMITS, finite) | measured
 
 
 def final_poses(plans, body) -> np.ndarray:
@@ -305,12 +295,12 @@ def _judge_limits(case: dict, span: np.ndarray, relative: float) -> tuple[dict, 
     measured = {f"max_{name.replace(' ', '_')}": value for name, (value, _) in peaks.items()}
     measured["rms_acceleration"] = np.sqrt(np.mean(rise**2, axis=1))
     tests = {
-        name: above(value, case[f"limits.{name.replace(' ', '_')}"], relative, time)
+        name: judging.above(value, case[f"limits.{name.replace(' ', '_')}"], relative, time)
         for name, (value, time) in peaks.items()
     }
     # The car may not drive backwards. A negative speed fails the test of the speed limit.
     limit = case["limits.speed"][:, None]
-    scale = np.where(np.isinf(limit), 1.0, np.maximum(limit, SMALLEST_LIMIT))
+    scale = np.where(np.isinf(limit), 1.0, np.maximum(limit, judging.SMALLEST_LIMIT))
     excess, when = _greatest(np.maximum(v - limit, -v) / scale, knots)
     tests["speed"] = (excess > relative, excess, when)
     return measured, tests

@@ -12,14 +12,7 @@ import numpy as np
 from jax import Array
 from jax.typing import ArrayLike, DTypeLike
 
-from planner_jax.core.checks import (
-    numbers_of,
-    numeric,
-    require_kind,
-    require_number,
-    require_switch,
-    shape_of,
-)
+from planner_jax.core import checks
 from planner_jax.core.choices import require_memory, require_size
 from planner_jax.core.errors import ArgumentError, ArgumentTypeError
 from planner_jax.core.protocol import Decision, Plan, take
@@ -34,12 +27,12 @@ def array_of(
 ) -> Array:
     """Return the argument `value` as an array of shape `batch + shape`; raise as `numbers_of`."""
     with np.errstate(over="ignore"):  # a number too large for `dtype` becomes infinite, no warning
-        return jnp.asarray(numbers_of(name, value, batch, shape), dtype)
+        return jnp.asarray(checks.numbers_of(name, value, batch, shape), dtype)
 
 
 def batch_of(name: str, vectors: object, *shape: int) -> tuple[int, ...]:
     """Return the batch shape of an argument: its leading axes, before the trailing `shape`."""
-    found = shape_of(name, vectors)
+    found = checks.shape_of(name, vectors)
     split = len(found) - len(shape)
     if split < 0 or found[split:] != shape:
         ends = ", ".join(map(str, shape))
@@ -105,11 +98,11 @@ def judge_by(
     settings: dict[str, object],
 ) -> VerdictT:
     """Check the arguments of a task's `judge` against `kinds`; return its referee's verdict."""
-    require_kind("cases", cases, kinds[0])
-    require_kind("plans", plans, kinds[1])
+    checks.require_kind("cases", cases, kinds[0])
+    checks.require_kind("plans", plans, kinds[1])
     require_settings(referee, settings)
     for leaf in jax.tree.leaves((cases, plans)):
-        if numeric(leaf) is None:
+        if checks.numeric(leaf) is None:
             raise ArgumentTypeError("cases and plans", "numbers", leaf, verb="hold")
     num = np.shape(plans.status)
     if num != cases.batch_shape:
@@ -134,8 +127,8 @@ def require_settings(referee: Callable[..., object], settings: dict[str, object]
             raise ArgumentTypeError(name, "a setting of the referee", value)
         match known[name].default:
             case bool():
-                require_switch(name, value)
+                checks.require_switch(name, value)
             case int():
                 require_size(name, value)
             case float():
-                require_number(name, value, NOT_NEGATIVE)
+                checks.require_number(name, value, NOT_NEGATIVE)

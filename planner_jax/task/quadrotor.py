@@ -9,33 +9,26 @@ from jax.core import Tracer
 from jax.typing import DTypeLike
 from jaxtyping import PyTree
 
+from planner_jax.core import rules
 from planner_jax.core.checks import numbers_of
 from planner_jax.core.errors import ArgumentError, ArgumentTypeError
-from planner_jax.core.rules import (
-    NOT_NEGATIVE,
-    POSITIVE,
-    POSITIVE_OR_NONE,
-    Field,
-    Table,
-    below,
-    require_rule,
-)
+from planner_jax.core.rules import Field, Table
 from planner_jax.robot.quadrotor import QuadrotorLimits, RotorLimits
 from planner_jax.robot.quadrotor_model import NET, QuadrotorModel, Tool
 
 # Shapes and ranges of the quadrotor's limits, for the cases of hits and of catches.
 FLIGHT_RULES: Table = (
-    Field("limits.speed", (), POSITIVE),
-    Field("limits.body_rate", (), POSITIVE),
-    Field("limits.acceleration", (), POSITIVE),
-    Field("limits.min_thrust", (), NOT_NEGATIVE),
-    Field("limits.min_thrust", (), below("limits.max_thrust")),
-    Field("limits.max_thrust", (), POSITIVE_OR_NONE),
-    Field("limits.rotors.mass", (), POSITIVE),
-    Field("limits.rotors.inertia", (3,), POSITIVE),
+    Field("limits.speed", (), rules.POSITIVE),
+    Field("limits.body_rate", (), rules.POSITIVE),
+    Field("limits.acceleration", (), rules.POSITIVE),
+    Field("limits.min_thrust", (), rules.NOT_NEGATIVE),
+    Field("limits.min_thrust", (), rules.below("limits.max_thrust")),
+    Field("limits.max_thrust", (), rules.POSITIVE_OR_NONE),
+    Field("limits.rotors.mass", (), rules.POSITIVE),
+    Field("limits.rotors.inertia", (3,), rules.POSITIVE),
     Field("limits.rotors.mixer", (4, 4)),
-    Field("limits.rotors.min_thrust", (), NOT_NEGATIVE),
-    Field("limits.rotors.min_thrust", (), below("limits.rotors.max_thrust")),
+    Field("limits.rotors.min_thrust", (), rules.NOT_NEGATIVE),
+    Field("limits.rotors.min_thrust", (), rules.below("limits.rotors.max_thrust")),
     Field("limits.rotors.max_thrust", ()),
 )
 
@@ -74,7 +67,8 @@ def require_start(cases: PyTree) -> None:
     if any(isinstance(each, Tracer) for each in heights):
         return
     height, least = map(np.asarray, heights)
-    require_rule("start", height, height >= least, "at a height >= min_height", cases.batch_shape)
+    words = "at a height >= min_height"
+    rules.require_rule("start", height, height >= least, words, cases.batch_shape)
 
 
 def require_own_robot(robot: object, usual: QuadrotorModel, suite: str) -> None:

@@ -37,12 +37,7 @@ from jaxtyping import Bool, Float, PyTree
 
 from planner_jax.core.arithmetic import reciprocal
 from planner_jax.core.errors import ArgumentError
-from planner_jax.trajectory.polynomial import (
-    Motion,
-    PiecewisePolynomial,
-    derivative_factors,
-    energy_form,
-)
+from planner_jax.trajectory import polynomial
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -75,7 +70,7 @@ class ProportionalMinco:
         h^derivative for a mean piece duration h.
         """
         degree = 2 * self.order - 1
-        factors = derivative_factors(degree, derivative)
+        factors = polynomial.derivative_factors(degree, derivative)
         powers = np.maximum(np.arange(degree + 1) - derivative, 0)
         times = self.proportions[:, None] * np.arange(nodes + 1) / nodes
         basis = factors * times[..., None] ** powers  # (M, nodes + 1, 2s)
@@ -90,7 +85,7 @@ def _hermite_map(order: int) -> np.ndarray:
     ends = np.zeros((size, size))
     for d in range(order):
         ends[d, d] = math.factorial(d)
-        ends[order + d] = derivative_factors(size - 1, d)
+        ends[order + d] = polynomial.derivative_factors(size - 1, d)
     return np.linalg.inv(ends)
 
 
@@ -98,7 +93,7 @@ def _hermite_map(order: int) -> np.ndarray:
 def _hermite_energy(order: int) -> np.ndarray:
     """Return the integral of |p^(order)|^2 over [0, 1], a quadratic form in p's end derivatives."""
     hermite = _hermite_map(order)
-    return hermite.T @ energy_form(2 * order - 1, order)[0] @ hermite
+    return hermite.T @ polynomial.energy_form(2 * order - 1, order)[0] @ hermite
 
 
 def _energy(coefficients: np.ndarray, shares: np.ndarray) -> np.ndarray:
@@ -110,7 +105,7 @@ def _energy(coefficients: np.ndarray, shares: np.ndarray) -> np.ndarray:
     motion far from the origin.
     """
     s = coefficients.shape[1] // 2
-    root = np.linalg.cholesky(energy_form(2 * s - 1, s)[0][s:, s:]).T
+    root = np.linalg.cholesky(polynomial.energy_form(2 * s - 1, s)[0][s:, s:]).T
     parts = root @ coefficients[:, s:] / np.sqrt(shares[:, None, None] ** (2 * s - 1))
     return np.einsum("mkb,mkc->bc", parts, parts)
 
@@ -194,7 +189,7 @@ def boundary_rows(head_state: Array, tail_state: Array, piece_duration: Array) -
 
 def sample_motion(
     maps: ProportionalMinco, nodes: int, columns: Array, piece_duration: Array, orders: int = 4
-) -> Motion:
+) -> polynomial.Motion:
     """Sample position, velocity, acceleration and jerk at `nodes` intervals of each piece.
 
     Args:
@@ -209,7 +204,7 @@ def sample_motion(
 
 
 def by_pieces(
-    function: Callable[[Motion, Array], PyTree],
+    function: Callable[[polynomial.Motion, Array], PyTree],
     maps: ProportionalMinco,
     nodes: int,
     columns: Array,
@@ -232,7 +227,7 @@ def by_pieces(
     return lax.map(of_piece, (matrices, shares))
 
 
-def _motion(matrices: Array, columns: Array, piece_duration: Array) -> Motion:
+def _motion(matrices: Array, columns: Array, piece_duration: Array) -> polynomial.Motion:
     # One matrix product computes all derivatives, because on a CPU a call takes longer than its
     # arithmetic. The matrix is the left factor, so that a batch adds columns to the right factor.
     orders = matrices.shape[0]
@@ -244,7 +239,7 @@ def _motion(matrices: Array, columns: Array, piece_duration: Array) -> Motion:
     rates = jnp.stack([*rates, rates[2] * rates[2]][:orders])
     pos, vel, acc, jerk, *snap = unit * rates[:, None, None]
     parts: dict[str, Array] = {"snap": snap[0]} if snap else {}
-    return Motion(height=pos[:, 2], vel=vel, acc=acc, jerk=jerk, pos=pos, **parts)
+    return polynomial.Motion(height=pos[:, 2], vel=vel, acc=acc, jerk=jerk, pos=pos, **parts)
 
 
 def trajectory_energy(maps: ProportionalMinco, rows: Array, offsets: Array, piece_duration: Array):
@@ -297,7 +292,7 @@ def _by_rows(maps: ProportionalMinco, rows: Array) -> Array:
 
 def proportional_trajectory(
     maps: ProportionalMinco, rows: Array, offsets: Array, piece_duration: Array
-) -> PiecewisePolynomial:
+) -> polynomial.PiecewisePolynomial:
     """Return the trajectory of boundary rows (scaled end states) and whitened waypoint offsets."""
     unit = jnp.einsum(
         "mkc,ci->mki",
@@ -306,7 +301,7 @@ def proportional_trajectory(
         precision=lax.Precision.HIGHEST,
     )
     powers = piece_duration ** jnp.arange(2 * maps.order, dtype=jnp.result_type(piece_duration))
-    return PiecewisePolynomial(
+    return polynomial.PiecewisePolynomial(
         coeffs=unit / powers[None, :, None],
         durations=piece_duration * jnp.asarray(maps.proportions, rows.dtype),
     )
@@ -338,7 +333,7 @@ def chain_rows(
 
 def chain_trajectory(
     maps: ProportionalMinco, chain: Chain, active: Bool[Array, " N"]
-) -> PiecewisePolynomial:
+) -> polynomial.PiecewisePolynomial:
     """Join N segments of M pieces each; the pieces of inactive segments have a duration of 0 s."""
     build = functools.partial(proportional_trajectory, maps)
     pieces = jax.vmap(build)(chain.rows, chain.offsets, chain.piece_durations)
@@ -347,6 +342,6 @@ def chain_trajectory(
     still = jnp.zeros_like(pieces.coeffs).at[:, :, 0].set(last)
     coeffs = jnp.where(active[:, None, None, None], pieces.coeffs, still)
     durations = jnp.where(active[:, None], pieces.durations, 0.0)
-    return PiecewisePolynomial(
+    return polynomial.PiecewisePolynomial(
         coeffs=coeffs.reshape(-1, *coeffs.shape[2:]), durations=durations.ravel()
     )

@@ -10,17 +10,10 @@ from jax import Array
 from numpy.typing import ArrayLike, DTypeLike
 
 from planner_jax.ball.flight import BallState
+from planner_jax.core import rules
 from planner_jax.core.checks import floating, require_kind, require_switch, shape_of
 from planner_jax.core.registry import require_name
-from planner_jax.core.rules import (
-    NOT_NEGATIVE,
-    POSITIVE,
-    Field,
-    Table,
-    below,
-    require_sound,
-    within,
-)
+from planner_jax.core.rules import Field, Table, require_sound
 from planner_jax.robot.arm import REGIMES, Arm, ArmLimits
 from planner_jax.robot.arm_mjcf import irb1600
 from planner_jax.task.arguments import array_of, batch_of
@@ -31,30 +24,30 @@ from planner_jax.task.block.scene import Scene, paper_scene
 RULES: Table = (
     Field("ball.pos", (3,)),
     Field("ball.vel", (3,)),
-    Field("gravity", (), POSITIVE),
-    Field("delay", (), NOT_NEGATIVE),
+    Field("gravity", (), rules.POSITIVE),
+    Field("delay", (), rules.NOT_NEGATIVE),
     Field("angles", (6,)),
     Field("rates", (6,)),
-    Field("arm.lower", (6,), below("arm.upper")),
+    Field("arm.lower", (6,), rules.below("arm.upper")),
     Field("arm.upper", (6,)),
-    Field("arm.mass", (6,), POSITIVE),
-    Field("arm.capsule_radius", ("C",), NOT_NEGATIVE),
-    Field("arm.shield_half", (), POSITIVE),
-    Field("limits.velocity", (6,), POSITIVE),
-    Field("limits.acceleration", (6,), POSITIVE),
+    Field("arm.mass", (6,), rules.POSITIVE),
+    Field("arm.capsule_radius", ("C",), rules.NOT_NEGATIVE),
+    Field("arm.shield_half", (), rules.POSITIVE),
+    Field("limits.velocity", (6,), rules.POSITIVE),
+    Field("limits.acceleration", (6,), rules.POSITIVE),
     Field("ends_at_rest", (), kind=np.bool_),
-    Field("offset", (), POSITIVE),
-    Field("tilt", (), within(0.0, np.pi, "in [0, pi]")),
-    Field("scene.inner.lower", (3,), below("scene.inner.upper")),
+    Field("offset", (), rules.POSITIVE),
+    Field("tilt", (), rules.within(0.0, np.pi, "in [0, pi]")),
+    Field("scene.inner.lower", (3,), rules.below("scene.inner.upper")),
     Field("scene.inner.upper", (3,)),
-    Field("scene.outer.lower", (3,), below("scene.outer.upper")),
+    Field("scene.outer.lower", (3,), rules.below("scene.outer.upper")),
     Field("scene.outer.upper", (3,)),
     Field("scene.pole", (2,)),
-    Field("scene.pole_radius", (), NOT_NEGATIVE),
+    Field("scene.pole_radius", (), rules.NOT_NEGATIVE),
     Field("scene.has_pole", (), kind=np.bool_),
     Field("scene.floor", ()),
     Field("scene.beam_ends", ("N", 2, 3)),
-    Field("scene.beam_radius", ("N",), NOT_NEGATIVE),
+    Field("scene.beam_radius", ("N",), rules.NOT_NEGATIVE),
 )
 
 

@@ -17,19 +17,7 @@ import numpy as np
 from jax import Array, lax
 
 from planner_jax.robot.arm import Arm, link_frames
-from planner_jax.space.distances import (
-    approach,
-    cross,
-    dot,
-    lowest_of_rectangle,
-    lowest_of_segment,
-    nearest_points,
-    rectangle_to_vertical_line,
-    segment_to_box,
-    segment_to_rectangle,
-    segment_to_segment,
-    segment_to_vertical_line,
-)
+from planner_jax.space import distances as space
 from planner_jax.task.block.scene import Scene
 
 FAR = 10.0  # [m], added to the distances from the pole if the scene has no pole
@@ -88,7 +76,7 @@ def clearances_and_slopes(
     """
     poses = _poses(arm, angles)
     every = _pairs(arm, scene, poses)
-    found = [nearest_points(pairs.measure, *pairs.bodies) for pairs in every]
+    found = [space.nearest_points(pairs.measure, *pairs.bodies) for pairs in every]
     distances = [each - pairs.thick for (each, _), pairs in zip(found, every, strict=True)]
     joint = np.arange(6)[:, None]
 
@@ -99,12 +87,12 @@ def clearances_and_slopes(
         # A joint turns about the axis a through the point o. The derivative of a distance along the
         # unit vector n at the point p is  a . ((p - o) x n), and  a . (o x n) = (a x o) . n.
         axes, origins = (tuple(jnp.moveaxis(at(each), 1, 0)[:, None]) for each in poses[3:])
-        arms = cross(axes, origins)  # 3 times (1, 6, W)
+        arms = space.cross(axes, origins)  # 3 times (1, 6, W)
         slopes = []
         for (_, nearest), pairs in zip(found, every, strict=True):
-            line = approach(pairs.measure, *jax.tree.map(at, (nearest, *pairs.bodies)))
+            line = space.approach(pairs.measure, *jax.tree.map(at, (nearest, *pairs.bodies)))
             direction, moment = (tuple(each[:, None] for each in vector) for vector in line)
-            slope = dot(axes, moment) - dot(arms, direction)  # (P, 6, W)
+            slope = space.dot(axes, moment) - space.dot(arms, direction)  # (P, 6, W)
             of_link, of_fixed = (np.reshape(each, (-1, 1, 1)) for each in (pairs.link, pairs.fixed))
             between = (joint > of_fixed) & (joint <= of_link)
             slopes.append(jnp.where(between, slope if pairs.first else -slope, 0.0))
@@ -174,7 +162,7 @@ def _pairs(arm: Arm, scene: Scene, poses: _Poses) -> list[_Pairs]:
 
     wrist = jnp.sqrt(jnp.sum((arm.origin[5] + arm.shield_centre) ** 2))
     thin = jnp.where(link[before] == 3, jnp.minimum(radius[before], _FORK * wrist), radius[before])
-    near_radius = jnp.concatenate([thin, scene.beam_radius])[:, None] + _HALF_THICKNESS
+    near_to = jnp.concatenate([thin, scene.beam_radius])[:, None] + _HALF_THICKNESS
     # Pairs of links 3 to 6 with link 1, the trunk, and of links 1 to 6 with the beams. Link 2 is
     # not paired with the trunk, because a joint connects both.
     fixed = with_beams(trunk)
@@ -182,28 +170,28 @@ def _pairs(arm: Arm, scene: Scene, poses: _Poses) -> list[_Pairs]:
     moving, fixture = np.array([(k, j) for k, j in every if j >= len(trunk) or k in far]).T
     against = fixed[:, :, fixture]
     fixed_radius = jnp.concatenate([radius[trunk], scene.beam_radius])
-    among_radius = (radius[moving] + fixed_radius[fixture])[:, None]
+    between = (radius[moving] + fixed_radius[fixture])[:, None]
     of_fixed = np.where(fixture < len(trunk), 0, -1)
     near, (lower, upper) = with_beams(before), jnp.asarray(arm.base_box)
     of_near = np.append(link[before], np.full(num_beams, -1))
     pole = jnp.where(scene.has_pole, scene.pole_radius, -FAR)
-    thick, plate, shield = radius[:, None], (middle, edges), _SHIELD_LINK
+    thick, plate, shield, half = radius[:, None], (middle, edges), _SHIELD_LINK, _HALF_THICKNESS
     to_pole = thick[turning] + pole
 
     # Pairs of the base's box with the capsules of links 3 to 6 and with the shield's edges.
     boxed = jnp.concatenate([poses.ends[:, :, swung], outline], axis=2)
-    boxed_radius = jnp.concatenate([thick[swung], jnp.full((4, 1), _HALF_THICKNESS, thick.dtype)])
+    boxed_radius = jnp.concatenate([thick[swung], jnp.full((4, 1), half, thick.dtype)])
     boxed_link = np.append(link[swung], np.full(4, shield))
 
     def ends(index: np.ndarray) -> Array:
         return poses.ends[:, :, index]
 
     return [
-        _Pairs(segment_to_vertical_line, (ends(turning), scene.pole), to_pole, link[turning]),
-        _Pairs(rectangle_to_vertical_line, (*plate, scene.pole), _HALF_THICKNESS + pole, shield),
-        _Pairs(segment_to_segment, (ends(moving), against), among_radius, link[moving], of_fixed),
-        _Pairs(segment_to_rectangle, (near, *plate), near_radius, shield, of_near, first=False),
-        _Pairs(lowest_of_segment, (ends(swung),), thick[swung] + scene.floor, link[swung]),
-        _Pairs(lowest_of_rectangle, plate, _HALF_THICKNESS + scene.floor, shield),
-        _Pairs(segment_to_box, (boxed, lower, upper), boxed_radius, boxed_link),
+        _Pairs(space.segment_to_vertical_line, (ends(turning), scene.pole), to_pole, link[turning]),
+        _Pairs(space.rectangle_to_vertical_line, (*plate, scene.pole), half + pole, shield),
+        _Pairs(space.segment_to_segment, (ends(moving), against), between, link[moving], of_fixed),
+        _Pairs(space.segment_to_rectangle, (near, *plate), near_to, shield, of_near, first=False),
+        _Pairs(space.lowest_of_segment, (ends(swung),), thick[swung] + scene.floor, link[swung]),
+        _Pairs(space.lowest_of_rectangle, plate, half + scene.floor, shield),
+        _Pairs(space.segment_to_box, (boxed, lower, upper), boxed_radius, boxed_link),
     ]

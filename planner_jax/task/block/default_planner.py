@@ -32,20 +32,11 @@ from planner_jax.core.protocol import (
     select_first_solved,
     status_of,
 )
-from planner_jax.optimise.levenberg import (
-    LevenbergConfig,
-    LevenbergState,
-    Model,
-    continue_search,
-    least_squares,
-    start_search,
-)
+from planner_jax.optimise import levenberg
+from planner_jax.optimise.levenberg import LevenbergConfig, LevenbergState, Model, continue_search
+from planner_jax.task.block import motion
 from planner_jax.task.block.case import BlockCase
-from planner_jax.task.block.clearance import (
-    clearances_and_slopes,
-    least_clearances,
-    num_of_pole,
-)
+from planner_jax.task.block.clearance import clearances_and_slopes, least_clearances, num_of_pole
 from planner_jax.task.block.end_poses import (
     EndPoses,
     Flight,
@@ -54,16 +45,6 @@ from planner_jax.task.block.end_poses import (
     contact_terms,
     end_poses,
     flight_of,
-)
-from planner_jax.task.block.motion import (
-    Weights,
-    angles_at,
-    bump_steps,
-    joint_terms,
-    lift_to_unknowns,
-    polynomial,
-    speed_up,
-    step_weights,
 )
 from planner_jax.task.block.plan import BlockPlan, explain_status, make_empty_plan
 
@@ -155,7 +136,7 @@ class OnlineBlock(Planner):
     # straight motion is selected: the arm then waits for the ball. Otherwise the arm moves until
     # the contact, which needs less torque.
     brisk: bool = False
-    weights: Weights = Weights()
+    weights: motion.Weights = motion.Weights()
     searches: tuple[Search, ...] = _SEARCHES
 
     def __post_init__(self) -> None:
@@ -203,22 +184,15 @@ class OnlineBlock(Planner):
             index = jnp.where(is_new, index, jnp.argmin(costs))
             start = self._encode_start(case, poses, order, attempt.first + index)
             straight_start = self.encode_straight(case, poses, order[k])
-            begin = start_search(jnp.where(is_straight, straight_start, start), solver)
-            search = jax.tree.map(
-                lambda new, old: jnp.where(is_new, new, old[index]), begin, searches
-            )
-            most = jnp.where(is_trial, solver.trial, solver.max_steps)
-            search = continue_search(model, search, solver, jnp.where(is_straight, -1, most))
+            begin = levenberg.start_search(jnp.where(is_straight, straight_start, start), solver)
+            pick = lambda new, old: jnp.where(is_new, new, old[index])  # noqa: E731
+            search = jax.tree.map(pick, begin, searches)
+            most = jnp.where(is_straight, -1, jnp.where(is_trial, solver.trial, solver.max_steps))
+            search = continue_search(model, search, solver, most)
             searches = jax.tree.map(lambda old, new: old.at[index].set(new), searches, search)
             costs = costs.at[index].set(jnp.where(is_trial, _trial_cost(search, solver), jnp.inf))
-            plan = lax.cond(
-                is_trial,
-                lambda search: best,
-                lambda search: self.finish(
-                    case, flight, search.point, jnp.maximum(search.steps, 0)
-                ),
-                search,
-            )
+            finish = lambda s: self.finish(case, flight, s.point, jnp.maximum(s.steps, 0))  # noqa: E731
+            plan = lax.cond(is_trial, lambda _: best, finish, search)
             return k + 1, searches, costs, select(plan, best)
 
         def is_open(turn: tuple[Array, LevenbergState, Array, BlockPlan]) -> Array:
@@ -227,7 +201,7 @@ class OnlineBlock(Planner):
             return (k < straight + tries + kept) & (compares | ~is_solved(best.status))
 
         num, dtype = len(read_learned_starts()[0]), case.angles.dtype
-        empty = start_search(jnp.zeros(6 * self.pieces + 1, dtype), solver)
+        empty = levenberg.start_search(jnp.zeros(6 * self.pieces + 1, dtype), solver)
         searches = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (num, *leaf.shape)), empty)
         costs, best = jnp.full(num, jnp.inf, dtype), make_empty_plan(case, self.pieces)
         turn = (jnp.zeros((), jnp.int32), searches, costs, best)
@@ -257,7 +231,7 @@ class OnlineBlock(Planner):
         def try_group(number: Array, best: BlockPlan) -> BlockPlan:
             index = _GROUP * number + jnp.arange(_GROUP)
             encode = functools.partial(self._encode_start, case, poses, order)
-            begin = lambda k: start_search(encode(attempt.first + k), solver)  # noqa: E731
+            begin = lambda k: levenberg.start_search(encode(attempt.first + k), solver)  # noqa: E731
 
             def take_turn(turn: Array, searches: LevenbergState) -> LevenbergState:
                 is_trial = turn < _GROUP // _WIDTH
@@ -312,14 +286,14 @@ class OnlineBlock(Planner):
         ranks, bumps = (jnp.asarray(each) for each in read_learned_starts())
         k = jnp.minimum(k, len(ranks) - 1)
         point = self.encode_straight(case, poses, order[ranks[k]])
-        bump = bump_steps(bumps[k].astype(point.dtype), self.pieces)
+        bump = motion.bump_steps(bumps[k].astype(point.dtype), self.pieces)
         return point.at[:-1].add(bump.reshape(-1))
 
     def refine(
         self, case: BlockCase, flight: Flight, start: Array, solver: LevenbergConfig
     ) -> BlockPlan:
         """Return the plan that least squares find from the unknowns `start`."""
-        end = least_squares(lambda point: self.model(point, case, flight), start, solver)
+        end = levenberg.least_squares(lambda point: self.model(point, case, flight), start, solver)
         return self.finish(case, flight, end.point, end.steps)
 
     def encode_straight(self, case: BlockCase, poses: EndPoses, index: Array) -> Array:
@@ -351,10 +325,10 @@ class OnlineBlock(Planner):
         """
         steps, first, duration = self.decode(case, point)
         pieces, dtype = self.pieces, point.dtype
-        joints = joint_terms(case, steps, first, duration, self.weights, 1.0 - self.slack)
+        joints = motion.joint_terms(case, steps, first, duration, self.weights, 1.0 - self.slack)
         # Derivatives are computed at the end and at the samples with the least distances.
         shares = tuple(np.arange(1, self.samples + 1) / self.samples)
-        angles = angles_at(case.angles, first, steps, shares)
+        angles = motion.angles_at(case.angles, first, steps, shares)
         gaps, slopes_at = clearances_and_slopes(case.arm, case.scene, angles)
         gaps = lax.optimization_barrier(gaps)  # (R, S)
         is_of_pole = np.arange(gaps.shape[0]) < num_of_pole(case.arm)
@@ -376,11 +350,12 @@ class OnlineBlock(Planner):
         push = jnp.matmul(row_slopes.T, rows, precision=_HIGHEST)
         grams = jnp.concatenate([grams, gram[None]])
         pushes = jnp.concatenate([pushes, push[None]])
-        of_first, of_steps = (jnp.asarray(each, dtype) for each in step_weights(pieces, shares))
+        weights = motion.step_weights(pieces, shares)
+        of_first, of_steps = (jnp.asarray(each, dtype) for each in weights)
         chosen = jnp.append(worst, self.samples - 1)
         lift = of_steps[chosen]  # (W + 1, K)
         drift = of_first[chosen][:, None] * case.rates[None]  # (W + 1, 6)
-        gradient, curvature = lift_to_unknowns(lift, drift, grams, pushes, joints)
+        gradient, curvature = motion.lift_to_unknowns(lift, drift, grams, pushes, joints)
         size = 6 * pieces
         ends_free = jnp.where(case.ends_at_rest, 0.0, 1.0)
         free = jnp.ones(size + 1, dtype).at[size - 6 : size].set(ends_free)
@@ -398,23 +373,24 @@ class OnlineBlock(Planner):
         `steps` is the number of steps of least squares that led to the unknowns.
         """
         moves, first, duration = self.decode(case, point)
-        joints = joint_terms(case, moves, first, duration, self.weights, 1.0 - self.slack).excess
+        joints = motion.joint_terms(case, moves, first, duration, self.weights, 1.0 - self.slack)
         # The start and all samples except the first after it are checked. On a GPU, the check of
         # one more sample would take a third longer.
         shares = (0.0, *(np.arange(min(2, self.checked), self.checked + 1) / self.checked))
-        angles = angles_at(case.angles, first, moves, shares)
+        angles = motion.angles_at(case.angles, first, moves, shares)
         gaps = least_clearances(case.arm, case.scene, angles)
         # A joint may exceed its position limit between two knots and turn back: check all samples.
         middle = 0.5 * (case.arm.upper + case.arm.lower)
         half = 0.5 * (case.arm.upper - case.arm.lower)
-        joints = jnp.maximum(joints, jnp.max(jnp.abs(angles - middle[None]) / half[None]) - 1.0)
+        beyond = jnp.max(jnp.abs(angles - middle[None]) / half[None]) - 1.0
         contact = contact_terms(case, flight, angles[-1], point[-1], self.weights)[2]
-        excess = _combine_excess(joints, contact, self.margin - jnp.min(gaps[1:]))
+        joint_excess = jnp.maximum(joints.excess, beyond)
+        excess = _combine_excess(joint_excess, contact, self.margin - jnp.min(gaps[1:]))
         violation = jnp.where(point[-1] > case.delay, excess, jnp.inf)
         status = status_of(duration, violation, violation > FEASIBILITY_TOLERANCE)
         is_blocked = (gaps[0] < 0.0) & ~is_solved(status)  # the arm touches something at the start
         plan = BlockPlan(
-            motion=polynomial(case.angles, first, moves, duration),
+            motion=motion.polynomial(case.angles, first, moves, duration),
             contact_time=point[-1],
             cost=duration,
             violation=violation,
@@ -423,10 +399,11 @@ class OnlineBlock(Planner):
         )
         if not self.brisk:
             return plan
-        limits, most = case.limits, 1.0 - self.slack
-        motion, pace = speed_up(plan.motion, most * limits.velocity, most * limits.acceleration)
+        most = 1.0 - self.slack
+        rate, rise = most * case.limits.velocity, most * case.limits.acceleration
+        path, pace = motion.speed_up(plan.motion, rate, rise)
         rests = is_solved(plan.status) & case.ends_at_rest & jnp.all(case.rates == 0.0)
-        quick = dataclasses.replace(plan, motion=motion, cost=pace * plan.cost)
+        quick = dataclasses.replace(plan, motion=path, cost=pace * plan.cost)
         return jax.tree.map(lambda new, old: jnp.where(rests, new, old), quick, plan)
 
 

@@ -9,16 +9,8 @@ from jax.typing import DTypeLike
 
 from planner_jax.core.registry import suite_named
 from planner_jax.task.arguments import make_generators
+from planner_jax.task.block import scene
 from planner_jax.task.block.case import BlockCase, case
-from planner_jax.task.block.scene import (
-    INNER_HALF,
-    INNER_HEIGHT,
-    OUTER_HALF,
-    OUTER_HEIGHT,
-    POLE,
-    POLE_RADIUS,
-    paper_scene,
-)
 from planner_jax.task.block.spec import SUITES, TASK, Suite
 
 GRAVITY = 9.81  # [m/s^2]
@@ -60,7 +52,7 @@ def draw(
         regime=regime,
         wide=wide,
         anywhere=anywhere,
-        scene=paper_scene(has_pole=own.has_pole),
+        scene=scene.paper_scene(has_pole=own.has_pole),
         dtype=dtype,
     )
 
@@ -73,12 +65,12 @@ def _draw_throw(suite: Suite, random: np.random.Generator) -> np.ndarray:
             [distance * np.cos(azimuth), distance * np.sin(azimuth), random.uniform(*HEIGHT)]
         )
         duration = distance / random.uniform(*SPEED)
-        sides = [(0, 1.0)] + [(1, side) for side in (1.0, -1.0) if side * pos[1] > INNER_HALF]
+        sides = [(0, 1.0)] + [(1, side) for side in (1.0, -1.0) if side * pos[1] > scene.INNER_HALF]
         axis, side = sides[random.integers(len(sides))]
         aim = np.empty(3)
-        aim[axis] = side * INNER_HALF
-        aim[1 - axis] = random.uniform(-INNER_HALF, INNER_HALF)
-        aim[2] = random.uniform(0.0, INNER_HEIGHT)
+        aim[axis] = side * scene.INNER_HALF
+        aim[1 - axis] = random.uniform(-scene.INNER_HALF, scene.INNER_HALF)
+        aim[2] = random.uniform(0.0, scene.INNER_HEIGHT)
         vel = (aim - pos) / duration
         vel[2] += 0.5 * GRAVITY * duration
         if _is_valid(suite, pos, vel, duration):
@@ -91,14 +83,14 @@ def _is_valid(suite: Suite, pos: np.ndarray, vel: np.ndarray, duration: float) -
     path = pos + vel * times[:, None]
     path[:, 2] -= 0.5 * GRAVITY * times**2
     if suite.has_pole:
-        if np.linalg.norm(path[:, :2] - POLE, axis=1).min() < POLE_RADIUS + BALL_RADIUS:
+        if np.linalg.norm(path[:, :2] - scene.POLE, axis=1).min() < scene.POLE_RADIUS + BALL_RADIUS:
             return False
 
     def within(half: float, height: float) -> np.ndarray:
         return (np.abs(path[:, :2]) < half).all(axis=1) & (path[:, 2] > 0.0) & (path[:, 2] < height)
 
-    outer = within(OUTER_HALF, OUTER_HEIGHT)
-    if not outer.any() or within(INNER_HALF, INNER_HEIGHT).any():
+    outer = within(scene.OUTER_HALF, scene.OUTER_HEIGHT)
+    if not outer.any() or within(scene.INNER_HALF, scene.INNER_HEIGHT).any():
         return False
     entered = int(outer.argmax())
     # The ball has to stay in the outer box after its entry, and must not enter from below: the

@@ -19,15 +19,8 @@ from planner_jax.core.rules import PERMUTATION, POSITIVE, Field, Rule, Table, re
 from planner_jax.cost.extras import Extra, for_batch
 from planner_jax.robot.quadrotor import QuadrotorLimits
 from planner_jax.robot.quadrotor_model import NET, PAPER_CATCHER, QuadrotorModel
+from planner_jax.task import quadrotor
 from planner_jax.task.arguments import array_of
-from planner_jax.task.quadrotor import (
-    ARGUMENTS,
-    FLIGHT_RULES,
-    hover_at,
-    limits_of,
-    require_start,
-    require_tool,
-)
 
 
 def _is_ahead(horizon: Numbers, case: PyTree) -> Numbers:
@@ -45,13 +38,13 @@ RULES: Table = (
     Field("net.height", ()),
     Field("net.radius", (), POSITIVE),
     Field("net.max_angle", (), within(0.0, np.pi, "in [0, pi]")),
-    *FLIGHT_RULES,
+    *quadrotor.FLIGHT_RULES,
     Field("limits.min_height", ()),
 )
 GRAVITY = 9.81  # [m/s^2]
 START = (0.0, 0.0, 1.0)  # [m], hover position of the quadrotor
 _ARGUMENTS = {
-    **ARGUMENTS,
+    **quadrotor.ARGUMENTS,
     **{f"net.{name}": f"net_{name}" for name in ("height", "radius")},
     "net.max_angle": "max_angle",
 }
@@ -163,7 +156,7 @@ def case(
         return array_of(name, value, batch, trailing, dtype)
 
     require_path("targets", targets, shape, 3, "horizon")
-    tool = require_tool(robot, NET)
+    tool = quadrotor.require_tool(robot, NET)
     shares = np.arange(1, num + 1) / (num + 1.0)
     cases = CatchCase(
         targets=targets,
@@ -171,14 +164,14 @@ def case(
         horizon=leaf("horizon", horizon, num),
         order=jnp.asarray(np.broadcast_to(np.arange(num), shape), jnp.int32),
         times=leaf("horizon", shares * np.asarray(horizon)[..., :1], num),
-        head_state=hover_at(start, batch, dtype),
+        head_state=quadrotor.hover_at(start, batch, dtype),
         gravity=leaf("gravity", gravity),
         net=Net(
             height=leaf("net_height", tool.height if net_height is None else net_height),
             radius=leaf("net_radius", tool.radius if net_radius is None else net_radius),
             max_angle=leaf("max_angle", tool.max_angle if max_angle is None else max_angle),
         ),
-        limits=limits_of(
+        limits=quadrotor.limits_of(
             robot,
             leaf,
             speed=speed,
@@ -191,7 +184,7 @@ def case(
         optional=optional,
     )
     require_sound(cases, _ARGUMENTS)
-    require_start(cases)
+    quadrotor.require_start(cases)
     return cases
 
 

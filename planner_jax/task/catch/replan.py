@@ -25,19 +25,14 @@ from planner_jax.task.catch.case import CatchCase
 from planner_jax.task.catch.context import CatchContext, targets_at
 from planner_jax.task.catch.default_planner import ExactCatch
 from planner_jax.task.catch.plan import CatchPlan
-from planner_jax.trajectory.polynomial import (
-    PiecewisePolynomial,
-    shift_basis,
-    state_basis,
-    states_at,
-)
+from planner_jax.trajectory import polynomial
 from planner_jax.trajectory.proportional_minco import boundary_rows
 
 _ORDERS = 4  # number of derivatives in a state, from position to jerk
 _LATEST = 0.05  # [s], greatest shift of a catch's time in the starting point
 _SHORTEST = 0.01  # [s], least duration of a segment in the starting point
 _CLOSING = 0.1  # [m/s], least speed towards the net's plane at which a catch's time is shifted
-_BINOMIALS, _SHIFTS = shift_basis(2 * _ORDERS)
+_BINOMIALS, _SHIFTS = polynomial.shift_basis(2 * _ORDERS)
 # Step lengths that a search tries. Its first direction ignores curvature, and is too long.
 _TRIALS = (1.0, 0.2, 0.04)
 
@@ -104,7 +99,7 @@ class ReplanCatch(OptimisedPlanner):
         """
         elapsed = check_elapsed(cases, elapsed)
         require_path("targets", targets, np.shape(cases.present), 3)
-        own = states_at(previous.trajectory, elapsed)
+        own = polynomial.states_at(previous.trajectory, elapsed)
         head_state = resolve_argument("head_state", head_state, own, elapsed)
         since = elapsed[..., None]
         order, times = np.asarray(previous.order), np.asarray(previous.times)
@@ -194,13 +189,13 @@ class ReplanCatch(OptimisedPlanner):
 
 def _states(coeffs: Array, time: Numbers) -> Array:
     """Return states (K, 4, 3) of K polynomial pieces, each at its time (K,) [s] since its start."""
-    factors, powers = state_basis(coeffs.shape[1])
+    factors, powers = polynomial.state_basis(coeffs.shape[1])
     basis = time[:, None, None] ** jnp.asarray(powers, time.dtype)[None]
     basis *= jnp.asarray(factors, time.dtype)[None]
     return jnp.sum(basis[..., None] * coeffs[:, None], axis=2)
 
 
-def _states_along(trajectory: PiecewisePolynomial, times: Numbers) -> Array:
+def _states_along(trajectory: polynomial.PiecewisePolynomial, times: Numbers) -> Array:
     """Return the states (K, 4, 3), position to jerk, of a trajectory at K times (K,) [s]."""
     ends = jnp.cumsum(trajectory.durations)
     piece = jnp.sum(times[:, None] >= ends[None, :-1], axis=1)
@@ -245,7 +240,7 @@ def _remainder(task: Replanning, context: CatchContext) -> CatchPlan:
     active = context.active[:, None]
     durations = jnp.where(active, jnp.diff(new, axis=1), 0.0)
     coeffs = jnp.where(active[..., None, None], coeffs, still)
-    trajectory = PiecewisePolynomial(
+    trajectory = polynomial.PiecewisePolynomial(
         coeffs=coeffs.reshape(-1, size, 3), durations=durations.ravel()
     )
     return dataclasses.replace(

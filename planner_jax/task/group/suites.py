@@ -14,15 +14,7 @@ from planner_jax.core.registry import suite_named
 from planner_jax.task.arguments import make_generators
 from planner_jax.task.group.case import InterceptGroup
 from planner_jax.task.group.spec import SUITES, TASK
-from planner_jax.task.intercept.suites import (
-    CAUSES,
-    anywhere,
-    cases_of,
-    draw_accepted,
-    first_cause,
-    path_of,
-    target_to,
-)
+from planner_jax.task.intercept import suites
 
 _TARGET = ("pos", "angle", "speed", "rate")
 
@@ -44,14 +36,15 @@ def draw(
     if suite not in SUITES:
         return TASK.other_suite(suite)(num, seed, first)
     spec, randoms, dtype = SUITES[suite], make_generators(suite, num, seed, first), floating(dtype)
-    draws, _, _ = draw_accepted(spec, randoms)
+    draws, _, _ = suites.draw_accepted(spec, randoms)
     fewest, most = spec.num_targets
     count = np.array([random.integers(fewest, most + 1) for random in randoms])
     targets = [{name: draws[name] for name in _TARGET}]
     targets += [_draw_target(suite, randoms, draws) for _ in range(most - 1)]
     stacked = {name: np.stack([each[name] for each in targets], axis=1) for name in _TARGET}
+    shared = suites.cases_of(draws, dtype)
     return InterceptGroup(
-        shared=dataclasses.replace(cases_of(draws, dtype), target=path_of(stacked, dtype)),
+        shared=dataclasses.replace(shared, target=suites.path_of(stacked, dtype)),
         present=jnp.asarray(np.arange(most) < count[:, None]),
         order=jnp.asarray(np.broadcast_to(np.arange(most), (num, most)), jnp.int32),
     )
@@ -69,10 +62,11 @@ def _draw_target(
     targets = {name: np.zeros_like(draws[name]) for name in _TARGET}
     while len(pending):
         uniform = np.stack([randoms[k].random(6) for k in pending])
-        meeting = anywhere(uniform[:, :2])
-        target = target_to(meeting, spec.time, turning[pending], uniform[:, 2:])
+        meeting = suites.anywhere(uniform[:, :2])
+        target = suites.target_to(meeting, spec.time, turning[pending], uniform[:, 2:])
         around = {name: leaf[pending] for name, leaf in draws.items()}
-        is_good = first_cause(spec, {**around, **target, "meeting": meeting}) == len(CAUSES)
+        candidates = {**around, **target, "meeting": meeting}
+        is_good = suites.first_cause(spec, candidates) == len(suites.CAUSES)
         for name in _TARGET:
             targets[name][pending[is_good]] = target[name][is_good]
         pending = pending[~is_good]

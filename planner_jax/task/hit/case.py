@@ -9,30 +9,15 @@ from flax import struct
 from jax import Array
 
 from planner_jax.ball.flight import BallState
+from planner_jax.core import rules
 from planner_jax.core.checks import floating
-from planner_jax.core.rules import (
-    NOT_NEGATIVE,
-    POSITIVE,
-    Field,
-    Table,
-    below,
-    require_rule,
-    require_sound,
-    within,
-)
+from planner_jax.core.rules import Field, Table, require_sound
 from planner_jax.cost.extras import Extra, for_batch
 from planner_jax.robot.quadrotor import QuadrotorLimits
 from planner_jax.robot.quadrotor_model import PAPER_HITTER, RACKET, QuadrotorModel
+from planner_jax.task import quadrotor
 from planner_jax.task.arguments import array_of, batch_of
 from planner_jax.task.hit.spec import DRAG, START
-from planner_jax.task.quadrotor import (
-    ARGUMENTS,
-    FLIGHT_RULES,
-    hover_at,
-    limits_of,
-    require_start,
-    require_tool,
-)
 
 # Shapes and ranges that `pj.require_sound` checks for the arrays of a `HitCase`.
 RULES: Table = (
@@ -40,21 +25,21 @@ RULES: Table = (
     Field("ball.vel", (3,)),
     Field("head_state", (4, 3)),
     Field("target", (3,)),
-    Field("drag", (), NOT_NEGATIVE),
-    Field("gravity", (), POSITIVE),
-    Field("restitution", (), within(0.0, 1.0, "in [0, 1]")),
+    Field("drag", (), rules.NOT_NEGATIVE),
+    Field("gravity", (), rules.POSITIVE),
+    Field("restitution", (), rules.within(0.0, 1.0, "in [0, 1]")),
     Field("racket_height", ()),
-    Field("racket_radius", (), POSITIVE),
-    *FLIGHT_RULES,
-    Field("limits.min_height", (), NOT_NEGATIVE),
-    Field("hit_limits.hitting_speed", (3,), POSITIVE),
-    Field("hit_limits.min_apex", (), NOT_NEGATIVE),
-    Field("hit_limits.min_apex", (), below("hit_limits.max_apex")),
+    Field("racket_radius", (), rules.POSITIVE),
+    *quadrotor.FLIGHT_RULES,
+    Field("limits.min_height", (), rules.NOT_NEGATIVE),
+    Field("hit_limits.hitting_speed", (3,), rules.POSITIVE),
+    Field("hit_limits.min_apex", (), rules.NOT_NEGATIVE),
+    Field("hit_limits.min_apex", (), rules.below("hit_limits.max_apex")),
     Field("hit_limits.max_apex", ()),
 )
 GRAVITY = 9.8  # [m/s^2], default magnitude of gravity in cases
 _ARGUMENTS = {
-    **ARGUMENTS,
+    **quadrotor.ARGUMENTS,
     **{f"ball.{name}": f"ball_{name}" for name in ("pos", "vel")},
     **{f"hit_limits.{name}": name for name in ("hitting_speed", "min_apex", "max_apex")},
 }
@@ -156,14 +141,14 @@ def case(
         TypeError: an argument does not hold numbers, or `dtype` is not a floating type.
     """
     dtype, batch = floating(dtype), batch_of("ball_pos", ball_pos, 3)
-    tool = require_tool(robot, RACKET)
+    tool = quadrotor.require_tool(robot, RACKET)
 
     def leaf(name: str, value: object, *shape: int) -> Array:
         return array_of(name, value, batch, shape, dtype)
 
     cases = HitCase(
         ball=BallState(pos=leaf("ball_pos", ball_pos, 3), vel=leaf("ball_vel", ball_vel, 3)),
-        head_state=hover_at(start, batch, dtype),
+        head_state=quadrotor.hover_at(start, batch, dtype),
         target=leaf("target", target, 3),
         drag=leaf("drag", drag),
         gravity=leaf("gravity", gravity),
@@ -171,7 +156,7 @@ def case(
         racket_height=leaf(
             "racket_height", tool.height if racket_height is None else racket_height
         ),
-        limits=limits_of(
+        limits=quadrotor.limits_of(
             robot,
             leaf,
             speed=speed,
@@ -192,7 +177,7 @@ def case(
         ),
     )
     require_sound(cases, _ARGUMENTS)
-    require_start(cases)
+    quadrotor.require_start(cases)
     height = np.asarray(cases.ball.pos)[..., 2]
-    require_rule("ball_pos", height, height >= 0.0, "at a height >= 0 m", batch)
+    rules.require_rule("ball_pos", height, height >= 0.0, "at a height >= 0 m", batch)
     return cases

@@ -12,17 +12,10 @@ from jax import Array
 from jax.typing import DTypeLike
 from numpy.typing import ArrayLike
 
+from planner_jax.core import rules
 from planner_jax.core.checks import floating, require_path, shape_of
 from planner_jax.core.errors import ArgumentError
-from planner_jax.core.rules import (
-    NOT_NEGATIVE,
-    POSITIVE,
-    POSITIVE_OR_NONE,
-    Field,
-    Table,
-    below,
-    require_sound,
-)
+from planner_jax.core.rules import Field, Table, require_sound
 from planner_jax.plane.obstacles import Obstacles, obstacles
 from planner_jax.plane.target import PlanePath
 from planner_jax.robot.car import CarBody, CarLimits
@@ -33,12 +26,12 @@ _BODY, _LIMITS = ([field.name for field in dataclasses.fields(c)] for c in (CarB
 # Shapes, types and ranges that `pj.require_sound` checks for the arrays of an `InterceptCase`.
 RULES: Table = (
     Field("start", (3,)),
-    Field("speed", (), NOT_NEGATIVE),
+    Field("speed", (), rules.NOT_NEGATIVE),
     Field("curvature", ()),
-    Field("time", (), POSITIVE),
-    Field("tolerance", (), POSITIVE),
+    Field("time", (), rules.POSITIVE),
+    Field("tolerance", (), rules.POSITIVE),
     Field("end_heading", ()),
-    Field("heading_tolerance", (), POSITIVE),
+    Field("heading_tolerance", (), rules.POSITIVE),
     *(
         Field(f"{group}.{name}", (letter, *shape), kind=kind)
         for group, letter in (("walls", "W"), ("movers", "M"))
@@ -49,11 +42,11 @@ RULES: Table = (
             ("present", (), np.bool_),
         )
     ),
-    Field("lower", (2,), below("upper")),
+    Field("lower", (2,), rules.below("upper")),
     Field("upper", (2,)),
-    *(Field(f"body.{name}", (), POSITIVE) for name in _BODY if name != "rear_overhang"),
+    *(Field(f"body.{name}", (), rules.POSITIVE) for name in _BODY if name != "rear_overhang"),
     Field("body.rear_overhang", ()),
-    *(Field(f"limits.{name}", (), POSITIVE_OR_NONE) for name in _LIMITS),
+    *(Field(f"limits.{name}", (), rules.POSITIVE_OR_NONE) for name in _LIMITS),
 )
 # Field of a case -> argument of `case` that sets it. Error messages name the argument.
 _ARGUMENTS = {

@@ -19,16 +19,9 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
+from planner_jax.core import protocol
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.planner import Planner
-from planner_jax.core.protocol import (
-    Status,
-    index_of_best,
-    is_solved,
-    require_attempts,
-    require_settings,
-    select,
-)
 from planner_jax.plane.cell_paths import PathNoise
 from planner_jax.task.intercept.case import InterceptCase
 from planner_jax.task.intercept.plan import InterceptPlan, explain, make_straight_plan
@@ -79,9 +72,9 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
     searches: tuple[Search, ...] | None = None  # by default `SEARCHES[meet]`
 
     def __post_init__(self) -> None:
-        require_settings(self)
+        protocol.require_settings(self)
         if self.searches is not None:
-            require_attempts("searches", self.searches, Search)
+            protocol.require_attempts("searches", self.searches, Search)
         if self.meet not in ("given", "early", "least"):
             raise ArgumentError("meet", "given, early or least", self.meet)
 
@@ -133,12 +126,14 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
             k, best = state
             noise = jax.tree.map(lambda leaf: leaf[k], search.noise)
             guess = self._guess(case, found, noise, search)
-            return k + 1, select(problem.refine(case, found.field, guess, search, stages), best)
+            return k + 1, protocol.select(
+                problem.refine(case, found.field, guess, search, stages), best
+            )
 
         def is_open(state: tuple) -> Array:
             k, best = state
             tries_all = self.tries_all or problem.is_time_free
-            return (k < num) & (tries_all | ~is_solved(best.status))
+            return (k < num) & (tries_all | ~protocol.is_solved(best.status))
 
         _, best = lax.while_loop(is_open, try_path, (0, make_straight_plan(case, self.pieces)))
         return self._explain(case, search, found, best)
@@ -166,7 +161,7 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
             return problem.decode(case, points[-1], steps)
 
         plans = jax.vmap(solve_along)(attempt.noise)
-        best = index_of_best(plans)
+        best = protocol.index_of_best(plans)
         plan = jax.tree.map(lambda leaf: leaf[best], plans)
         if not self.tries_all:
             plan = problem.refine_solved(case, found.field, plan, attempt)
@@ -200,7 +195,7 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
         self, case: InterceptCase, attempt: LoadedSearch, found: Reachability, plan: InterceptPlan
     ) -> InterceptPlan:
         reason = plan.status
-        reason = jnp.where(found.is_reached | ~attempt.is_last, reason, Status.NO_PATH)
+        reason = jnp.where(found.is_reached | ~attempt.is_last, reason, protocol.Status.NO_PATH)
         return explain(case, reason, plan, is_time_free=self.problem.is_time_free)
 
 

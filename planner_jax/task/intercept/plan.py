@@ -9,15 +9,9 @@ from jax import Array
 
 from planner_jax.core.protocol import Status, is_solved, status_of
 from planner_jax.robot.car import CarPlan
+from planner_jax.task.intercept import terms
 from planner_jax.task.intercept.case import InterceptCase
 from planner_jax.task.intercept.motion import motion
-from planner_jax.task.intercept.terms import (
-    Weights,
-    clearance,
-    is_blocked,
-    limit_terms,
-    meeting_terms,
-)
 
 _GRAZING = 5e-3  # [m], required clearance at samples, so that nothing is touched between samples
 
@@ -48,9 +42,9 @@ def make_plan(
     number of iterations that the plan reports.
     """
     drive = motion(case.start, time, speed, curvature, samples)
-    _, violation = limit_terms(case, time, speed, curvature, Weights(), points)
-    _, missed = meeting_terms(case, drive, time, Weights())
-    too_close = (_GRAZING - jnp.min(clearance(case, drive))) / case.body.width
+    _, violation = terms.limit_terms(case, time, speed, curvature, terms.Weights(), points)
+    _, missed = terms.meeting_terms(case, drive, time, terms.Weights())
+    too_close = (_GRAZING - jnp.min(terms.clearance(case, drive))) / case.body.width
     worst = jnp.maximum(jnp.maximum(violation, missed), too_close)
     effort = jnp.sum((speed[1:] - speed[:-1]) ** 2) * (speed.shape[0] - 1) / time
     return InterceptPlan(
@@ -91,7 +85,7 @@ def explain(
     obstacle or off the map. Else it is the status `reason` () int32. `is_time_free` is true if the
     planner may choose an earlier meeting time than the time of the case.
     """
-    is_start_blocked, is_goal_blocked = is_blocked(case)
+    is_start_blocked, is_goal_blocked = terms.is_blocked(case)
     blocked = is_start_blocked if is_time_free else is_start_blocked | is_goal_blocked
     reason = jnp.where(blocked, Status.BLOCKED, reason)
     floats = [leaf for leaf in jax.tree.leaves(case) if jnp.issubdtype(leaf.dtype, jnp.floating)]

@@ -27,27 +27,22 @@ from planner_jax.optimise.settings import Evaluation, LbfgsConfig, NewtonConfig,
 from planner_jax.plane.cell_paths import CellPath
 from planner_jax.plane.distance_field import DistanceField
 from planner_jax.plane.reach import Grid
+from planner_jax.task.intercept import terms
 from planner_jax.task.intercept.case import InterceptCase
 from planner_jax.task.intercept.motion import Quadratic, by_unknowns, motion
 from planner_jax.task.intercept.plan import InterceptPlan, make_plan
 from planner_jax.task.intercept.searches import Search, Warm
-from planner_jax.task.intercept.terms import (
-    Weights,
-    following_terms,
-    join_obstacles,
-    limit_terms,
-    meeting_terms,
-    obstacle_terms,
-)
 
 _SOONEST = 0.01  # earliest time of a meeting, divided by the case's time
 
 # Weights of the cost in the three stages: follow the path of grid cells, keep all limits, and
 # reduce the effort, which is the integral of the squared acceleration.
-_FOLLOWING = Weights(follow=10.0, obstacle=0.0, early=0.0)
-_KEEPING = Weights()
-_SETTLING = Weights(effort=10.0)
-_HURRYING = Weights(early=1000.0)  # of the last stage if the meeting shall be as early as possible
+_FOLLOWING = terms.Weights(follow=10.0, obstacle=0.0, early=0.0)
+_KEEPING = terms.Weights()
+_SETTLING = terms.Weights(effort=10.0)
+_HURRYING = terms.Weights(
+    early=1000.0
+)  # of the last stage if the meeting shall be as early as possible
 # Weight of the meeting time when the cost is differentiated. It is small beside the weight of the
 # limits, whose penalties start before a limit is reached: the minimum then exceeds no limit.
 _EARLY = 30.0
@@ -57,7 +52,7 @@ _EARLY = 30.0
 class Stage:
     """A stage of the search: Levenberg-Marquardt steps with fixed weights of the cost."""
 
-    weights: Weights
+    weights: terms.Weights
     steps: Array | int  # greatest number of steps
     tolerance: Array | float = 1.0  # as in `LevenbergConfig`; 1 ends at the first feasible point
     settled: Array | int = 1  # as in `LevenbergConfig`
@@ -87,7 +82,7 @@ class MotionProblem:
         return self.meet != "given"
 
     @property
-    def weights(self) -> Weights:
+    def weights(self) -> terms.Weights:
         """Weights of the last stage, which reduces the meeting time or the squared acceleration."""
         return _HURRYING if self.meet == "early" else _SETTLING
 
@@ -164,7 +159,7 @@ class MotionProblem:
         point: Array,
         case: InterceptCase,
         field: DistanceField,
-        weights: Weights,
+        weights: terms.Weights,
         positions: Array,
         discs: int = 3,
     ) -> Model:
@@ -175,10 +170,10 @@ class MotionProblem:
         """
         speed, curvature, time = self.unpack(case, point)
         drive = motion(case.start, time, speed, curvature, self.samples)
-        limits, violation = limit_terms(case, time, speed, curvature, weights, 4)
-        end, missed = meeting_terms(case, drive, time, weights)
-        squares, close = obstacle_terms(case, field, drive, weights, discs)
-        squares = squares.at[:, -1].add(following_terms(drive, positions, weights))
+        limits, violation = terms.limit_terms(case, time, speed, curvature, weights, 4)
+        end, missed = terms.meeting_terms(case, drive, time, weights)
+        squares, close = terms.obstacle_terms(case, field, drive, weights, discs)
+        squares = squares.at[:, -1].add(terms.following_terms(drive, positions, weights))
         squares = squares.at[-1, -1].add(end)
         cost = Quadratic(
             push=squares[..., :4, 4],
@@ -318,7 +313,7 @@ class SmoothIntercept(OptimisedPlanner):
         nowhere = jnp.full((2, 2), 1e3, case.lower.dtype)
         return _Context(
             case=case,
-            moving=dataclasses.replace(case, movers=join_obstacles(case.walls, case.movers)),
+            moving=dataclasses.replace(case, movers=terms.join_obstacles(case.walls, case.movers)),
             field=DistanceField(values=nowhere, corner=case.lower, spacing=case.time),
         )
 
