@@ -12,9 +12,9 @@ from jaxtyping import Float
 from planner_jax.core.protocol import is_solved
 from planner_jax.live.packets import FIELDS
 from planner_jax.planning.programs import solve_one
-from planner_jax.recovery.case import RecoveryCase, RecoveryPlan
+from planner_jax.recovery.case import RecoveryCase
 from planner_jax.recovery.planner import RecoveryPlanner
-from planner_jax.robot.quadrotor import QuadrotorLimits, setpoint_at
+from planner_jax.robot.quadrotor import QuadrotorLimits, QuadrotorPlan, setpoint_at
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, states_at, total_duration
 
 _REST = RecoveryPlanner()
@@ -40,7 +40,7 @@ def with_recovery(
     """Append a trajectory to standstill to a plan; return both, and whether the limits are kept."""
     state: Any = state_on(path, np.sum(path.durations))
     case = RecoveryCase(state, state[0], gravity, limits)
-    rest: RecoveryPlan = solve_one(_REST, case, _REST.rounds[0])
+    rest: QuadrotorPlan = solve_one(_REST, case, _REST.rounds[0])
     return Course(_join(path, rest.trajectory), gravity), bool(is_solved(rest.status))
 
 

@@ -100,9 +100,8 @@ def draw_path(
     along *= (lattice.levels - 1) / lattice.pace
 
     def draw(ends: Array, steps: Array) -> CellPath:
-        score = (
-            ends + jnp.where(jnp.arange(9) == 0, 1.0, 0.0)[None, None]
-        )  # the bonus 1 prefers the cell of the goal, which is cell 0, to its neighbours
+        # The bonus 1 prefers the cell of the goal, which is cell 0, to its neighbours.
+        score = ends + jnp.where(jnp.arange(9) == 0, 1.0, 0.0)[None, None]
         best = jnp.argmax(jnp.where(is_reached, score, -jnp.inf))
         level, heading, around = jnp.unravel_index(best, is_reached.shape)
 

@@ -9,6 +9,7 @@ from jax import Array
 from jax.typing import ArrayLike
 
 from planner_jax.core.checks import floating, numeric, shape_of
+from planner_jax.core.choices import require
 from planner_jax.core.errors import ArgumentError, ArgumentTypeError
 
 _COUNTS = (16, 32, 64)  # numbers of entries of `obstacles`; then multiples of the last
@@ -63,8 +64,7 @@ def obstacles(
     if shape not in ((), (2,), (len(checked), 2)):
         rule = f"the shape (2,) or ({len(checked)}, 2)"
         raise ArgumentError("velocities", rule, shape, verb="have")
-    if not np.isfinite(np.asarray(velocities)).all():
-        raise ArgumentError("velocities", "finite", velocities)
+    require(bool(np.isfinite(np.asarray(velocities)).all()), "velocities", "finite", velocities)
     speeds = np.broadcast_to(np.asarray(velocities, float), (len(checked), 2))
     centre, velocity = np.zeros((num, 2)), np.zeros((num, 2))
     corners = np.zeros((num, size, 2))

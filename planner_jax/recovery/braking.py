@@ -119,9 +119,8 @@ def brake_arm(case: PyTree, plan: ArmPlan) -> ArmPlan:
     coeffs, durations = (np.asarray(x, np.float64) for x in vars(plan.motion).values())
     state = states_at(plan.motion, np.asarray(durations.sum()))
     why = ""
-    for pieces, times in _arm_candidates(
-        state[0], state[1], np.asarray(case.limits.acceleration, float)
-    ):
+    most = np.asarray(case.limits.acceleration, float)
+    for pieces, times in _arm_candidates(state[0], state[1], most):
         problem = _arm_problem(case, pieces, times)
         if not problem:
             size = max(coeffs.shape[1], 3)

@@ -1,4 +1,4 @@
-"""Case and plan of a recovery: a quadrotor's trajectory from the end of a plan to standstill."""
+"""Case of a recovery: a quadrotor's trajectory from the end of a plan to standstill."""
 
 from typing import ClassVar
 
@@ -9,7 +9,7 @@ from jax import Array
 
 from planner_jax.core.rules import POSITIVE, Field, Table
 from planner_jax.cost.extras import Extra
-from planner_jax.robot.quadrotor import QuadrotorLimits, QuadrotorPlan
+from planner_jax.robot.quadrotor import QuadrotorLimits
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
 
 
@@ -33,11 +33,6 @@ class RecoveryCase:
     def batch_shape(self) -> tuple[int, ...]:
         """Shape () for one case, or (B,) for a batch of B cases."""
         return np.shape(self.gravity)
-
-
-@struct.dataclass
-class RecoveryPlan(QuadrotorPlan):
-    """One recovery trajectory, or a batch with a leading axis on every leaf."""
 
 
 def end_state(path: PiecewisePolynomial) -> Array:

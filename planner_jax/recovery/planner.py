@@ -8,12 +8,12 @@ import numpy as np
 from flax import struct
 from jax import Array
 
-from planner_jax.core.choices import RECOVERIES
-from planner_jax.core.errors import ArgumentError
+from planner_jax.core.choices import RECOVERIES, require_one_of
 from planner_jax.optimise.chain import ChainEnds, ChainPlanner
 from planner_jax.optimise.planner import pending
 from planner_jax.optimise.settings import LbfgsConfig, Round
-from planner_jax.recovery.case import RecoveryCase, RecoveryPlan
+from planner_jax.recovery.case import RecoveryCase
+from planner_jax.robot.quadrotor import QuadrotorPlan
 from planner_jax.trajectory.polynomial import PiecewisePolynomial
 
 # [m] Least height of the final position above the least allowed height, in starting points.
@@ -33,7 +33,7 @@ class RecoveryContext:
 
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
-class RecoveryPlanner(ChainPlanner[RecoveryCase, RecoveryPlan]):
+class RecoveryPlanner(ChainPlanner[RecoveryCase, QuadrotorPlan]):
     """Plans minimum-snap trajectories to standstill, whose durations are free.
 
     A trajectory of M pieces has n = 3 (M - 1) + 4 decision variables, in units of `scale`: whitened
@@ -66,8 +66,7 @@ class RecoveryPlanner(ChainPlanner[RecoveryCase, RecoveryPlan]):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.to not in RECOVERIES:
-            raise ArgumentError("to", f"one of {', '.join(RECOVERIES)}", self.to)
+        require_one_of(RECOVERIES, "to", self.to)
 
     def prepare(self, case: RecoveryCase) -> RecoveryContext:
         """Return the context of a case, which contains only the case."""
@@ -104,8 +103,7 @@ class RecoveryPlanner(ChainPlanner[RecoveryCase, RecoveryPlan]):
         ends: ChainEnds,
         violation: Array,
         context: RecoveryContext,
-    ) -> RecoveryPlan:
+    ) -> QuadrotorPlan:
         """Return the plan of a trajectory; the solver sets its cost and status later."""
-        return RecoveryPlan(
-            trajectory=trajectory, gravity=context.case.gravity, **pending(violation)
-        )
+        gravity = context.case.gravity
+        return QuadrotorPlan(trajectory=trajectory, gravity=gravity, **pending(violation))

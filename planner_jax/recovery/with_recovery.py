@@ -57,21 +57,17 @@ class RecoveringPlanner(PlannerAround[CaseT, PlanT]):
 
     def _plan_at(self, factor: float, drive: Drive, cases: PyTree) -> tuple[PyTree, PyTree]:
         """Plan with `factor` times the speed limit; return plans, and which only lack recovery."""
-        limits = cases.limits
-        slower = dataclasses.replace(
-            limits, speed=(factor * limits.speed).astype(limits.speed.dtype)
-        )
+        speed = (factor * cases.limits.speed).astype(cases.limits.speed.dtype)
+        slower = dataclasses.replace(cases.limits, speed=speed)
         plans, _ = drive(self.planner, dataclasses.replace(cases, limits=slower))
         recoveries, _ = drive(self.recovery_planner, recovery_cases(cases, plans))
         xp: ModuleType = jnp if drive.is_pure else np
         whole, recovers = is_solved(plans.status), is_solved(recoveries.status)
-        lacking = whole & ~recovers
+        lacking, worst = whole & ~recovers, xp.maximum(plans.violation, recoveries.violation)
         plans = dataclasses.replace(
             plans,
             recovery=recoveries.trajectory,
-            violation=xp.where(
-                whole, xp.maximum(plans.violation, recoveries.violation), plans.violation
-            ),
+            violation=xp.where(whole, worst, plans.violation),
             iterations=plans.iterations + recoveries.iterations,
             status=xp.where(lacking, Status.INFEASIBLE, plans.status).astype(np.int32),
         )

@@ -75,11 +75,8 @@ def referee_groups(
         for name in ("failed_time", "meeting_time"):
             found[k][name] = found[k][name] + begin
         begin = begin + np.asarray(leg.time, np.float64)
-        car = (
-            final_poses(leg, shared.body),
-            np.asarray(leg.speed)[:, -1],
-            np.asarray(leg.curvature)[:, -1],
-        )
+        at_end = (np.asarray(knots)[:, -1] for knots in (leg.speed, leg.curvature))
+        car = (final_poses(leg, shared.body), *at_end)
     together = {name: np.stack([each[name] for each in found], axis=1) for name in found[0]}
     fails = ~together["success"] & there
     leg = np.where(fails.any(axis=1), fails.argmax(axis=1), np.maximum(there.sum(axis=1) - 1, 0))

@@ -105,11 +105,8 @@ def pose_at(start: Array, end: Array, speed: Array, curvature: Array, time: Arra
     heading = start[2] + jnp.cumsum(whole) - whole
     tau = length[:, None] * jnp.asarray(_NODE, speed.dtype)[None]
     angle = heading[:, None] + jax.vmap(turn, in_axes=1, out_axes=1)(tau)
-    moved = (
-        (v[:, None] + rise[:, None] * tau)
-        * length[:, None]
-        * jnp.asarray(_WEIGHT, speed.dtype)[None]
-    )
+    weights = jnp.asarray(_WEIGHT, speed.dtype)[None]
+    moved = (v[:, None] + rise[:, None] * tau) * length[:, None] * weights
     x, y = jnp.sum(moved * jnp.cos(angle)), jnp.sum(moved * jnp.sin(angle))
     return start + jnp.stack([x, y, jnp.sum(whole)])
 

@@ -12,6 +12,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from planner_jax.core.choices import require
 from planner_jax.core.errors import ArgumentError
 
 GRAVITY = 9.81  # [m/s^2], used to check that the quadrotor can hover
@@ -36,8 +37,7 @@ class Tool:
     max_angle: float = math.pi / 6.0
 
     def __post_init__(self) -> None:
-        if self.kind not in (NET, RACKET):
-            raise ArgumentError("tool.kind", f"{NET} or {RACKET}", self.kind)
+        require(self.kind in (NET, RACKET), "tool.kind", f"{NET} or {RACKET}", self.kind)
         _require("tool.radius", self.radius, *_POSITIVE)
         _require("tool.height", self.height, *_FINITE)
         _require("tool.restitution", self.restitution, "in [0, 1]", lambda x: 0.0 <= x <= 1.0)
@@ -56,10 +56,9 @@ class Rotors:
     radius: float = 0.06  # [m], of a propeller; used only for pictures
 
     def __post_init__(self) -> None:
-        if np.shape(self.places) != (4, 2):
-            raise ArgumentError("rotors.places", "4 of 2 numbers", self.places)
-        if not np.isfinite(self.places).all():
-            raise ArgumentError("rotors.places", "finite", self.places)
+        is_shaped = np.shape(self.places) == (4, 2)
+        require(is_shaped, "rotors.places", "4 of 2 numbers", self.places)
+        require(bool(np.isfinite(self.places).all()), "rotors.places", "finite", self.places)
         least = self.min_thrust
         _require("rotors.min_thrust", least, *_NOT_NEGATIVE)
         _require("rotors.max_thrust", self.max_thrust, f"> {least:g}", lambda x: x > least)
@@ -147,17 +146,14 @@ class QuadrotorModel:
 
     def __post_init__(self) -> None:
         _require("mass", self.mass, *_POSITIVE)
-        if np.shape(self.inertia) != (3,):
-            raise ArgumentError("inertia", "3 numbers", self.inertia)
+        require(np.shape(self.inertia) == (3,), "inertia", "3 numbers", self.inertia)
         for axis in self.inertia:
             _require("inertia", axis, *_POSITIVE)
-        if not 2.0 * max(self.inertia) <= sum(self.inertia) * (1.0 + 1e-9):
-            rule = "of a body, none above the other two together"
-            raise ArgumentError("inertia", rule, self.inertia)
+        is_body = 2.0 * max(self.inertia) <= sum(self.inertia) * (1.0 + 1e-9)
+        require(is_body, "inertia", "of a body, none above the other two together", self.inertia)
         weight, most = self.mass * GRAVITY, 4.0 * self.rotors.max_thrust
-        if not most > weight:
-            rule = f"> the weight of {weight:.3g} N"
-            raise ArgumentError("4 x rotors.max_thrust", rule, shown=f"{most:.3g} N")
+        rule = f"> the weight of {weight:.3g} N"
+        require(most > weight, "4 x rotors.max_thrust", rule, shown=f"{most:.3g} N")
         lift = weight * self.rotors.shares
         if not np.all((lift > self.rotors.min_thrust) & (lift < self.rotors.max_thrust)):
             shown = " ".join(f"{each:.3g}" for each in lift)
@@ -193,8 +189,7 @@ class QuadrotorModel:
 def _require(name: str, value: object, rule: str, holds: Callable[[float], bool]) -> None:
     if isinstance(value, bool) or not isinstance(value, int | float | np.number):
         raise ArgumentError(name, "a number", value)
-    if not (math.isfinite(value) and holds(float(value))):
-        raise ArgumentError(name, rule, value)
+    require(math.isfinite(value) and holds(float(value)), name, rule, value)
 
 
 # The quadrotor of [Yu2023catch]. Height and radius of the net are from Fig. 6 and the diagonal is

@@ -23,7 +23,7 @@ _DRAWN_BYTES = 1_000  # [B], estimated memory of one case of a suite
 
 
 def array_of(
-    name: str, value: object, batch: tuple[int, ...], shape: tuple[int, ...], dtype: DTypeLike
+    name: str, value: object, *shape: int, batch: tuple[int, ...], dtype: DTypeLike
 ) -> Array:
     """Return the argument `value` as an array of shape `batch + shape`; raise as `numbers_of`."""
     with np.errstate(over="ignore"):  # a number too large for `dtype` becomes infinite, no warning
@@ -106,9 +106,8 @@ def judge_by(
             raise ArgumentTypeError("cases and plans", "numbers", leaf, verb="hold")
     num = np.shape(plans.status)
     if num != cases.batch_shape:
-        raise ArgumentError(
-            "plans", f"the batch shape of the cases, {cases.batch_shape}", num, verb="have"
-        )
+        rule = f"the batch shape of the cases, {cases.batch_shape}"
+        raise ArgumentError("plans", rule, num, verb="have")
     alone = cases.batch_shape == ()
     if alone:
         cases, plans = jax.tree.map(lambda leaf: np.asarray(leaf)[None], (cases, plans))

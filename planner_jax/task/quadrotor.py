@@ -48,9 +48,8 @@ def require_tool(robot: object, kind: str) -> Tool:
         rule = "a QuadrotorModel, such as pj.robot_named('x500') or pj.read_robot('my.yaml')"
         raise ArgumentTypeError("robot", rule, robot)
     if robot.tool.kind != kind:
-        raise ArgumentError(
-            "robot", f"a {kind}", verb="carry", shown=f"{robot.name!r} with a {robot.tool.kind}"
-        )
+        shown = f"{robot.name!r} with a {robot.tool.kind}"
+        raise ArgumentError("robot", f"a {kind}", verb="carry", shown=shown)
     return robot.tool
 
 
@@ -86,18 +85,11 @@ def limits_of(
     not None. The function `leaf(name, value, *shape)` broadcasts a value to the batch's shape.
     """
     own = robot.limits
-    least, most = own.thrust or (None, None)
-    if robot.tool.kind == NET:
-        least, most = robot.thrust_bounds
-    known = {
-        "speed": own.speed,
-        "body_rate": own.body_rate,
-        "min_height": own.min_height,
-        "acceleration": own.acceleration,
-        "min_thrust": least,
-        "max_thrust": most,
-    }
-    values = {**known, **{name: value for name, value in given.items() if value is not None}}
+    least, most = robot.thrust_bounds if robot.tool.kind == NET else own.thrust or (None, None)
+    names = ("speed", "body_rate", "min_height", "acceleration")
+    values = {name: getattr(own, name) for name in names}
+    values |= {"min_thrust": least, "max_thrust": most}
+    values |= {name: value for name, value in given.items() if value is not None}
     # If only one bound of the thrust is specified, the lower one is 0 or the upper one infinite.
     if values["max_thrust"] is None and values["min_thrust"] is not None:
         values["max_thrust"] = np.inf

@@ -89,13 +89,6 @@ def _hermite_map(order: int) -> np.ndarray:
     return np.linalg.inv(ends)
 
 
-@functools.cache
-def _hermite_energy(order: int) -> np.ndarray:
-    """Return the integral of |p^(order)|^2 over [0, 1], a quadratic form in p's end derivatives."""
-    hermite = _hermite_map(order)
-    return hermite.T @ polynomial.energy_form(2 * order - 1, order)[0] @ hermite
-
-
 def _energy(coefficients: np.ndarray, shares: np.ndarray) -> np.ndarray:
     """Return the integral of a spline's |p^(s)|^2 as a quadratic form (C, C) in C numbers.
 
@@ -135,7 +128,9 @@ def proportional_minco(
     shares = np.array(proportions) * m / np.sum(proportions)
     # Piece i lasts r_i h. A d-th derivative by t / (r_i h) is r_i^d times the derivative by t / h.
     units = np.tile(shares[:, None] ** np.arange(s), 2)
-    piece_energy = _hermite_energy(s)
+    hermite = _hermite_map(s)
+    # Energy of a piece of duration 1, as a quadratic form in the derivatives at its ends.
+    piece_energy = hermite.T @ polynomial.energy_form(2 * s - 1, s)[0] @ hermite
     total = np.zeros(((m + 1) * s, (m + 1) * s))
     for i in range(m):
         span = slice(i * s, (i + 2) * s)
@@ -168,7 +163,7 @@ def proportional_minco(
     to_offsets = np.linalg.inv(from_offsets)
     nodes = nodal @ from_offsets
     pieces = np.stack([nodes[i * s : (i + 2) * s] for i in range(m)])
-    coefficients = _hermite_map(s) @ (units[:, :, None] * pieces)  # for pieces of duration 1
+    coefficients = hermite @ (units[:, :, None] * pieces)  # for pieces of duration 1
     powers = shares[:, None] ** np.arange(2 * s)
     return ProportionalMinco(
         order=s,

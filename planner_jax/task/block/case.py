@@ -1,6 +1,7 @@
 """Cases of the task `block`: a thrown ball, and an arm that has to block it with its shield."""
 
-from typing import ClassVar, TypeVar
+import functools
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -49,9 +50,6 @@ RULES: Table = (
     Field("scene.beam_ends", ("N", 2, 3)),
     Field("scene.beam_radius", ("N",), rules.NOT_NEGATIVE),
 )
-
-
-TreeT = TypeVar("TreeT")
 # Tolerances of a contact: greatest distance [m] of the ball from the shield's middle, and greatest
 # angle [rad] between the shield's normal and the reversed velocity of the ball.
 STRICT = (0.002, np.deg2rad(0.5))
@@ -146,16 +144,12 @@ def case(
     shapes += [shape_of("delay", delay), shape_of("gravity", gravity)]
     batch, dtype = max(shapes, key=len), floating(dtype)
 
-    def leaf(name: str, value: ArrayLike, *trailing: int) -> Array:
-        return array_of(name, value, batch, trailing, dtype)
+    leaf = functools.partial(array_of, batch=batch, dtype=dtype)
 
-    def broadcast(tree: TreeT) -> TreeT:
-        def repeat(value: ArrayLike) -> Array:
-            value = np.asarray(value)
-            kind = np.dtype(dtype) if value.dtype.kind == "f" else value.dtype
-            return jnp.asarray(np.broadcast_to(value, batch + value.shape), kind)
-
-        return jax.tree.map(repeat, tree)
+    def repeat(value: ArrayLike) -> Array:
+        value = np.asarray(value)
+        kind = np.dtype(dtype) if value.dtype.kind == "f" else value.dtype
+        return jnp.asarray(np.broadcast_to(value, batch + value.shape), kind)
 
     offset, tilt = ANYWHERE if anywhere else WIDE if wide else STRICT
     cases = BlockCase(
@@ -164,12 +158,12 @@ def case(
         delay=leaf("delay", delay),
         angles=leaf("angles", angles, 6),
         rates=leaf("rates", rates, 6),
-        arm=broadcast(arm),
-        limits=broadcast(REGIMES[regime].limits),
+        arm=jax.tree.map(repeat, arm),
+        limits=jax.tree.map(repeat, REGIMES[regime].limits),
         ends_at_rest=jnp.broadcast_to(jnp.asarray(REGIMES[regime].ends_at_rest), batch),
         offset=leaf("offset", offset),
         tilt=leaf("tilt", tilt),
-        scene=broadcast(scene),
+        scene=jax.tree.map(repeat, scene),
     )
     require_sound(cases, {"ball.pos": "ball_pos", "ball.vel": "ball_vel"})
     return cases

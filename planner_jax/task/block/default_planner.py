@@ -343,9 +343,8 @@ class OnlineBlock(Planner):
         pushes = jnp.einsum("riw,rw->wi", lifts, short, precision=_HIGHEST)
         # The derivatives by the time of contact are zero: distances do not depend on it.
         grams, pushes = jnp.pad(grams, ((0, 0), (0, 1), (0, 1))), jnp.pad(pushes, ((0, 0), (0, 1)))
-        rows, row_slopes, contact_excess = contact_terms(
-            case, flight, angles[-1], point[-1], self.weights
-        )
+        contact = contact_terms(case, flight, angles[-1], point[-1], self.weights)
+        rows, row_slopes, contact_excess = contact
         gram = jnp.matmul(row_slopes.T, row_slopes, precision=_HIGHEST)
         push = jnp.matmul(row_slopes.T, rows, precision=_HIGHEST)
         grams = jnp.concatenate([grams, gram[None]])

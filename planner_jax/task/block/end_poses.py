@@ -158,9 +158,8 @@ def contact_terms(
     by_normal = jnp.cross(turns, normal)
     # Distance of the ball from the plane of the shield.
     off = jnp.sum(away * normal)
-    off_slope = jnp.append(
-        product(by_normal, away) - product(moves, normal), jnp.sum(velocity * normal)
-    )
+    off_by_angles = product(by_normal, away) - product(moves, normal)
+    off_slope = jnp.append(off_by_angles, jnp.sum(velocity * normal))
     # Offset of the ball from the shield's middle, within the plane of the shield.
     beside = away - off * normal
     beside_slope = jnp.concatenate([-moves, velocity[None]])

@@ -1,6 +1,7 @@
 """Cases of the task `catch`: up to N flying targets, the quadrotor, its net and its limits."""
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 from typing import ClassVar
 
@@ -152,9 +153,7 @@ def case(
     require_switch("optional", optional)
     batch, num = shape[:-1], shape[-1]
 
-    def leaf(name: str, value: object, *trailing: int) -> Array:
-        return array_of(name, value, batch, trailing, dtype)
-
+    leaf = functools.partial(array_of, batch=batch, dtype=dtype)
     require_path("targets", targets, shape, 3, "horizon")
     tool = quadrotor.require_tool(robot, NET)
     shares = np.arange(1, num + 1) / (num + 1.0)

@@ -15,7 +15,7 @@ import numpy as np
 from flax import struct
 from jax import Array, lax
 
-from planner_jax.core.errors import ArgumentError
+from planner_jax.core.choices import require
 from planner_jax.core.protocol import Status, is_unsolved, require_settings
 from planner_jax.task.arguments import require_orders
 from planner_jax.task.catch import estimate
@@ -100,8 +100,7 @@ def beam(case: CatchCase, table: Timetable, width: int) -> CatchChoice:
         ValueError: there are more than `MOST_SEARCHED` targets.
     """
     num, speed = case.num_targets, estimate.top_speed(case)
-    if num > MOST_SEARCHED:
-        raise ArgumentError("targets", f"at most {MOST_SEARCHED} of a case", num)
+    require(num <= MOST_SEARCHED, "targets", f"at most {MOST_SEARCHED} of a case", num)
     from_all = jax.vmap(estimate.arrivals, (None, 0, 0, None))
     # The set of caught targets is stored as bits of a few 32-bit integers. The last integer also
     # holds the index of the last target.
@@ -217,8 +216,7 @@ class Best(CatchDecision):
 
     def __post_init__(self) -> None:
         require_settings(self)
-        if self.width < self.finalists:
-            raise ArgumentError("width", f">= {self.finalists} finalists", self.width)
+        require(self.width >= self.finalists, "width", f">= {self.finalists} finalists", self.width)
 
     def propose(self, case: CatchCase) -> CatchChoice:
         """Return the orders of one case with the least ranks, best first; each is a row."""

@@ -20,8 +20,7 @@ from planner_jax.ball.flight import BallState
 from planner_jax.ball.target import BallPath, HarmonicPath, TargetPath
 from planner_jax.core.arithmetic import host_leaf
 from planner_jax.core.checks import floating, require_scalar
-from planner_jax.core.choices import require_scale
-from planner_jax.core.errors import ArgumentError
+from planner_jax.core.choices import require, require_scale
 from planner_jax.core.registry import suite_named
 from planner_jax.robot.quadrotor_model import PAPER_CATCHER, QuadrotorModel
 from planner_jax.task.arguments import require_draw
@@ -88,8 +87,7 @@ def draw(
         return TASK.other_suite(suite)(num, seed, first)
     own = SUITES[suite].num_targets
     size = own if num_targets is None else num_targets
-    if size < own:
-        raise ArgumentError("num_targets", f">= {own} for suite {suite!r}", size)
+    require(size >= own, "num_targets", f">= {own} for suite {suite!r}", size)
     random = np.random.default_rng([seed, zlib.crc32(suite.encode())])
     # Each case uses `columns` random numbers: skip the numbers of the cases before `first`.
     columns, make_targets = _PATHS[suite]
@@ -175,8 +173,7 @@ def earliest_throw(name: str) -> tuple[BallState, float]:
     Raises:
         ValueError: the suite does not have exactly one thrown ball a case.
     """
-    if name not in _THROWS or len(_THROWS[name]) > 1:
-        raise ArgumentError("suite", "one of single throws", name)
+    require(len(_THROWS.get(name, ())) == 1, "suite", "one of single throws", name)
     middle_and_shortest = np.array([[0.5, 0.5, 0.0]])
     pos, vel, horizon = _throw(middle_and_shortest, _THROWS[name][0])
     pos, vel = (leaf[0].astype(np.float32) for leaf in (pos, vel))

@@ -15,7 +15,7 @@ import numpy as np
 from flax import struct
 from jax import Array
 
-from planner_jax.core.errors import ArgumentError
+from planner_jax.core.choices import require
 from planner_jax.core.protocol import Decision, require_settings
 from planner_jax.task.arguments import require_orders
 from planner_jax.task.group.case import GroupChoice, InterceptGroup
@@ -111,9 +111,8 @@ class Best(Decision):
     def propose(self, case: InterceptGroup) -> GroupChoice:
         """Return the F = `finalists` best orders of a group's N targets, best first, (F, N)."""
         num = case.num_targets
-        if num > MOST_PERMUTED:
-            rule = f"at most {MOST_PERMUTED}, because all orders are evaluated"
-            raise ArgumentError("targets", rule, num)
+        rule = f"at most {MOST_PERMUTED}, because all orders are evaluated"
+        require(num <= MOST_PERMUTED, "targets", rule, num)
         orders = jnp.asarray(list(itertools.permutations(range(num))), jnp.int32)
         rank = jax.vmap(functools.partial(_rank, case, _timetable(case)))(orders)
         # Orders that differ only in the positions of absent targets are equivalent. Only the order

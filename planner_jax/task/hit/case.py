@@ -1,5 +1,6 @@
 """Cases of the task `hit`: the incoming ball, the hovering quadrotor, the target and the limits."""
 
+import functools
 from collections.abc import Sequence
 from typing import ClassVar
 
@@ -143,9 +144,9 @@ def case(
     dtype, batch = floating(dtype), batch_of("ball_pos", ball_pos, 3)
     tool = quadrotor.require_tool(robot, RACKET)
 
-    def leaf(name: str, value: object, *shape: int) -> Array:
-        return array_of(name, value, batch, shape, dtype)
-
+    leaf = functools.partial(array_of, batch=batch, dtype=dtype)
+    racket_height = tool.height if racket_height is None else racket_height
+    racket_radius = tool.radius if racket_radius is None else racket_radius
     cases = HitCase(
         ball=BallState(pos=leaf("ball_pos", ball_pos, 3), vel=leaf("ball_vel", ball_vel, 3)),
         head_state=quadrotor.hover_at(start, batch, dtype),
@@ -153,9 +154,7 @@ def case(
         drag=leaf("drag", drag),
         gravity=leaf("gravity", gravity),
         restitution=leaf("restitution", tool.restitution if restitution is None else restitution),
-        racket_height=leaf(
-            "racket_height", tool.height if racket_height is None else racket_height
-        ),
+        racket_height=leaf("racket_height", racket_height),
         limits=quadrotor.limits_of(
             robot,
             leaf,
@@ -172,9 +171,7 @@ def case(
             max_apex=leaf("max_apex", max_apex),
         ),
         extras=for_batch(extras, batch, dtype),
-        racket_radius=leaf(
-            "racket_radius", tool.radius if racket_radius is None else racket_radius
-        ),
+        racket_radius=leaf("racket_radius", racket_radius),
     )
     require_sound(cases, _ARGUMENTS)
     quadrotor.require_start(cases)

@@ -30,20 +30,14 @@ REGIONS = "NFLR"  # near, far, left, right; the published files number the regio
 # [m], target of each region of `REGIONS` in the opponent's half. Left is y > 0 in both halves.
 TARGETS = ((1.75, 0.0, 0.0), (4.0, 0.0, 0.0), (3.0, 1.67, 0.0), (3.0, -1.67, 0.0))
 
-PLANNERS = ("juggle", "bat-lite", "bat")
-
-
-def _scenario_names() -> tuple[str, ...]:
-    """Return the names of the 36 scenarios, such as "NFL": serve near, landing far, target left."""
-    return tuple(
-        serve + landing + target
-        for serve in "NFL"
-        for landing in ("NFLR" if serve == "L" else "NFL")
-        for target in ("NFLR" if "L" in (serve, landing) else "NFL")
-    )
-
-
-SCENARIOS = _scenario_names()
+PLANNERS = ("juggle", "bat-lite", "bat")  # planners with published results
+# Names of the 36 scenarios, such as "NFL": serve near, landing far, target left.
+SCENARIOS = tuple(
+    serve + landing + target
+    for serve in "NFL"
+    for landing in ("NFLR" if serve == "L" else "NFL")
+    for target in ("NFLR" if "L" in (serve, landing) else "NFL")
+)
 
 
 def region_bounds(depth: float = HALF_LENGTH) -> np.ndarray:

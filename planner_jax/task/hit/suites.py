@@ -13,7 +13,7 @@ import numpy as np
 from scipy.interpolate import RectBivariateSpline
 
 from planner_jax.core.checks import numeric, require_scalar
-from planner_jax.core.choices import require_scale
+from planner_jax.core.choices import require, require_scale
 from planner_jax.core.errors import ArgumentError
 from planner_jax.robot.quadrotor_model import PAPER_HITTER, QuadrotorModel
 from planner_jax.task.arguments import require_draw
@@ -207,8 +207,7 @@ def _aim(distance: np.ndarray, rise: np.ndarray):
 
 def advance(serves: Serves, delay: float) -> Serves:
     """Return serves after `delay` [s] of flight; raise `ArgumentError` if a ball lands earlier."""
-    if not 0.0 <= delay < math.inf:
-        raise ArgumentError("delay", "finite and >= 0", delay)
+    require(0.0 <= delay < math.inf, "delay", "finite and >= 0", delay)
     time, _ = landing(serves.position, serves.velocity, DRAG, GRAVITY)
     if (down := time <= delay).any():
         first = int(np.argmax(down))
@@ -250,10 +249,8 @@ def to_cases(
     require_scalar("delay", delay)
     require_scale(limit_scale)
     if isinstance(start, str):
-        if start != "uniform":
-            raise ArgumentError("start", "three numbers or 'uniform'", start)
-        if seed < 0:
-            raise ArgumentError("seed", ">= 0", seed)
+        require(start == "uniform", "start", "three numbers or 'uniform'", start)
+        require(seed >= 0, "seed", ">= 0", seed)
         head = uniform_starts(serves.index, seed)
     else:
         head = numeric(start)

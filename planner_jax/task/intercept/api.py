@@ -11,7 +11,7 @@ from jax.typing import DTypeLike
 from jaxtyping import Float
 
 from planner_jax.core.checks import require_kind, require_path
-from planner_jax.core.errors import ArgumentError
+from planner_jax.core.choices import require
 from planner_jax.core.planner import Planner
 from planner_jax.core.registry import suite_named
 from planner_jax.plane.target import LaterPath, PlanePath, PolynomialPath, TurningPath
@@ -74,10 +74,8 @@ def observe(
     """
     ranges = {"count": (count, 1), "noise": (noise, 0), "first": (first, 0), "until": (until, 0)}
     for name, (value, least) in ranges.items():
-        if not value >= least:
-            raise ArgumentError(name, f">= {least}", value)
-    if not interval > 0.0:
-        raise ArgumentError("interval", "> 0", interval)
+        require(value >= least, name, f">= {least}", value)
+    require(interval > 0.0, "interval", "> 0", interval)
     times = interval * np.arange(1.0 - count, 1.0 + np.floor(until / interval + 1e-9))
     positions = np.asarray(_positions_at(cases.target, times.astype(cases.time.dtype)))
     tag = zlib.crc32(b"observations")

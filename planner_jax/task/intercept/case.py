@@ -1,6 +1,7 @@
 """Cases of the task `intercept`: a car, a moving target, and obstacles, in the plane."""
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 from typing import ClassVar
 
@@ -154,9 +155,7 @@ def case(
     shapes += [shape_of(name, value) for name, value in scalars.items()]
     batch = max(shapes, key=len)
 
-    def leaf(name: str, value: ArrayLike, *trailing: int) -> Array:
-        return array_of(name, value, batch, trailing, dtype)
-
+    leaf = functools.partial(array_of, batch=batch, dtype=dtype)
     require_path("target", target, batch, 2)
     is_free = end_heading is None
     around = leaf("heading_tolerance", heading_tolerance)

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from planner_jax.core import protocol
-from planner_jax.core.errors import ArgumentError
+from planner_jax.core.choices import require
 from planner_jax.core.planner import Planner
 from planner_jax.plane.cell_paths import PathNoise
 from planner_jax.task.intercept.case import InterceptCase
@@ -75,8 +75,9 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
         protocol.require_settings(self)
         if self.searches is not None:
             protocol.require_attempts("searches", self.searches, Search)
-        if self.meet not in ("given", "early", "least"):
-            raise ArgumentError("meet", "given, early or least", self.meet)
+        require(
+            self.meet in ("given", "early", "least"), "meet", "given, early or least", self.meet
+        )
 
     @property
     def attempts(self) -> tuple[Search, ...]:
@@ -194,8 +195,8 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
     def _explain(
         self, case: InterceptCase, attempt: LoadedSearch, found: Reachability, plan: InterceptPlan
     ) -> InterceptPlan:
-        reason = plan.status
-        reason = jnp.where(found.is_reached | ~attempt.is_last, reason, protocol.Status.NO_PATH)
+        is_open = found.is_reached | ~attempt.is_last
+        reason = jnp.where(is_open, plan.status, protocol.Status.NO_PATH)
         return explain(case, reason, plan, is_time_free=self.problem.is_time_free)
 
 

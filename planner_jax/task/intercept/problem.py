@@ -207,13 +207,11 @@ class MotionProblem:
     def list_last_stages(self, attempt: Search | Warm) -> list[Stage]:
         """Return the last two stages: keep all limits, then reduce acceleration or meeting time."""
         margins = {"margin": attempt.margin, "slack": attempt.slack}
-        keeping = Stage(dataclasses.replace(_KEEPING, **margins), attempt.solver.max_steps)
+        solver, steps = attempt.solver, attempt.settling
+        keeping = Stage(dataclasses.replace(_KEEPING, **margins), solver.max_steps)
         if self.is_time_free:
-            solver = attempt.solver
-            keeping = dataclasses.replace(
-                keeping, tolerance=solver.tolerance, settled=solver.settled
-            )
-        steps = attempt.settling
+            until = {"tolerance": solver.tolerance, "settled": solver.settled}
+            keeping = dataclasses.replace(keeping, **until)
         weights = dataclasses.replace(self.weights, **margins)
         return [keeping, Stage(weights, steps, settled=steps, only_feasible=True)]
 
@@ -238,13 +236,8 @@ class MotionProblem:
             config = dataclasses.replace(
                 attempt.solver, max_steps=most, tolerance=stage.tolerance, settled=stage.settled
             )
-
-            def model(x: Array) -> Model:
-                return self.build_model(
-                    x, case, field, stage.weights, guess.positions, attempt.discs
-                )
-
-            end = least_squares(model, point, config)
+            inputs = (case, field, stage.weights, guess.positions, attempt.discs)
+            end = least_squares(lambda x: self.build_model(x, *inputs), point, config)
             return (end.point, end.model.violation <= 0.0), end
 
         # `scan` over the stages, so that one compiled loop serves all stages.

@@ -86,11 +86,10 @@ class ReplanIntercept(Planner[Replanning, InterceptPlan]):
             require_kind("movers", movers, Obstacles)
             require_beginning("movers", movers, batch, f"the batch shape {batch}")
         planned = (_states if cases.batch_shape else _state)(previous, elapsed)
+        given = {"start": start, "speed": speed, "curvature": curvature}
         start, speed, curvature = (
             resolve_argument(name, value, default, elapsed)
-            for name, value, default in zip(
-                ("start", "speed", "curvature"), (start, speed, curvature), planned, strict=True
-            )
+            for (name, value), default in zip(given.items(), planned, strict=True)
         )
         limits = cases.limits
         speed = np.clip(speed, 0.0, limits.speed)
@@ -142,10 +141,7 @@ class ReplanIntercept(Planner[Replanning, InterceptPlan]):
         previous, num = task.previous, self.problem.pieces
         at = task.elapsed + time * (jnp.arange(1, num + 1) / num)
         old = previous.time * jnp.linspace(0.0, 1.0, previous.speed.shape[0])
-        speed, curvature = (
-            jnp.interp(at, old, values) for values in (previous.speed, previous.curvature)
-        )
-        return speed, curvature
+        return jnp.interp(at, old, previous.speed), jnp.interp(at, old, previous.curvature)
 
 
 @jax.jit

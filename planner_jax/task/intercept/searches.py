@@ -12,8 +12,8 @@ import numpy as np
 from flax import struct
 from jax import Array
 
+from planner_jax.core.choices import require
 from planner_jax.core.compiled import cached_by_precision, with_run_time_numbers
-from planner_jax.core.errors import ArgumentError
 from planner_jax.core.protocol import Attempt
 from planner_jax.optimise.levenberg import LevenbergConfig
 from planner_jax.plane import cell_paths, reach
@@ -51,8 +51,7 @@ class Search(Attempt):
     body_scale: float = 1.0
 
     def __post_init__(self) -> None:
-        if self.paths < 1:
-            raise ArgumentError("paths", ">= 1", self.paths)
+        require(self.paths >= 1, "paths", ">= 1", self.paths)
         lattice = self.lattice
         words = lattice.cells**2 // 32 * lattice.levels * lattice.headings * lattice.layers
         starts = max(_PATH_STARTS * self.paths, round(_WORD_STARTS * words))
@@ -182,17 +181,11 @@ def search_reach(
     grid = make_grid(case, search.lattice)
     field = make_field(case, grid)
     radius, ahead = discs_of(case.body, 2)
-    level = case.limits.speed * jnp.linspace(0.0, 1.0, search.lattice.levels)
-    turn_rates = jnp.minimum(
-        case.limits.curvature * level,
-        case.limits.lateral_acceleration / jnp.maximum(level, 0.1 * case.limits.speed),
-    )
-    vehicle = reach.Vehicle(
-        radius=search.body_scale * radius,
-        ahead=ahead,
-        speed=case.limits.speed,
-        turn_rates=turn_rates,
-    )
+    limits = case.limits
+    level = limits.speed * jnp.linspace(0.0, 1.0, search.lattice.levels)
+    quickest = limits.lateral_acceleration / jnp.maximum(level, 0.1 * limits.speed)
+    turn_rates = jnp.minimum(limits.curvature * level, quickest)
+    vehicle = reach.Vehicle(search.body_scale * radius, ahead, limits.speed, turn_rates)
     needed = grid.num if layers is None else layers
     by = _FIELD // search.lattice.cells
     coarse = field.values[::by, ::by]
