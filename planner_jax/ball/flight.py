@@ -132,10 +132,8 @@ def linear_drag_flight(ball: BallState, duration: Array, drag: Array, gravity: A
 
 
 def _phi(x: Array) -> tuple[Array, Array]:
-    """Return phi_1 = (1 - exp(-x))/x and phi_2 = (1 - phi_1)/x, exact to rounding for any x.
-
-    For |x| < 1/2 a power series of thirteen terms avoids the cancellation in 1 - phi_1.
-    """
+    """Return phi_1 = (1 - exp(-x))/x and phi_2 = (1 - phi_1)/x, exact to rounding for any x."""
+    # For |x| < 1/2 a power series of thirteen terms avoids the cancellation in 1 - phi_1.
     small = jnp.abs(x) < 0.5
     near = jnp.where(small, x, 0.0)
     series = sum((-near) ** k / float(math.factorial(k + 2)) for k in range(13))

@@ -101,10 +101,7 @@ def _check_values(name: str, value: ArrayLike, num: int) -> Numbers:
 
 
 def _evaluate(times: np.ndarray, values: list[PyTree], at: np.ndarray, order: int) -> PyTree:
-    """Return the `order`-th derivative (..., T, 3) of a spline at T times `at` [s].
-
-    `values` are the positions at `times`, or positions and velocities, each (..., K, 3).
-    """
+    """Return a derivative (..., T, 3) at T times of a spline through positions and velocities."""
     units, none = np.eye(times.size), np.zeros((times.size, times.size))
     if len(values) == 1:
         splines = [CubicSpline(times, units)]

@@ -50,10 +50,7 @@ def draw_noise(lattice: Lattice, num: int, seed: int, candidates: int) -> PathNo
 
 
 def _velocity(level: Array, heading: Array, grid: Grid) -> Array:
-    """Return velocities (..., 2), in units of a speed level, of speed levels and heading bins.
-
-    Axis 0 has the heading of bin 0, and axis 1 points to its left.
-    """
+    """Return velocities (..., 2) in units of a speed level; axis 0 has the heading of bin 0."""
     dtype = grid.cell.dtype
     angle = (2.0 * np.pi / grid.lattice.headings) * heading.astype(dtype)
     return level[..., None].astype(dtype) * jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)

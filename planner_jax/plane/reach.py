@@ -125,11 +125,8 @@ def _move_y(rows: Array, move: Array) -> Array:
     """Shift bitmaps of cells by `move` (...) cells along y, the last axis of the bitmaps."""
     words, cells = rows.shape[0], rows.shape[-1]
     padded = jnp.pad(rows.reshape(words, -1, cells), ((0, 0), (0, 0), (_FARTHEST, _FARTHEST)))
-    moved = jax.vmap(
-        lambda row, by: lax.dynamic_slice_in_dim(row, _FARTHEST - by, cells, axis=1),
-        in_axes=(1, 0),
-        out_axes=1,
-    )(padded, move.reshape(-1))
+    move_row = lambda row, by: lax.dynamic_slice_in_dim(row, _FARTHEST - by, cells, 1)  # noqa: E731
+    moved = jax.vmap(move_row, in_axes=(1, 0), out_axes=1)(padded, move.reshape(-1))
     return moved.reshape(rows.shape)
 
 
@@ -165,11 +162,7 @@ def _map_needed(body: Callable[[Array], Array], over: Array, needed: Array) -> A
 
 
 def _stencils(grid: Grid, movers: Obstacles, radius: Array) -> Array:
-    """Return bitmaps (M, _STENCIL) uint32 of the cells near each of M moving obstacles.
-
-    A bit is set if the cell's middle is closer than `radius` [m] to the obstacle. The bitmap's
-    middle is the obstacle's centre.
-    """
+    """Return bitmaps (M, _STENCIL) of the cells closer than `radius` [m] to each of M obstacles."""
     offsets = grid.cell * (jnp.arange(_STENCIL, dtype=grid.corner.dtype) - _STENCIL // 2)
     x, y = jnp.meshgrid(offsets, offsets)
     far, _ = distances(movers.corners, movers.present, x.reshape(1, -1), y.reshape(1, -1))
@@ -184,14 +177,12 @@ def _draw_movers(grid: Grid, movers: Obstacles, stencils: Array, time: Array) ->
 
     def draw_one(stencil: Array, at: Array) -> Array:
         y = jnp.arange(cells, dtype=at.dtype) - at[1]
-        row = jnp.where(
-            (y >= 0) & (y < _STENCIL), stencil[jnp.clip(y, 0, _STENCIL - 1)], jnp.uint32(0)
-        )
+        inside = (y >= 0) & (y < _STENCIL)
+        row = jnp.where(inside, stencil[jnp.clip(y, 0, _STENCIL - 1)], jnp.uint32(0))
         return jnp.stack([_word_of(row, at[0] - 32 * word) for word in range(cells // 32)])
 
-    return lax.reduce(
-        jax.vmap(draw_one)(stencils, at), jnp.uint32(0), lax.bitwise_or, dimensions=(0,)
-    )
+    drawn = jax.vmap(draw_one)(stencils, at)
+    return lax.reduce(drawn, jnp.uint32(0), lax.bitwise_or, dimensions=(0,))
 
 
 def _word_of(row: Array, at: Array) -> Array:
@@ -228,10 +219,8 @@ def reach_set(
     # rounded position. If each move were rounded, a car with a heading of 11 degrees would never
     # change its row.
     half_steps = jnp.arange(2 * lattice.layers + 2, dtype=dtype)[:, None, None, None]
-    cells = jnp.round(0.5 * half_steps * pace[None, :, None, None] * direction[None, None]).astype(
-        jnp.int32
-    )
-    halves = jnp.diff(cells, axis=0)  # (2 layers + 1, levels, headings, 2)
+    cells = jnp.round(0.5 * half_steps * pace[None, :, None, None] * direction[None, None])
+    halves = jnp.diff(cells.astype(jnp.int32), axis=0)  # (2 layers + 1, levels, headings, 2)
     halves = jnp.clip(halves, -_FARTHEST, _FARTHEST)
     moves = jnp.moveaxis(halves[1:].reshape(-1, 2, levels, headings, 2), 1, 3)
     most = vehicle.turn_rates * grid.step / width
@@ -279,12 +268,9 @@ def reach_set(
         *(functools.partial(move, half=half) for half in range(2) for move in (move_y, move_x)),
     ]
 
+    # Each part (a change of speed, a turn, a move) is an iteration of its own. XLA would otherwise
+    # fuse them on a CPU, and repeat the work of one part for every bit that the next part reads.
     def apart(bits: Array, n: Array) -> Array:
-        """Compute the states at time step n + 1 from step n, each of `parts` in its own iteration.
-
-        The parts are a change of speed, a turn and moves. XLA would otherwise fuse them on a CPU,
-        and repeat the work of one part for every bit that the next part reads.
-        """
         return lax.fori_loop(0, len(parts), lambda k, bits: lax.switch(k, parts, bits, n), bits)
 
     def at_once(bits: Array, n: Array) -> Array:

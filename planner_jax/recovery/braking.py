@@ -137,10 +137,7 @@ def brake_arm(case: PyTree, plan: ArmPlan) -> ArmPlan:
 def _arm_candidates(
     angles: np.ndarray, rates: np.ndarray, most: np.ndarray
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Yield candidates of braking motions: coefficients (M, 3, 6), durations (M,) of M pieces.
-
-    Angles [rad], rates [rad/s] and greatest accelerations [rad/s^2] are (6,).
-    """
+    """Yield braking motions of six joints: coefficients (M, 3, 6), durations (M,) of M pieces."""
     alone = np.maximum(np.abs(rates) / (_SPARE * most), 1e-3)
     together = np.full(6, alone.max())
     for ends in (together, alone, *(factor * together for factor in _SLOWER)):

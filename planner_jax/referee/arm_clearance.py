@@ -255,11 +255,7 @@ def _distance(one: _Capsule | _Box, other: _Capsule | _Box) -> np.ndarray:
 
 
 def _least(pairs: list[_Pair], sampled: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Find each motion's least distance over `pairs` of solids, and over samples to evaluate.
-
-    `sampled` (B, S) is true for these samples. Returns arrays (B,): the distance [m], the index of
-    its sample, and the name of its pair.
-    """
+    """Return the least distance (B,) [m] of each motion over `pairs`, its sample and its pair."""
     num_lanes, num_samples = sampled.shape
     if not pairs:
         return np.full(num_lanes, np.inf), np.zeros(num_lanes, int), np.full(num_lanes, "")

@@ -246,10 +246,7 @@ def _worst(excess: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 
 def _judge_limits(case: dict, motion: _Motion, extremes: list, relative: float) -> tuple:
-    """Test start, continuity and limits of joints, from the result `extremes` of `_extremes`.
-
-    Returns measurements, tests and the worst joints, each by name.
-    """
+    """Test start, continuity and limits of joints; return measurements, tests and worst joints."""
     tests, parts, measured = {}, {}, {}
 
     def test(name: str, excess: np.ndarray, times: np.ndarray, allowed: float) -> None:
@@ -279,10 +276,7 @@ def _judge_limits(case: dict, motion: _Motion, extremes: list, relative: float) 
 
 
 def _rest(case: dict, motion: _Motion, stays: np.ndarray) -> tuple[tuple, np.ndarray]:
-    """Test that a motion ends at standstill if the case requires it or the contact is later.
-
-    `stays` (B,) [s] is the time from the motion's end to the contact.
-    """
+    """Test that a motion ends at standstill if the case requires it or the contact is later."""
     rates = np.abs(judging.derivative(motion.coeffs[..., -1], motion.durations[:, -1], 1))
     has_to = (case["ends_at_rest"] != 0.0) | (stays > judging.CONTACT_TIME_TOLERANCE)
     time = motion.starts[:, -1] + motion.durations[:, -1]

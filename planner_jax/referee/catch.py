@@ -130,17 +130,15 @@ def referee_catches(
             pos, vel = target_states(cases.targets, order, times)
     leaves["target pos"] = judging.check_leaf("target_states' pos", pos, (*shape, 3))
     leaves["target vel"] = judging.check_leaf("target_states' vel", vel, (*shape, 3))
+    tolerances = {"relative": tolerance, "contact": contact_tolerance}
+    tolerances["continuity"] = continuity_tolerance
     judge = functools.partial(
         _judge,
         extras=cases.extras,
         intervals=quadrotor.intervals_of(leaves["durations"].shape[1] // shape[1]),
         net_test=net_test,
         optional=bool(cases.optional),
-        tolerances={
-            "relative": tolerance,
-            "contact": contact_tolerance,
-            "continuity": continuity_tolerance,
-        },
+        tolerances=tolerances,
     )
     return CatchVerdict(**judging.judge_in_chunks(judge, leaves, chunk=2048))
 

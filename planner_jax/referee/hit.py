@@ -101,12 +101,8 @@ def referee_hits(
     leaves = quadrotor.read_flight(cases, plans)
     leaves |= judging.read_leaves(cases, _CASE_SHAPES, len(leaves["lane"]))
     leaves |= judging.read_leaves(plans, {"stroke.time": ()}, len(leaves["lane"]))
-    tolerances = {
-        "relative": tolerance,
-        "landing": landing_tolerance,
-        "contact": contact_tolerance,
-        "continuity": continuity_tolerance,
-    }
+    tolerances = {"relative": tolerance, "continuity": continuity_tolerance}
+    tolerances |= {"landing": landing_tolerance, "contact": contact_tolerance}
     judge = functools.partial(
         _judge,
         extras=cases.extras,

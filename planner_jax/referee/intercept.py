@@ -224,13 +224,8 @@ def _judge(case: dict, relative: float, contact: float) -> dict:
 
 def final_poses(plans, body) -> np.ndarray:
     """Return the rear axles' poses (x [m], y [m], heading [rad]) at the end of B plans, (B, 3)."""
-    case = {
-        "plan.start": plans.start,
-        "plan.speed": plans.speed,
-        "plan.curvature": plans.curvature,
-        "body.length": body.length,
-        "body.rear_overhang": body.rear_overhang,
-    }
+    case = {f"plan.{name}": getattr(plans, name) for name in ("start", "speed", "curvature")}
+    case |= {f"body.{name}": getattr(body, name) for name in ("length", "rear_overhang")}
     case = {name: np.asarray(leaf, np.float64) for name, leaf in case.items()}
     end = np.asarray(plans.time, np.float64)
     # For a plan whose time is not in (0, `LONGEST_PLAN`], the start pose is returned.

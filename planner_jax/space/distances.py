@@ -255,10 +255,8 @@ def _share_nearest_to_slabs(slabs: list[_Slab]) -> Array:
     slabs. The derivative's zero is interpolated between the last kink with a value <= 0 and the
     first kink with a value >= 0. If it is 0 on an interval, the interval's middle is returned.
 
-    In this form the term of a slab is exactly 0 at the slab's own kinks, also in float32. A term
-    computed from coordinates would have a rounding error in proportion to the segment's length
-    across the slab. This error could exceed the terms of slabs that are nearly parallel to the
-    segment, and move the zero.
+    In this form the term of a slab is exactly 0 at the slab's own kinks, also in float32. Rounding
+    errors of coordinates could exceed the terms of slabs that are nearly parallel to the segment.
     """
 
     def half_derivative(s: Array | float) -> Array:

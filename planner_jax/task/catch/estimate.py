@@ -89,10 +89,7 @@ arrivals = jax.vmap(arrival, (0, None, None, None))  # `arrival` for N targets f
 
 
 def _out_of_reach(offset: Array, span: Array, speed: Array) -> Array:
-    """Return by how much [m] a flight of `span` (..., K) [s] falls short of its goal.
-
-    The goal is displaced by `offset` (..., 3, K) [m] from the start of the flight.
-    """
+    """Return how far [m] a flight of `span` (..., K) [s] ends short of a displacement `offset`."""
     span = jnp.maximum(span - _TURNING, 0.0)
     rise = speed / _ACCELERATION
     reach = jnp.where(span < rise, 0.5 * _ACCELERATION * span**2, speed * span - 0.5 * speed * rise)

@@ -232,15 +232,9 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
     def guess_ends(self, context: HitContext, num: int) -> Array:
         """Return the 8 variables of the impact in the first `num` starting points, (num, 1, 8)."""
         fraction, flight_time, thrust = jnp.asarray(_GUESSES[:num], context.landing_time.dtype).T
-        times = jnp.stack(
-            [
-                jnp.log(fraction * jnp.maximum(context.landing_time, 0.1)),
-                jnp.log(flight_time),
-                jnp.log(thrust * context.case.gravity),
-            ],
-            axis=1,
-        )
-        natural = jnp.pad(times, ((0, 0), (0, 5)))
+        time = fraction * jnp.maximum(context.landing_time, 0.1)
+        sizes = (time, flight_time, thrust * context.case.gravity)
+        natural = jnp.pad(jnp.stack([jnp.log(each) for each in sizes], axis=1), ((0, 0), (0, 5)))
         if num > 2:  # in hard cases the racket must also move across its normal
             moving = jax.vmap(lambda each: self._set_passing_speed(each, context))(natural[2:])
             natural = jnp.concatenate([natural[:2], moving])
@@ -316,14 +310,7 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
                 natural[5:],
             ]
         )
-        stroke = Stroke(
-            time=time,
-            ball_pos=ball.pos,
-            ball_vel=ball.vel,
-            ball_vel_after=after,
-            normal=normal,
-            flight_time=flight_time,
-        )
+        stroke = Stroke(time, ball.pos, ball.vel, after, normal, flight_time)
         return Impact(stroke=stroke, tail_state=tail_state, apex=apex)
 
     def rules_out(self, context: HitContext) -> Array:

@@ -92,16 +92,10 @@ class ReplanHit(OptimisedPlanner):
         path = task.previous.trajectory
         vel, acc, jerk = (evaluate(path, total_duration(path), order) for order in (1, 2, 3))
         pull = net_thrust(acc, task.case.gravity)
-        across_x, across_y = tangent_basis(stroke.normal)
+        across = jnp.stack([jnp.sum(vel * each) for each in tangent_basis(stroke.normal)])
         times = jnp.stack([stroke.time - task.elapsed, stroke.flight_time])
         sizes = jnp.append(times, jnp.sqrt(jnp.sum(pull**2)))
-        natural = jnp.concatenate(
-            [
-                jnp.log(jnp.maximum(sizes, _SHORTEST)),
-                jnp.stack([jnp.sum(vel * across_x), jnp.sum(vel * across_y)]),
-                jerk,
-            ]
-        )
+        natural = jnp.concatenate([jnp.log(jnp.maximum(sizes, _SHORTEST)), across, jerk])
         return planner.join(jnp.zeros((1, planner.num_offsets // 3, 3), sizes.dtype), natural[None])
 
     def guesses(self, context: ReplanHitContext, num: int) -> Array:

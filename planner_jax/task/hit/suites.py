@@ -118,10 +118,7 @@ def _random(seed: int, stream: int, block: int) -> np.random.Generator:
 
 
 def _draw_block(chosen: np.ndarray, seed: int, block: int):
-    """Draw N serves, `_ROUNDS` of each scenario in `chosen`.
-
-    Return their scenarios (N,), positions (N, 3) [m] and velocities (N, 3) [m/s].
-    """
+    """Draw `_ROUNDS` serves of each scenario: scenarios (N,), positions and velocities (N, 3)."""
     random = _random(seed, _SERVE_STREAM, block)
     scenario = random.permuted(np.tile(chosen, (_ROUNDS, 1)), axis=1).ravel()
     states = np.zeros((2, len(scenario), 3))

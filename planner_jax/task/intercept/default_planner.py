@@ -75,9 +75,8 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
         protocol.require_settings(self)
         if self.searches is not None:
             protocol.require_attempts("searches", self.searches, Search)
-        require(
-            self.meet in ("given", "early", "least"), "meet", "given, early or least", self.meet
-        )
+        is_known = self.meet in ("given", "early", "least")
+        require(is_known, "meet", "given, early or least", self.meet)
 
     @property
     def attempts(self) -> tuple[Search, ...]:

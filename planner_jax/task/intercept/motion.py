@@ -221,13 +221,9 @@ def by_unknowns(drive: Motion, cost: Quadratic, is_time_free: bool) -> tuple[Arr
     def spread(values: Array) -> Array:
         return jnp.repeat(flatten(values), num, axis=1)
 
-    lower = jnp.where(
-        gap >= 2,
-        product(rigid + next_left + own_right),
-        jnp.where(
-            gap == 1, product(rigid + next_left) + spread(beside), product(rigid) + spread(same)
-        ),
-    )
+    far = product(rigid + next_left + own_right)
+    near, own_knot = product(rigid + next_left) + spread(beside), product(rigid) + spread(same)
+    lower = jnp.where(gap >= 2, far, jnp.where(gap == 1, near, own_knot))
     curvature = jnp.where(gap >= 0, lower, lower.T)
     gradient = pull[:, rights] + shift(pull[:, lefts], 1)
     gradient = flatten(gradient + jnp.sum(twist * later[:, None, :, 8], axis=-1))

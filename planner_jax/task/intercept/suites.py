@@ -127,8 +127,7 @@ def _candidates(suite: Suite, kinds: np.ndarray, uniform: np.ndarray) -> Draws:
     """Make one candidate for each of B cases from uniform random numbers of [0, 1).
 
     `kinds` (B, 3) is the same for all candidates of a case: it determines whether the target turns,
-    and the numbers of walls and moving obstacles. `uniform` has the shape (B,
-    `_count_numbers(suite)`).
+    and the numbers of walls and moving obstacles. `uniform` is (B, `_count_numbers(suite)`).
     """
     turning, count_walls = kinds[:, 0] < 0.5, _integer(kinds[:, 1], *suite.num_walls)
     count_movers = _integer(kinds[:, 2], *suite.num_movers)
