@@ -6,7 +6,8 @@ from jax import Array, lax
 
 from planner_jax.plane.obstacles import Obstacles, distances
 
-# A wall's second half of corners is skipped if it only repeats a corner, and has `_HALF` or more.
+# The corners of a wall are padded by repeating its last corner. If the second half of the corners
+# is only padding, and has at least `_HALF` corners, distances are computed from the first half.
 _HALF = 4
 
 

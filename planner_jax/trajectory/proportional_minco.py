@@ -90,12 +90,11 @@ def _hermite_map(order: int) -> np.ndarray:
 
 
 def _energy(coefficients: np.ndarray, shares: np.ndarray) -> np.ndarray:
-    """Return the integral of a spline's |p^(s)|^2 as a quadratic form (C, C) in C numbers.
+    """Return the matrix (C, C) of the integral of a spline's |p^(s)|^2, a quadratic form.
 
-    These are scaled end states and waypoint offsets. `coefficients` (M, 2s, C) map them to the
-    polynomials of M pieces, and `shares` (M,) are the pieces' durations. The form is computed as a
-    sum of squares, because rounding errors could otherwise exceed the small integral of a smooth
-    motion far from the origin.
+    The C numbers, end states and waypoint offsets, define the spline: `coefficients` (M, 2s, C) map
+    them to polynomials of M pieces with durations `shares` (M,). The matrix is a sum of squares, as
+    rounding errors could otherwise exceed the small integral of a motion far from the origin.
     """
     s = coefficients.shape[1] // 2
     root = np.linalg.cholesky(polynomial.energy_form(2 * s - 1, s)[0][s:, s:]).T
@@ -208,7 +207,8 @@ def by_pieces(
     """Apply a function to the motion of each piece, one piece after another to save memory.
 
     The function takes the motion at `nodes` + 1 samples of a piece, and the piece's duration [s].
-    Its results get a leading axis of M. The other arguments are as for `sample_motion`.
+    The results of the M pieces are stacked on a leading axis. See `sample_motion` for the other
+    arguments.
     """
     each = np.stack([maps.sample_matrix(nodes, d) for d in range(4)])
     indices = np.arange(maps.num_pieces)[:, None] * nodes + np.arange(nodes + 1)
@@ -266,7 +266,7 @@ def offset_energy(maps: ProportionalMinco, offsets: Array, piece_duration: Array
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _boundary_form(maps: ProportionalMinco, rows: Array) -> Array:
-    """Return `boundary_energy` () of scaled end states (2s, 3) for a mean piece duration of 1 s."""
+    """Return the least integral () of |p^(s)|^2 for end states (2s, 3), with pieces of mean 1 s."""
     return jnp.sum(rows * _by_rows(maps, rows))
 
 

@@ -22,7 +22,7 @@ _HIGHEST = lax.Precision.HIGHEST
 
 @dataclasses.dataclass(frozen=True)
 class Weights:
-    """Weights of the residuals of least squares."""
+    """Weights of the residuals whose squares the search for an arm's motion minimises."""
 
     meeting: float = 100.0  # [1/m], of the ball's distances from the shield's plane and middle
     tilt: float = 30.0  # [1/rad], of the shield's tilt against the ball's path
@@ -63,9 +63,10 @@ def angles_at(start: Array, first: Array, steps: Array, shares: tuple[float, ...
 
 
 class JointTerms(NamedTuple):
-    """Sum of squares of residuals r: excesses over joint limits, and accelerations; derivatives.
+    """Cost of joint limits and accelerations, a sum of squared residuals r, with derivatives.
 
-    J is the Jacobian of a joint's residuals by its K steps and the time of contact.
+    J is the Jacobian of a joint's residuals by the joint's rates after K pieces of the motion,
+    multiplied by the duration, and by the time of contact.
     """
 
     cost: Array  # (), r . r, summed over the joints

@@ -272,7 +272,7 @@ class ExactCatch(ChainPlanner[CatchCase, CatchPlan]):
         across = jnp.stack(jax.vmap(tangent_basis)(axis), axis=1)  # (N, 2, 3)
         share = jnp.sum(across * miss[:, None], axis=2) / (_RIM * net.radius)
         squared = jnp.sum(share**2, axis=1, keepdims=True)
-        # Keep the catch point off the rim, where it would hardly move with its variables.
+        # At the hoop's rim the catch point hardly moves with its two variables: keep it inside.
         share *= jnp.minimum(1.0, _ENCODED_RIM / jnp.sqrt(jnp.maximum(squared, 1e-12)))
         place = share / jnp.sqrt(1.0 - jnp.sum(share**2, axis=1, keepdims=True))
         natural = jnp.concatenate(
@@ -281,7 +281,7 @@ class ExactCatch(ChainPlanner[CatchCase, CatchPlan]):
         return self.join(offsets, natural)
 
     def rules_out(self, context: CatchContext) -> Array:
-        """Return whether `is_too_far` proves that no plan exists."""
+        """Return whether a target is provably out of the quadrotor's reach at all times, () bool."""
         return is_too_far(context)
 
     def make_plan(

@@ -40,9 +40,8 @@ _SOONEST = 0.01  # earliest time of a meeting, divided by the case's time
 _FOLLOWING = terms.Weights(follow=10.0, obstacle=0.0, early=0.0)
 _KEEPING = terms.Weights()
 _SETTLING = terms.Weights(effort=10.0)
-_HURRYING = terms.Weights(
-    early=1000.0
-)  # of the last stage if the meeting shall be as early as possible
+# Weights of the last stage if the meeting shall be as early as possible.
+_HURRYING = terms.Weights(early=1000.0)
 # Weight of the meeting time when the cost is differentiated. It is small beside the weight of the
 # limits, whose penalties start before a limit is reached: the minimum then exceeds no limit.
 _EARLY = 30.0
