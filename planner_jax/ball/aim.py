@@ -43,7 +43,7 @@ def aim_with_drag(
 
 @jax.custom_jvp
 def _aim(displacement: Array, flight_time: Array, drag: Array, gravity: Array) -> Array:
-    """Return the velocity of `aim_with_drag` for the displacement (3,) [m] to the target."""
+    """Return the initial velocity (3,) with which a ball with drag moves by `displacement` [m]."""
 
     def newton_step(_: Array, near: tuple[Array, Array]) -> tuple[Array, Array]:
         def landing(vel: Array) -> tuple[Array, Array]:

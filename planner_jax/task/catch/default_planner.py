@@ -281,7 +281,7 @@ class ExactCatch(ChainPlanner[CatchCase, CatchPlan]):
         return self.join(offsets, natural)
 
     def rules_out(self, context: CatchContext) -> Array:
-        """Return whether a target is provably out of the quadrotor's reach at all times, () bool."""
+        """Return whether a target is provably never within the quadrotor's reach, () bool."""
         return is_too_far(context)
 
     def make_plan(

@@ -314,7 +314,7 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
         return Impact(stroke=stroke, tail_state=tail_state, apex=apex)
 
     def rules_out(self, context: HitContext) -> Array:
-        """Return whether the ball is provably out of the quadrotor's reach at all times, () bool."""
+        """Return whether the ball is provably never within the quadrotor's reach, () bool."""
         return is_too_far(context)
 
     def make_plan(

@@ -21,8 +21,8 @@ from planner_jax.plane.distance_field import DistanceField, distance_field
 from planner_jax.task.intercept.case import InterceptCase
 from planner_jax.task.intercept.terms import discs_of, wrap
 
-# Memory of a search for one path, and for one 32-bit word of its set of reachable cells, in units
-# of the memory of one starting point of a planner with few unknowns.
+# Memory that a search needs for each path, and for each 32-bit word of its set of reachable cells.
+# The unit is the memory for one starting point of a planner with few unknowns.
 _PATH_STARTS = 8
 _WORD_STARTS = 1 / 32768
 _PADDED = ("paths", "candidates")
