@@ -134,7 +134,6 @@ def _write_place(file: str, names: set[str]) -> str:
 
 
 def main() -> int:
-    """Write docs/equations.md, or return 1 if the page differs from the citations in the code."""
     if "--write" in sys.argv:
         PAGE.write_text(make_page())
     stale = not PAGE.exists() or PAGE.read_text() != make_page()

@@ -22,22 +22,14 @@ def assert_gradient_matches_differences(function, point, *, step=1e-5, rtol=1e-7
     gradient = jax.tree.map(np.asarray, value_and_gradient(function)(point)[1])
     rng = np.random.default_rng(0)
     for _ in range(directions):
-        direction = jax.tree.map(
-            lambda x: np.max(np.abs(x), initial=0.1) * rng.normal(size=x.shape), point
-        )
-        ahead, behind = (
-            float(value_and_gradient(function)(along(point, direction, h))[0])
-            for h in (step, -step)
-        )
-        terms = np.concatenate(
-            jax.tree.leaves(jax.tree.map(lambda g, d: np.ravel(g * d), gradient, direction))
-        )
-        np.testing.assert_allclose(
-            np.sum(terms),
-            (ahead - behind) / (2.0 * step),
-            rtol=0.0,
-            atol=rtol * np.sum(np.abs(terms)),
-        )
+        sized = lambda x: np.max(np.abs(x), initial=0.1) * rng.normal(size=x.shape)  # noqa: E731
+        direction = jax.tree.map(sized, point)
+        ends = (along(point, direction, h) for h in (step, -step))
+        ahead, behind = (float(value_and_gradient(function)(end)[0]) for end in ends)
+        products = jax.tree.map(lambda g, d: np.ravel(g * d), gradient, direction)
+        terms = np.concatenate(jax.tree.leaves(products))
+        slope, atol = (ahead - behind) / (2.0 * step), rtol * np.sum(np.abs(terms))
+        np.testing.assert_allclose(np.sum(terms), slope, rtol=0.0, atol=atol)
 
 
 def double(tree):

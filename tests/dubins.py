@@ -17,8 +17,6 @@ _TURN = 2.0 * jnp.pi
 
 @struct.dataclass
 class DubinsPath:
-    """A path of three parts, each a straight line or an arc of the greatest curvature."""
-
     start: Array  # (3,) x [m], y [m], heading [rad]
     word: Array  # () int32, index in WORDS
     lengths: Array  # (3,) [m], of the three parts
@@ -26,7 +24,6 @@ class DubinsPath:
 
     @property
     def length(self) -> Array:
-        """The length () [m] of the whole path."""
         return self.lengths.sum(axis=-1)
 
 

@@ -13,11 +13,8 @@ def assert_full_precision(function, *args):
     At a lower precision a GPU rounds float32 factors to TF32. Check derivatives, such as
     `jax.grad(function)`, by calls of their own. The result is the number of products.
     """
-    products = [
-        equation
-        for equation in equations(jax.make_jaxpr(function)(*args))
-        if equation.primitive.name in PRODUCTS
-    ]
+    every = equations(jax.make_jaxpr(function)(*args))
+    products = [equation for equation in every if equation.primitive.name in PRODUCTS]
     for product in products:
         shapes = " and ".join(str(operand.aval) for operand in product.invars)
         assert product.params["precision"] == HIGHEST, (

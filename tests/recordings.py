@@ -6,10 +6,7 @@ from planner_jax.sims.recording import Recording
 
 
 def recording(num=6, met=0.04, target=(np.nan,) * 3):
-    """Return a `Recording`, `num` samples 10 ms apart: a quadrotor rises at 1 m/s, a ball falls.
-
-    They meet at the time `met` [s]. The quadrotor's last sample is NaN.
-    """
+    """Return a `Recording` of a quadrotor that rises at 1 m/s and meets a falling ball at `met`."""
     time = 0.01 * np.arange(num)
     pos = np.stack([0.0 * time, 0.0 * time, 1.0 + time], axis=1)
     pos[-1] = np.nan

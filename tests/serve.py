@@ -17,12 +17,6 @@ def serve(pos=SERVE_POS, vel=SERVE_VEL, dtype=np.float64):
     return BallState(pos=np.array(pos, dtype), vel=np.array(vel, dtype))
 
 
-def three_balls():
-    """Return a batch of three balls: a served ball, a ball at rest and a falling ball."""
-    positions = np.array([SERVE_POS, (0.0, 0.0, 0.0), (-1.0, 2.0, 0.3)])
-    return BallState(positions, np.array([SERVE_VEL, (0.0, 0.0, 0.0), (0.0, -20.0, 1.0)]))
-
-
 def assert_close(a, b, **tolerance):
     jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, **tolerance), a, b)
 

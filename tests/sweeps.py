@@ -57,6 +57,25 @@ def stop_after(monkeypatch, sweep, num_chunks):
     monkeypatch.setattr(sweep, "plan", plan)
 
 
+def write_rows(folder, rows, *, kind="sweep hit", is_finished=True, parameters=()):
+    """Write the folder of a run, finished or not, that has these rows; return the folder."""
+    manifest = {"kind": kind, "state": "running", "parameters": dict(parameters), "sessions": []}
+    manifest |= {"run": "", "settings": "", "setting": {"gravity": 9.81}}
+    manifest |= {"versions": {}, "device": {}}
+    run = RunFolder(folder, name="RUN")
+    with run.create(manifest):
+        if is_finished:
+            num, successes = len(rows), sum(rows["success"].to_pylist())
+            summary = {"num": num, "successes": successes, "success_rate": successes / num}
+            summary |= {"wilson_95": [0.0, 1.0], "plans_per_second_warm": 500.0}
+            summary |= {"status_counts": {}, "failed_limits": {}}
+            seconds = {f"{name}_seconds": 2.0 for name in ("compile", "referee", "wall")}
+            run.plans.write_rows(rows)
+            manifest |= {"state": "complete", "summary": summary, "times": seconds}
+            run.write_manifest(manifest)
+    return run
+
+
 class RunTests:
     """Tests of the fixture `finished`, a finished sweep; a subclass sets the class attributes."""
 

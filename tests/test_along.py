@@ -17,11 +17,10 @@ from planner_jax.lanes import over_lanes
 from planner_jax.robot.quadrotor import QuadrotorLimits
 from planner_jax.trajectory.proportional_minco import proportional_minco, sample_motion
 
-PROPORTIONS, LANES, SEGMENTS = (0.4, 1.0), 32, 2
-
-
+LANES, SEGMENTS = 32, 2
+SLOW_MODES = [pytest.param(mode, marks=pytest.mark.slow) for mode in MODES[2:]]
 ALONG = Along(
-    proportional_minco(2, PROPORTIONS),
+    proportional_minco(2, (0.4, 1.0)),
     5,
     lambda motion, given: motion_excess(motion, *given),
     margins=(0.1, 0.1, 0.1, 0.05),
@@ -30,10 +29,7 @@ ALONG = Along(
 
 
 def cases(num=LANES, dtype=np.float32):
-    """Draw `num` random trajectories that exceed every limit somewhere.
-
-    Returns coefficients ("columns"), durations of the segments [s], and gravity with the limits.
-    """
+    """Draw coefficients, durations [s], gravity and limits of flights that exceed every limit."""
     random = np.random.default_rng(0)
     columns = random.standard_normal((num, SEGMENTS, 5, 3)) * 0.7
     durations = random.uniform(0.2, 0.5, (num, SEGMENTS))
@@ -75,16 +71,11 @@ def test_it_is_the_trapezoid_sum_of_the_hinges(float64):
 
 def test_slopes_and_curvature_are_those_of_finite_differences(float64):
     x = jax.tree.map(lambda x: x[1], cases(dtype=np.float64))
+    waves = [np.cos(np.arange(leaf.size)).reshape(leaf.shape) for leaf in x[:2]]
     step = 1e-5
-    for moving in ((True, False), (False, True), (True, True)):  # Move x, the parameters, both.
-        direction = (
-            jax.tree.map(
-                lambda leaf, m=moving[0]: m * np.cos(np.arange(leaf.size)).reshape(leaf.shape),
-                x[:2],
-            ),
-            jax.tree.map(lambda leaf, m=moving[1]: m * np.ones_like(leaf), x[2]),
-        )
-        direction = (*direction[0], direction[1])
+    for a, b in ((1.0, 0.0), (0.0, 1.0), (1.0, 1.0)):  # Move the flight, the parameters, both.
+        parameters = jax.tree.map(lambda leaf, b=b: b * np.ones_like(leaf), x[2])
+        direction = (*(a * wave for wave in waves), parameters)
         behind, here, ahead = (along_a_line(t, x, direction) for t in (-step, 0.0, step))
         for order, tolerance in ((0, 1e-7), (1, 1e-6)):
             expected = (ahead[order] - behind[order]) / (2.0 * step)
@@ -92,7 +83,7 @@ def test_slopes_and_curvature_are_those_of_finite_differences(float64):
 
 
 def test_the_greatest_of_every_limit_is_the_peak_between_the_samples(float64):
-    """Leave out the body rate: its peaks are too narrow even for 100 times finer samples."""
+    """Compare no body rates: their peaks are too narrow even for 100 times as many samples."""
     columns, durations, given = jax.tree.map(lambda x: x[0], cases(dtype=np.float64))
     along, finer = dataclasses.replace(ALONG, nodes=20), 100
 
@@ -144,7 +135,7 @@ def test_worst_has_no_derivative():
 
 
 def reference(mode):
-    """Return what a kernel must compute for one trajectory, as a function without a kernel."""
+    """Return a function that computes without a kernel what a kernel computes for one flight."""
 
     def value(*x):
         penalties, worst = integrate_along(ALONG, *x)
@@ -155,9 +146,8 @@ def reference(mode):
         num = range(3 if mode != "slopes" else 2)
 
         def segment(c, h, given):
-            (_, aux), by = jax.value_and_grad(value, argnums=num, has_aux=True)(
-                c[None], h[None], given
-            )
+            both = jax.value_and_grad(value, argnums=num, has_aux=True)
+            (_, aux), by = both(c[None], h[None], given)
             return jax.tree.map(lambda leaf: leaf[0], (*aux, by[0], by[1])), by[2:]
 
         return jax.vmap(segment, in_axes=(0, 0, None))(*x)
@@ -174,13 +164,7 @@ def reference(mode):
     }[mode]
 
 
-@pytest.mark.parametrize(
-    "mode",
-    [
-        "greatest",  # computed by the kernel of greatest excesses
-        *(pytest.param(mode, marks=[pytest.mark.slow] * (k > 1)) for k, mode in enumerate(MODES)),
-    ],
-)
+@pytest.mark.parametrize("mode", ["greatest", *MODES[:2], *SLOW_MODES])
 def test_the_kernel_gives_the_same_numbers(mode):
     args = cases()
     if mode == "curvature":
@@ -258,7 +242,7 @@ def test_the_kernel_declines_types_and_sizes_that_it_does_not_support():
 
 
 def test_the_name_of_a_kernel_does_not_depend_on_earlier_kernels(monkeypatch):
-    """Another process finds compiled programs by the names of their kernels."""
+    """Processes share compiled programs by the names of their kernels."""
     lane = jax.tree.map(lambda leaf: leaf[0], cases())
     others = [dataclasses.replace(ALONG, margins=(0.1, 0.1, 0.1, margin)) for margin in (0.2, 0.3)]
 

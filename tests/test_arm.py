@@ -1,9 +1,3 @@
-"""Tests of the six-axis arm with a shield: kinematics, dynamics, and its MJCF file.
-
-The results are compared with closed forms for the robot IRB 1600-6/1.2, and with MuJoCo, also for
-an arm whose frames are rotated arbitrarily.
-"""
-
 import dataclasses
 import xml.etree.ElementTree as ET
 from pathlib import Path
@@ -75,7 +69,7 @@ many_at = jax.jit(jax.vmap(everything_at, in_axes=(None, 0, 0, 0)))
 
 
 def everything(arm, angles, velocity=0.0, acceleration=0.0):
-    """Compute `Everything` at N <= NUM joint positions, repeated to NUM: one program."""
+    """Compute `Everything` at up to NUM joint positions, by one program for NUM positions."""
     motion = np.broadcast_arrays(angles, velocity, acceleration)
     rows = (np.resize(each, (NUM, 6)).astype(angles.dtype) for each in motion)
     found = many_at(without_capsules(arm), *rows)
@@ -116,7 +110,7 @@ def test_at_home_the_shield_is_low_in_front_and_the_motors_hold_the_weight():
 @float64
 @of_each_arm
 def test_the_jacobian_is_that_of_the_moving_shield(model):
-    """The angular velocity omega of a joint rate is in the skew matrix [omega] = dR/dq R^T."""
+    """Compare with the skew matrix dR/dq R^T of the angular velocity that each joint causes."""
     arm, step = read_arm(model, dtype=np.float64), 1e-6
     angles = some_angles(arm, 1)[0]
     steps = step * np.concatenate([np.zeros((1, 6)), np.eye(6), -np.eye(6)])
@@ -130,7 +124,7 @@ def test_the_jacobian_is_that_of_the_moving_shield(model):
 
 @pytest.fixture(scope="module", params=MODELS.values(), ids=MODELS)
 def simulated(request):
-    """Load an arm in MuJoCo and here, and draw angles, velocities, accelerations (9, 6)."""
+    """Load an arm in MuJoCo and in this library, and draw angles, rates, accelerations (9, 6)."""
     mujoco = pytest.importorskip("mujoco", reason="the extra `sims` is not installed")
     arm, rng = read_arm(request.param, dtype=np.float64), np.random.default_rng(1)
     motion = some_angles(arm, 9), *rng.normal(scale=(3.0, 20.0), size=(9, 6, 2)).transpose(2, 0, 1)
@@ -200,8 +194,7 @@ def test_inverse_kinematics_is_right_to_rounding_in_float32():
     angles = some_angles(arm, NUM)
     at = everything(arm, angles)
     assert at.branches.dtype == np.float32 and np.max(at.off[at.found]) < 2e-6
-    # The tolerance is large, because near a stretched arm or a straight wrist the angles are square
-    # roots of small differences, in which rounding errors are large.
+    # Near a stretched arm or a straight wrist the angles are square roots of rounding errors.
     assert np.max(from_the_nearest(at, angles)) < 1e-2
 
 

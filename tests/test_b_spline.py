@@ -1,5 +1,3 @@
-"""Clamped uniform B-splines: basis, derivatives, and the same curve as a piecewise polynomial."""
-
 import functools
 
 import jax
@@ -14,8 +12,7 @@ from planner_jax.trajectory.polynomial import evaluate
 
 SHARES = np.linspace(0.0, 1.0, 98)
 DURATION = 0.6
-# (degree, number of control points) of curves with one span, which are Bezier curves, and of curves
-# with several spans.
+# (degree, number of control points) of curves with one or several spans.
 SIZES = [(1, 4), (2, 3), (3, 4), (3, 7), (5, 9)]
 every_size = pytest.mark.parametrize("degree, num", SIZES)
 
@@ -32,10 +29,7 @@ def scipy_curve(degree, points):
 
 @functools.partial(jax.jit, static_argnums=(0, 3))
 def sample(degree, points, duration, order):
-    """Convert a B-spline to a piecewise polynomial; evaluate its derivative of the given order.
-
-    The times are the fractions `SHARES` of the duration.
-    """
+    """Evaluate a derivative of a B-spline, as a piecewise polynomial, at `SHARES` of its time."""
     trajectory = b_spline(degree, points, duration)
     times = jnp.asarray(SHARES, points.dtype) * duration
     return jax.vmap(lambda time: evaluate(trajectory, time, order))(times)
@@ -59,8 +53,7 @@ def test_a_derivative_is_the_spline_of_the_hodograph_between_whose_points_it_lie
     for order in range(1, degree + 1):
         of_derivative = hodograph(degree, order, num) @ points
         value = basis(degree - order, num - order, SHARES) @ of_derivative
-        # The end is not compared, because SciPy's derivative of piecewise linear curves is wrong
-        # there.
+        # At the end SciPy's derivative of piecewise linear curves is wrong.
         expected = scipy_curve(degree, points)(SHARES, order)[:-1]
         scale = np.abs(expected).max()
         np.testing.assert_allclose(value[:-1], expected, atol=1e-12 * scale)
@@ -93,9 +86,7 @@ def test_gradients_by_control_points_and_duration_match_differences(float64):
     weights = np.random.default_rng(0).normal(size=(3, len(SHARES), 6))
 
     def total(point):
-        return sum(
-            jnp.sum(weight * sample(3, *point, order)) for order, weight in enumerate(weights)
-        )
+        return sum(jnp.sum(each * sample(3, *point, order)) for order, each in enumerate(weights))
 
     assert_gradient_matches_differences(total, (control_points(7), DURATION))
 

@@ -1,4 +1,4 @@
-"""Tests of the published planners of hits: their equations hold, and failures have a status."""
+"""Tests of the published planners of hits."""
 
 import dataclasses
 import functools
@@ -28,13 +28,12 @@ GRAVITY = 9.8
 RESTITUTION = 0.7
 BAT = BatHit()
 JUGGLE = JuggleHit()
-
+position = jax.jit(lambda head, tail, end, t: evaluate(minimum_jerk(head, tail, end), t))
 float64 = pytest.mark.usefixtures("float64")
 
 
 @pytest.fixture(scope="module")
 def cases():
-    """Draw NUM hits, in NumPy arrays, for which one program plans all batches of up to 16 cases."""
     return jax.tree.map(np.asarray, to_cases(generate_serves(NUM, 5)))
 
 
@@ -51,9 +50,8 @@ def juggle_plans(cases):
 def serves_gone_wrong():
     """Return cases in which a paper's equation divides by zero or has no root, then a usual case.
 
-    In the first two cases the target is straight above or straight below the falling ball, so that
-    xi_x = xi_y = 0. In the next cases the ball falls straight down, is already below the height at
-    which `juggle` hits, lands immediately, or is at rest.
+    The target is straight above or straight below a falling ball; the ball moves straight up, is
+    below the height at which `juggle` hits, lands at once, or is at rest.
     """
     pos = [[-2.0, 0.0, 2.0]] * 3 + [[-2.0, 0.0, 1.0], [-2.0, 0.0, 0.01], [-2.0, 0.0, 3.0]]
     vel = [[0.0, 0.0, 7.0]] * 3 + [[0.0, 0.0, -4.0], [-3.0, 0.0, -8.0], [0.0, 0.0, 0.0]]
@@ -111,9 +109,8 @@ def test_the_flight_time_is_the_one_of_the_printed_equations():
     after_y = xi[:, 1] * (tau_y * vx - thrust[:, 0] * vy) / cross
     after_z = -thrust[:, 1] / tau_y * (vy - after_y) + vz
     np.testing.assert_allclose(hit.thrust[:, 1], tau_y, rtol=1e-9)
-    np.testing.assert_allclose(
-        hit.ball_vel_after, np.stack([after_x, after_y, after_z], axis=1), rtol=1e-8
-    )
+    after = np.stack([after_x, after_y, after_z], axis=1)
+    np.testing.assert_allclose(hit.ball_vel_after, after, rtol=1e-8)
 
 
 @float64
@@ -161,7 +158,7 @@ def test_a_ball_aimed_at_an_angle_leaves_at_it_and_arrives():
 
 
 def test_transition_point_of_an_example_by_hand():
-    """In the symbols of [Yu2023bat]: s_mid = (2, 0, 0) and p_alpha = (-3, 1.5, 0)."""
+    """Compute the transition point by hand, from s_mid = (2, 0, 0) and p_alpha = (-3, 1.5, 0)."""
     points = jnp.array([[-4.0, 3.0, 0.0], [-2.0, 0.0, 0.0], [4.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
     point = transition_point(**dict(zip(("start", "hit", "origin", "target"), points, strict=True)))
     np.testing.assert_allclose(point, [-3.0, 1.0, 0.0], atol=1e-6)
@@ -187,9 +184,6 @@ def first_guess(transition, case):
     impact, defect = bat.impact(natural[bat.num_offsets :], context)
     waypoints = natural[: bat.num_offsets].reshape(-1, 3)
     return waypoints, impact, defect, bat.transition_state(impact, case)
-
-
-position = jax.jit(lambda head, tail, end, t: evaluate(minimum_jerk(head, tail, end), t))
 
 
 @pytest.mark.parametrize("transition", [True, False])
@@ -224,9 +218,8 @@ def test_juggle_starts_at_rest_and_ends_in_its_fixed_stroke(cases, juggle_plans)
     np.testing.assert_allclose(juggle_plans.stroke.ball_pos[:, 2], JUGGLE.height, atol=1e-3)
     np.testing.assert_allclose(verdict.apex, JUGGLE.apex, atol=2e-3)
     np.testing.assert_allclose(verdict.hitting_velocity[:, :2], 0.0, atol=1e-3)
-    acc = jax.vmap(lambda path, time: evaluate(path, time, 2))(
-        juggle_plans.trajectory, juggle_plans.stroke.time
-    )
+    acc_of = jax.vmap(lambda plan: evaluate(plan.trajectory, plan.stroke.time, 2))
+    acc = acc_of(juggle_plans)
     np.testing.assert_allclose(acc[:, 2], 0.1 * GRAVITY, atol=2e-3)  # The thrust is 1.1 g.
 
 
@@ -237,7 +230,6 @@ def test_a_short_ease_leaves_the_minimum_jerk_primitive_and_joins_it_up_to_the_j
     eased_primitive = jax.jit(minimum_jerk_after_ramp, static_argnums=3)
 
     def derivatives(coeffs, t, num):
-        """Return value and derivatives up to order num - 1 of one polynomial at t, (num, 3)."""
         value = [np.polynomial.polynomial.polyder(coeffs, n) for n in range(num)]
         return np.stack([np.polynomial.polynomial.polyval(t, c) for c in value])
 
@@ -250,9 +242,8 @@ def test_a_short_ease_leaves_the_minimum_jerk_primitive_and_joins_it_up_to_the_j
         joint = derivatives(ramp, ease, 4), derivatives(primitive, 0.0, 4)
         np.testing.assert_allclose(*joint, rtol=1e-9, atol=1e-9)
         np.testing.assert_allclose(derivatives(primitive, end - ease, 3), tail, atol=1e-9)
-        np.testing.assert_allclose(
-            derivatives(primitive, 0.6 - ease, 1), derivatives(plain.coeffs[0], 0.6, 1), atol=away
-        )
+        middle, usual = derivatives(primitive, 0.6 - ease, 1), derivatives(plain.coeffs[0], 0.6, 1)
+        np.testing.assert_allclose(middle, usual, atol=away)
 
 
 def test_bat_meets_the_ball_and_reaches_the_target_on_every_lane(cases, bat_plans):

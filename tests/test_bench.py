@@ -1,5 +1,3 @@
-"""Tests of the benchmarks: they write run folders, and measure tasks that a user registered."""
-
 import csv
 import dataclasses
 import importlib
@@ -46,10 +44,8 @@ def test_the_throws_that_are_kept_are_those_of_the_seed():
         balls = pj.block.draw(2, suite, 7).ball
         kept = [[float(row[f"{axis} [m]"]) for axis in "xyz"] for row in rows[:2]]
         np.testing.assert_allclose(kept, balls.pos, rtol=1e-5)
-        marks = {
-            name: np.array([[digit == "1" for digit in row[name]] for row in rows])
-            for name in METHODS
-        }
+        digits = {name: [list(row[name]) for row in rows] for name in METHODS}
+        marks = {name: np.array(each) == "1" for name, each in digits.items()}
         assert marks["union"].shape == (2000, len(names.split(", ")))
         known = marks["straight"] | marks["planner"]
         np.testing.assert_array_equal(marks["union"], known | marks["long"])
@@ -95,7 +91,7 @@ def test_a_run_that_fails_says_so_and_no_run_is_overwritten(tmp_path):
 
 @struct.dataclass
 class Number:
-    """A case of the simplest possible task, as a user may register it: one number."""
+    """A case of the simplest possible task: one number."""
 
     value: jax.Array
 

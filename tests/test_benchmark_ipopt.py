@@ -1,5 +1,3 @@
-"""Objective, limits and derivatives of the problems for IPOPT, compared with the planners."""
-
 import dataclasses
 import functools
 import importlib.util
@@ -32,7 +30,6 @@ def setup(name):
 
 @functools.cache
 def points(name):
-    """Return decision variables near the initial guesses; some of their plans exceed limits."""
     starts = setup(name).batches["smooth"].starts
     return starts + 0.6 * np.random.default_rng(0).normal(size=starts.shape)
 
@@ -54,10 +51,9 @@ def test_objective_and_greatest_excess_are_those_of_the_planner(name):
     with jax.enable_x64(True):
         found = task._objective(jnp.asarray(points(name)), task.contexts)
     params = task.batches["smooth"].params
-    values = [
-        float(written.functions[0](*each)[0]) for each in zip(points(name), params, strict=True)
-    ]
-    worst = [float(written.worst(*each)) for each in zip(points(name), params, strict=True)]
+    pairs = list(zip(points(name), params, strict=True))
+    values = [float(written.functions[0](*each)[0]) for each in pairs]
+    worst = [float(written.worst(*each)) for each in pairs]
     np.testing.assert_allclose(values, found.cost, rtol=1e-12)
     np.testing.assert_allclose(np.array(worst) + BETWEEN_NODES, found.violation, rtol=1e-12)
     assert max(worst) > 0.0
@@ -137,6 +133,5 @@ def test_a_run_has_a_row_for_every_setting_solver_and_effort(monkeypatch, tmp_pa
     assert sum(row.get("chosen", False) for row in rows) == 2
     summary = json.loads((tmp_path / "run" / "manifest.json").read_text())["summary"]
     assert summary["num"] == 6 and summary["success_rate"] == 1.0
-    assert (
-        summary["cost_gap_median"] >= 0.0 and summary["hit_best_over_ipopt_penalties_smooth"] > 0.0
-    )
+    assert summary["cost_gap_median"] >= 0.0
+    assert summary["hit_best_over_ipopt_penalties_smooth"] > 0.0

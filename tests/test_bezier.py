@@ -1,19 +1,10 @@
-"""Bezier pieces of equal length: values, derivatives, energy, joints and bounds."""
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from planner_jax.baselines.intercept.bezier import (
-    BezierCurve,
-    bernstein,
-    bounds_of_pieces,
-    energy_of_pieces,
-    hodograph,
-    joints,
-    rows_of_pieces,
-)
+from planner_jax.baselines.intercept import bezier
+from planner_jax.baselines.intercept.bezier import BezierCurve, bernstein, hodograph
 
 PIECES, DEGREE, HORIZON = 4, 5, 3.0
 POINTS = np.random.default_rng(0).normal(size=(PIECES, DEGREE + 1))
@@ -50,7 +41,7 @@ def test_a_curve_of_a_polynomials_points_is_that_polynomial_with_all_its_derivat
 @float64
 def test_points_of_a_polynomial_join_up_to_every_derivative_and_others_do_not():
     smooth = of_polynomial(np.polynomial.Polynomial([1.0, 2.0, -0.5, 0.1, 0.3, -0.05]))
-    rows = joints(DEGREE, 3, PIECES)
+    rows = bezier.joints(DEGREE, 3, PIECES)
     assert rows.shape == ((PIECES - 1) * 4, PIECES * (DEGREE + 1))
     np.testing.assert_allclose(rows @ smooth.ravel(), 0.0, atol=1e-9)
     assert np.abs(rows @ POINTS.ravel()).min() > 1e-3
@@ -72,18 +63,19 @@ def test_the_energy_is_the_integral_of_the_squared_derivative(order):
     basis = bernstein(DEGREE - order, 0.5 + 0.5 * nodes)
     values = POINTS @ (basis @ hodograph(DEGREE, order, PIECES)).T
     integral = np.sum(values**2 @ weights) / (2 * PIECES)
-    form = energy_of_pieces(DEGREE, order, PIECES)
+    form = bezier.energy_of_pieces(DEGREE, order, PIECES)
     np.testing.assert_allclose(POINTS.ravel() @ form @ POINTS.ravel(), integral, rtol=1e-12)
 
 
 def test_rows_and_bounds_of_pieces_share_one_row_at_each_joint_with_both_bounds():
     of_piece = np.eye(DEGREE + 1)
-    rows = rows_of_pieces(of_piece, PIECES)
+    rows = bezier.rows_of_pieces(of_piece, PIECES)
     smooth = of_polynomial(np.polynomial.Polynomial([0.0, 1.0, 1.0]))
     value = rows @ smooth.ravel()
     assert len(value) == PIECES * DEGREE + 1
     bounds_at = smooth + np.array([0.0, 0.1, 0.0, 0.3])[:, None]
-    low, high = map(np.asarray, bounds_of_pieces(jnp.asarray(bounds_at), jnp.asarray(bounds_at)))
+    bounds_at = jnp.asarray(bounds_at)
+    low, high = map(np.asarray, bezier.bounds_of_pieces(bounds_at, bounds_at))
     assert low.shape == high.shape == value.shape
     places = np.arange(1, PIECES) * DEGREE
     np.testing.assert_allclose((low - value)[places], [0.1, 0.1, 0.3], atol=1e-6)

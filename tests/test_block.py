@@ -1,5 +1,3 @@
-"""Tests of blocks by an arm: throws, joint motions, least squares, and plans that block."""
-
 import dataclasses
 from typing import Any
 
@@ -28,8 +26,7 @@ from tests.derivatives import double
 SMALL = OnlineBlock(
     pieces=6, points=10, searches=(Search(straight=12, tries=3, solver=LevenbergConfig(8)),)
 )
-# A planner that tries only straight motions of the joints. It compiles much faster than the planner
-# with a search by least squares.
+# A planner that tries only straight motions of the joints, and compiles much faster.
 STRAIGHT = dataclasses.replace(SMALL, searches=(Search(straight=60, tries=0),))
 
 
@@ -177,15 +174,14 @@ def test_end_poses_meet_the_ball(float64):
 @pytest.mark.slow
 @pytest.mark.parametrize("regime", ["R1", "R2"])
 def test_slopes_of_least_squares_are_those_of_the_cost(regime, float64):
-    """The joints move at first, and the contact is too late, so that all residuals count."""
+    """Let joints move at first and the contact be too late, so that all residuals count."""
     case = throw(regime=regime, rates=(0.3, -0.2, 0.1, 0.2, -0.4, 0.5), dtype=jnp.float64)
     flight = flight_of(case)
     poses = end_poses(case, flight, SMALL.points, SMALL.pieces)
     nearest = rank_poses(poses, 1, 1.0 - SMALL.slack)[0]
     start = SMALL.encode_straight(case, poses, nearest)
     rng = np.random.default_rng(0)
-    # The changes are small, because the model approximates the derivative of the sine of an angle
-    # by the derivative of the angle.
+    # The changes are small, because the model replaces sines of small angles by the angles.
     point = start + jnp.asarray(rng.normal(0.0, 0.02, start.shape)).at[-1].set(0.0)
     point = point.at[-1].set(flight.latest + 0.01)
     model = jax.jit(lambda point: SMALL.model(point, case, flight))
@@ -231,7 +227,7 @@ def test_plans_of_a_batch_say_what_became_of_each_ball():
 
 
 def test_brisk_motions_end_before_the_ball_is_there():
-    """With `brisk` a motion to rest takes the least time, and reaches a limit of the joints."""
+    """Check that brisk motions to standstill take the least time, at a limit of the joints."""
     cases = jax.tree.map(np.array, pj.block.draw(8, seed=8))
     cases.ends_at_rest[4] = False
     plans, quick = (pj.plan(dataclasses.replace(STRAIGHT, brisk=b), cases) for b in (False, True))
@@ -260,11 +256,7 @@ def test_brisk_motions_end_before_the_ball_is_there():
         (throw, {"gravity": 0.0}, "gravity must be > 0, got 0"),
         (throw, {"angles": (0.0, 1.0)}, r"angles must have a .* ends with \(6,\), got \(2,\)"),
         (pj.block.draw, {"num": 0}, "num must be >= 1, got 0"),
-        (
-            pj.block.draw,
-            {"num": 1, "suite": "x"},
-            "suite must be one of pole, open, short, got 'x'",
-        ),
+        (pj.block.draw, {"num": 1, "suite": "x"}, "suite must be one of pole, .*, got 'x'"),
     ],
 )
 def test_an_error_in_a_case_or_a_draw_is_named(make, options, message):

@@ -27,6 +27,7 @@ ONLINE = OnlineBlock(pieces=6, points=10)
 LAYOUT = Layout((Face(0, 1, (3, 2)),), (Face(0, 1, (1, 2)),))
 EFFORT = Effort(neighbours=4, points=4, screened=6, samples=8, checks=3)
 BALL = ((9.0, 0.5, 0.3), (-8.0, -0.4, 5.4))
+GOOD = [0, 6, 7]  # cases of the fixture `planned` that can be planned
 
 
 def library(pieces=6, has_pole=True):
@@ -39,9 +40,8 @@ def library(pieces=6, has_pole=True):
     num = (1, LAYOUT.num_pairs)
     vectors = (np.broadcast_to(each, (*num, 3)) for each in np.eye(3))
     row: Any = Row(steps[None], np.full(num, 0.9), *vectors)  # type: ignore[arg-type]
-    return library_of(
-        pack_rows(row), irb1600().home[None], LAYOUT, setting(has_pole=np.asarray(has_pole))
-    )
+    given = setting(has_pole=np.asarray(has_pole))
+    return library_of(pack_rows(row), irb1600().home[None], LAYOUT, given)
 
 
 def planner(has_pole=True):
@@ -86,9 +86,8 @@ def test_warped_motions_meet_the_ball_and_open_ones_keep_their_limits():
 
         def one(point):
             steps, first, duration = ONLINE.decode(case, point)
-            excess = joint_terms(
-                case, steps, first, duration, ONLINE.weights, 1.0 - ONLINE.slack
-            ).excess
+            share = 1.0 - ONLINE.slack
+            excess = joint_terms(case, steps, first, duration, ONLINE.weights, share).excess
             angles = case.angles + jnp.asarray(1.0 / 6.0) * jnp.sum(steps, axis=0)
             return contact_terms(case, flight, angles, point[-1], ONLINE.weights)[2], excess
 
@@ -116,15 +115,9 @@ def test_a_stored_motion_for_the_same_ball_is_not_warped():
 
 @pytest.fixture(scope="module")
 def planned():
-    """Return a planner, eight cases, and their plans. Only three of the cases can be planned."""
     own = planner(has_pole=False)
-    rng = np.random.default_rng(2)
-    num = 8
-    cases = pj.block.case(
-        np.array(BALL[0]) + rng.uniform(-0.15, 0.15, (num, 3)),
-        np.tile(BALL[1], (num, 1)),
-        scene=paper_scene(has_pole=False),
-    )
+    pos = np.array(BALL[0]) + np.random.default_rng(2).uniform(-0.15, 0.15, (8, 3))
+    cases = pj.block.case(pos, np.tile(BALL[1], (8, 1)), scene=paper_scene(has_pole=False))
     cases = jax.tree.map(np.array, cases)
     cases.ball.vel[1, 0] *= -1.0  # The ball flies away from the arm.
     cases.ball.pos[2] = np.nan
@@ -132,9 +125,6 @@ def planned():
     cases.limits.velocity[4] *= 0.5  # The limits differ from the library's.
     cases.rates[5, 0] = 0.1  # The arm is not at rest.
     return own, cases, jax.device_get(pj.plan(own, jax.tree.map(jnp.asarray, cases)))
-
-
-GOOD = [0, 6, 7]
 
 
 def test_statuses_name_the_reason_and_the_referee_confirms_solved_plans(planned):

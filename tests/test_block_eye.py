@@ -27,7 +27,7 @@ def test_the_camera_on_the_mast_sees_all_throws_nearly_until_they_can_be_met(sui
 
 
 def test_one_fit_after_a_quarter_of_a_second_is_within_reach_of_the_shield():
-    """Fit flights after 0.25 s at 60 Hz with 2 cm of noise; 90 % of the errors are below 0.1 m."""
+    """Observe for 0.25 s at 60 Hz with 2 cm of noise; 90 % of the errors must be below 0.1 m."""
     cases = pj.block.draw(1000, "short", seed=11)
     seen = see(cases, eye(std=0.02), 0.25)
     assert (seen.fits.num == 16).all() and (seen.fits.status == Sight.SEEN).all()
@@ -79,7 +79,7 @@ def test_the_referee_agrees_on_plans_for_the_true_ball(regime):
 
 
 def test_a_late_ball_meets_the_braking_arm():
-    """Delay a ball by 10 ms: the contact is about 10 ms later, where the shield is at that time."""
+    """Delay a ball by 10 ms, which must delay the contact by about 10 ms."""
     cases = jax.tree.map(np.asarray, pj.block.draw(6, seed=8, regime="R1", wide=True))
     near_middle = cautious(cases, offset=0.01)
     plans = pj.plan(SMALL, jax.tree.map(np.asarray, near_middle))

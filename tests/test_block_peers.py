@@ -24,6 +24,8 @@ from planner_jax.task.block.spec import TASK
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
 
 LIMITS = REGIMES["R2"].limits
+# Planner options for throws in a scene without a pole, in which the first path is collision-free.
+QUICK = {"points": 6, "budget": 20.0, "longest": 20.0}
 
 
 def require_peers(*packages):
@@ -37,10 +39,8 @@ def quickest(turn, rate, stretch):
     times = least_times(turn, rate, LIMITS.velocity, LIMITS.acceleration)
     duration = stretch * jnp.max(times)
     motion = bang_bang(jnp.zeros(6), rate, turn, duration, jnp.asarray(LIMITS.acceleration))
-    at = jax.vmap(
-        lambda share: jnp.stack([evaluate(motion, share * duration, k) for k in range(3)])
-    )
-    return at(jnp.linspace(0.0, 1.0, 400)), times
+    at = jax.vmap(lambda time: jnp.stack([evaluate(motion, time, k) for k in range(3)]))
+    return at(jnp.linspace(0.0, 1.0, 400) * duration), times
 
 
 def test_joints_from_rest_take_the_times_of_closed_forms(float64):
@@ -56,7 +56,7 @@ def test_joints_from_rest_take_the_times_of_closed_forms(float64):
 
 @pytest.mark.parametrize("stretch", [1.0, 1.3, 3.0])
 def test_joints_arrive_together_at_rest_within_their_limits(stretch, float64):
-    """The joints start at rest, towards the goal, away from it, or too fast to stop before it."""
+    """Start joints at rest, towards the goal, away from it, or too fast to stop before it."""
     rng = np.random.default_rng(0)
     for scale in (0.0, 1.0):
         turn = rng.uniform(-1.5, 1.5, 6) * np.array([1, 1, 1, 1, 0.01, 0.0])
@@ -88,7 +88,7 @@ def test_an_arm_at_rest_exerts_the_torque_of_gravity(float64):
 
 
 def test_constant_acceleration_takes_the_torque_of_inertia(float64):
-    """Joint 1 accelerates for the first half and brakes for the second, without gravity."""
+    """Accelerate joint 1 in the first half and brake it in the second, without gravity."""
     arm: Any = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), irb1600())
     acceleration, half = 3.0, 0.2
     rows = np.zeros((2, 3, 6))
@@ -202,10 +202,6 @@ def test_without_the_extra_the_error_names_it(name, package, monkeypatch):
         pj.block.planner(name)
     others = BlockSweep(TASK).other_planners(BlockSettings(planner="online"))
     assert name not in others and {"direct", "insat"} <= others.keys()
-
-
-# Planner options for throws in a scene without a pole, in which the first path is collision-free.
-QUICK = {"points": 6, "budget": 20.0, "longest": 20.0}
 
 
 def plan_and_confirm(name, regime, **options):

@@ -1,4 +1,4 @@
-"""Tests of arms that plan again while they observe the ball: estimates and joined motions."""
+"""Tests of arms that plan again while they observe the ball."""
 
 import dataclasses
 
@@ -42,11 +42,9 @@ def test_a_perfect_camera_gives_the_plans_of_no_camera(cases):
     solved = pj.are_solved(plans)
     assert solved.sum() >= 2
     np.testing.assert_array_equal(pj.are_solved(done.plans), solved)
-    np.testing.assert_allclose(
-        done.plans.contact_time[solved], plans.contact_time[solved], atol=1e-3
-    )
-    ours, theirs = (each.motion.coeffs[solved, :, 0] for each in (done.plans, plans))
-    np.testing.assert_allclose(ours, theirs, atol=1e-2)
+    both = take(done.plans, solved), take(plans, solved)
+    np.testing.assert_allclose(*(each.contact_time for each in both), atol=1e-3)
+    np.testing.assert_allclose(*(each.motion.coeffs[:, :, 0] for each in both), atol=1e-2)
 
 
 @pytest.mark.slow
@@ -67,8 +65,7 @@ def test_composed_pieces_are_one_motion_within_rate_limits(cases):
     done = decide(SMALL, cases, eye(std=0.02), [0.15, 0.25, 0.35, 0.45], aims=AIMS)
     verdict, solved = judge(done)
     assert (done.motions[solved] >= 1).all() and done.motions.max() >= 2
-    # Position limits are not in this list, because an arm that brakes after a missed contact may
-    # exceed them.
+    # An arm that brakes after a missed contact may exceed its position limits.
     of_joints = ("time", "start", "continuity", "velocity", "acceleration", "rest")
     assert not np.isin(verdict.failed_limit[solved], of_joints).any()
     assert verdict.success[done.motions >= 2].any()
@@ -115,9 +112,8 @@ def test_the_noise_of_a_throw_does_not_depend_on_its_batch(cases):
     seeds = np.arange(6, dtype=np.uint32)
     every = decide(SMALL, cases, eye(std=0.02), [0.2], seed=seeds, aims=AIMS[:1])
     some = decide(SMALL, take(cases, slice(2, 5)), eye(std=0.02), [0.2], seed=seeds[2:5], aims=AIMS)
-    np.testing.assert_allclose(
-        every.fits.belief.mean[:, 2:5], some.fits.belief.mean, rtol=1e-4, atol=1e-4
-    )
+    ours, theirs = every.fits.belief.mean[:, 2:5], some.fits.belief.mean
+    np.testing.assert_allclose(ours, theirs, rtol=1e-4, atol=1e-4)
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,3 @@
-"""Re-planning of catches: the search starts at the remainder of the previous plan."""
-
 import dataclasses
 
 import jax
@@ -23,7 +21,6 @@ UNCHANGED = ReplanCatch(rounds=(Round(starts=1, solver=LbfgsConfig(max_steps=0))
 
 
 def plan_first(name, num):
-    """Draw `num` cases of a suite, choose the times of the catches, and plan from scratch."""
     cases = draw(num, name)
     times = np.linspace(0.7, 0.9, cases.num_targets) * np.asarray(cases.horizon)
     cases = jax.tree.map(np.asarray, dataclasses.replace(cases, times=times))
@@ -54,11 +51,8 @@ def ahead(cases, elapsed, noise=0.0):
 def assert_same_flight(old, new, elapsed, until, atol):
     """Assert that `new` plans continue the `old` ones at `elapsed` for `until` [s]."""
     for share in np.linspace(0.0, 1.0, 23):
-        times = share * until
-        found, expected = (
-            states_at(new.trajectory, times),
-            states_at(old.trajectory, elapsed + times),
-        )
+        found = states_at(new.trajectory, share * until)
+        expected = states_at(old.trajectory, elapsed + share * until)
         np.testing.assert_allclose(found[:, :3], expected[:, :3], rtol=0, atol=atol)
 
 
@@ -82,14 +76,11 @@ def test_a_batch_is_its_cases(throws):
     task = AGAIN.begin(cases, plans, elapsed, targets=ahead(cases, elapsed, 0.005))
     together = plan(AGAIN, task)
     for k in range(6):
-        alone_task = AGAIN.begin(
-            take(cases, k), take(plans, k), elapsed[k], targets=take(task.case.targets, k)
-        )
-        for one, many in zip(
-            jax.tree.leaves(alone_task), jax.tree.leaves(take(task, k)), strict=True
-        ):
+        targets = take(task.case.targets, k)
+        own = AGAIN.begin(take(cases, k), take(plans, k), elapsed[k], targets=targets)
+        for one, many in zip(*map(jax.tree.leaves, (own, take(task, k))), strict=True):
             np.testing.assert_allclose(one, many, rtol=1e-4, atol=1e-4)
-        alone = plan(AGAIN, alone_task)
+        alone = plan(AGAIN, own)
         np.testing.assert_allclose(alone.times, together.times[k], atol=2e-3)
         np.testing.assert_allclose(alone.cost, together.cost[k], rtol=0.02, atol=1e-6)
 

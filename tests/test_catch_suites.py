@@ -1,5 +1,3 @@
-"""Tests of the suites of catches: every draw is within the ranges that their module documents."""
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -46,12 +44,11 @@ def draw_doubles(name, num=NUM, seed=3):
 
 
 def away(pos):
-    """Return horizontal distances [m] of positions (..., 3) from the origin."""
     return np.linalg.norm(np.asarray(pos)[..., :2], axis=-1)
 
 
-def test_a_suite_is_a_matter_of_its_name_and_the_seed_alone():
-    """If a number changes, then the published benchmark cases change."""
+def test_a_suite_depends_on_its_name_and_the_seed_alone():
+    """Published results are for cases with these numbers."""
     np.testing.assert_allclose(draw(1, "throws").targets.ball.vel[0, 0, 1], -0.10602945, rtol=1e-5)
     np.testing.assert_allclose(draw(1, "hexagon6").targets.ball.pos[0, 0, 2], 2.3829162, rtol=1e-5)
     heptagon = draw(1, "heptagon7").targets.ball.pos[0, 0]

@@ -1,5 +1,3 @@
-"""Test how many files of the library are needed to plan a hit, which a reader must understand."""
-
 import subprocess
 import sys
 

@@ -1,4 +1,4 @@
-"""Tests of sweeps with a Ray cluster. Slow tests use Ray, the other tests a stand-in for it."""
+"""Tests of sweeps with a Ray cluster. Only tests of a "real cluster" start one."""
 
 import dataclasses
 import os
@@ -28,15 +28,16 @@ from tests.sweeps import rows_of, stop_after
 TASK = pj.task_named("hit")
 NUM, BATCH = 64, 13  # Numbers of cases and of cases in a chunk, which give five chunks.
 SETTINGS = HitSettings(num=NUM, batch=BATCH, seed=3)
+SWEEP = [sys.executable, "-m", "planner_jax", "sweep", "hit"]
 COMMAND = f"sweep hit --num {NUM} --batch {BATCH} --seed 3".split()
 
 
 class RayError(Exception):
-    """Stand-in for the error that Ray raises if a worker process dies too often."""
+    """Error of Ray if a worker process dies too often."""
 
 
 class RayTaskError(RayError):
-    """Stand-in for the error that Ray raises if a task raises an exception."""
+    """Error of Ray if a task raises an exception."""
 
     def __init__(self, cause):
         super().__init__("a long traceback\nof many lines")
@@ -44,7 +45,7 @@ class RayTaskError(RayError):
 
 
 class StandIn:
-    """Stand-in for the module ray: tasks run here, in reverse order, and `deaths` workers die."""
+    """Object in place of the module ray, which runs tasks in reverse order in this process."""
 
     exceptions = SimpleNamespace(RayError=RayError, RayTaskError=RayTaskError)
 
@@ -116,11 +117,11 @@ def quick():
 
 @pytest.fixture(autouse=True)
 def ray(monkeypatch, request):
-    """Replace the module ray by the stand-in, except in tests of a real cluster."""
+    """Replace the module ray, except in tests of a real cluster."""
     monkeypatch.delenv("RAY_ADDRESS", raising=False)
-    told = ("RAY_USAGE_STATS_ENABLED", "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER")
-    changed = ("XLA_PYTHON_CLIENT_PREALLOCATE", "XLA_CLIENT_MEM_FRACTION", "CUDA_VISIBLE_DEVICES")
-    for name in ("NPROC", "PJRT_NPROC", *told, *changed):
+    names = "NPROC PJRT_NPROC RAY_USAGE_STATS_ENABLED RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER "
+    names += "XLA_PYTHON_CLIENT_PREALLOCATE XLA_CLIENT_MEM_FRACTION CUDA_VISIBLE_DEVICES"
+    for name in names.split():
         monkeypatch.setenv(name, "1")  # The value is restored after the test.
     monkeypatch.delenv("CUDA_VISIBLE_DEVICES")
     monkeypatch.setattr(run, "write_report", lambda folder: None)
@@ -310,8 +311,7 @@ def test_a_worker_whose_jax_has_no_device_ends_a_run_that_can_be_finished(
 def test_a_run_with_a_real_cluster_survives_the_death_of_a_worker(tmp_path):
     pytest.importorskip("ray")
     plain, out = tmp_path / "plain", tmp_path / "run"
-    options = "--num 64 --batch 2 --planner juggle --out".split()
-    command = [sys.executable, "-m", "planner_jax", "sweep", "hit", *options]
+    command = [*SWEEP, *"--num 64 --batch 2 --planner juggle --out".split()]
     subprocess.run([*command, str(plain)], check=True, capture_output=True)
     pipes: dict = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
     with subprocess.Popen([*command, str(out), "--workers", "ray"], **pipes) as sweep:
@@ -342,14 +342,12 @@ def test_workers_of_a_real_cluster_that_hold_shares_of_gpus_make_the_same_rows(
     monkeypatch.setenv("NPROC", "4")
     monkeypatch.setenv("PJRT_NPROC", "4")
     plain, out = tmp_path / "plain", tmp_path / "run"
-    options = "--num 32 --batch 2 --planner juggle --out".split()
-    command = [sys.executable, "-m", "planner_jax", "sweep", "hit", *options, str(plain)]
+    command = [*SWEEP, *"--num 32 --batch 2 --planner juggle --out".split(), str(plain)]
     subprocess.run(command, check=True, capture_output=True)
     monkeypatch.setattr(cluster, "require_backend", lambda: "gpu")
     machine.threads_of_a_computation.cache_clear()  # This process plans nothing itself.
     try:
-        settings = HitSettings(num=32, batch=2, planner="juggle")
-        start(out, settings)
+        start(out, HitSettings(num=32, batch=2, planner="juggle"))
     finally:
         machine.threads_of_a_computation.cache_clear()
     assert rows_of(out) == rows_of(plain)
@@ -359,8 +357,8 @@ def test_workers_of_a_real_cluster_that_hold_shares_of_gpus_make_the_same_rows(
 def test_a_bad_case_of_a_worker_of_a_real_cluster_is_one_line_and_leaves_nothing(tmp_path):
     """Plan so late that serves of a later chunk have landed."""
     pytest.importorskip("ray")
-    options = "--num 40 --batch 4 --delay 1.56 --planner juggle --workers ray --out run".split()
-    command = [sys.executable, "-m", "planner_jax", "sweep", "hit", *options]
+    options = "--num 40 --batch 4 --delay 1.56 --planner juggle --workers ray --out run"
+    command = [*SWEEP, *options.split()]
     ended = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
     error = ended.stderr.splitlines()[-1]
     assert ended.returncode == 2 and "Traceback" not in ended.stderr

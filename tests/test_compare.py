@@ -1,5 +1,3 @@
-"""Tests of the comparison of two runs: which runs can be compared, and the reported numbers."""
-
 import csv
 
 import numpy as np
@@ -8,20 +6,18 @@ import pytest
 from scipy.stats import binomtest
 
 from planner_jax.cli.main import main
-from planner_jax.runs.run_folder import RunFolder
 from planner_jax.runs.summary import wilson_interval
 from planner_jax.sweep.compare import describe, difference_of, differing, other_cases, read_run
+from tests.sweeps import write_rows
 
 FAILED = {0: "", 1: "speed", 2: "landing"}
+ONE = [0] * 40 + [0] * 9 + [1] * 3 + [1] * 8
+OTHER = [0] * 40 + [2] * 9 + [0] * 3 + [1] * 8
 
 
 def write_run(folder, outcomes, *, kind="sweep hit", **settings):
-    """Write the folder of a finished run, whose case k has the result `outcomes[k]`.
-
-    The result 0 is a success. Any other number is the index of the failed limit in FAILED.
-    """
-    outcomes = np.array(outcomes)
-    num, successes = len(outcomes), int((outcomes == 0).sum())
+    """Write the folder of a finished run, whose case k succeeds or fails a limit of `FAILED`."""
+    outcomes, num = np.array(outcomes), len(outcomes)
     rows = pa.table(
         {
             "index": pa.array(np.arange(num)),
@@ -33,27 +29,8 @@ def write_run(folder, outcomes, *, kind="sweep hit", **settings):
     )
     own = {"planner": "exact", "suite": "court", "seed": 3, "num": num, "serves": None}
     own |= {"start": [0.0, 0.0, 1.5], "delay": 0.0, "limit_scale": 1.0}
-    manifest = {
-        "kind": kind,
-        "state": "running",
-        "parameters": {**own, **settings},
-        **{name: "" for name in ("run", "settings")},
-        **{name: {} for name in ("versions", "device")},
-        "sessions": [],
-    }
-    run = RunFolder(folder, name="RUN")
-    with run.create(manifest):
-        summary = {"num": num, "successes": successes, "success_rate": successes / num}
-        summary |= {"wilson_95": [0.0, 1.0], "plans_per_second_warm": 500.0}
-        summary |= {"status_counts": {}, "failed_limits": {}}
-        seconds = {f"{name}_seconds": 2.0 for name in ("compile", "referee", "wall")}
-        run.plans.write_rows(rows)
-        run.write_manifest({**manifest, "state": "complete", "summary": summary, "times": seconds})
+    write_rows(folder, rows, kind=kind, parameters={**own, **settings})
     return str(folder)
-
-
-ONE = [0] * 40 + [0] * 9 + [1] * 3 + [1] * 8
-OTHER = [0] * 40 + [2] * 9 + [0] * 3 + [1] * 8
 
 
 @pytest.fixture

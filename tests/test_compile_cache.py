@@ -1,5 +1,3 @@
-"""The folder of compiled programs: where it is, who may choose it, and its greatest size."""
-
 import os
 import subprocess
 import sys
@@ -29,10 +27,8 @@ def run(**environment):
     """Compile a program in a new process; return its output without the line's end."""
     usual = {name: text for name, text in os.environ.items() if not name.startswith("JAX_COMP")}
     usual.pop("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", None)
-    command = [sys.executable, "-c", SCRIPT]
-    done = subprocess.run(
-        command, env={**usual, **environment}, capture_output=True, text=True, check=True
-    )
+    command, env = [sys.executable, "-c", SCRIPT], {**usual, **environment}
+    done = subprocess.run(command, env=env, capture_output=True, text=True, check=True)
     assert done.stderr == ""
     return done.stdout.strip()
 
@@ -51,12 +47,9 @@ def test_a_folder_that_the_user_set_in_jax_is_used_instead(tmp_path):
     assert any(theirs.iterdir()) and not ours.exists()
 
 
-def test_the_cache_can_be_switched_off(tmp_path):
+def test_without_a_cache_because_of_a_switch_or_its_folder_a_process_goes_on(tmp_path):
     assert run(XDG_CACHE_HOME=str(tmp_path), PLANNER_JAX_CACHE="off") == "None False"
     assert not any(tmp_path.iterdir())
-
-
-def test_a_folder_that_cannot_be_created_does_not_stop_the_process(tmp_path):
     (tmp_path / "file").touch()
     assert run(XDG_CACHE_HOME=str(tmp_path / "file")) == "None False"
 

@@ -1,5 +1,3 @@
-"""Tests of decisions on catching orders and times: cases with known answers, and invariants."""
-
 import dataclasses
 
 import jax
@@ -16,16 +14,8 @@ from planner_jax.planning import drive
 from planner_jax.planning.decided import DecidedPlanner, first_choice
 from planner_jax.planning.plan import plan
 from planner_jax.referee.catch import referee_catches
-from planner_jax.task.catch.decide import (
-    LENGTHS,
-    Best,
-    Given,
-    Greedy,
-    Random,
-    beam,
-    closest_approach,
-    optimal_time_ratio,
-)
+from planner_jax.task.catch import decide as decisions
+from planner_jax.task.catch.decide import LENGTHS, Best, Given, Greedy, Random, beam
 from planner_jax.task.catch.default_planner import ExactCatch
 from planner_jax.task.catch.estimate import follow, timetable
 from planner_jax.task.catch.suites import draw
@@ -33,6 +23,7 @@ from tests.trees import assert_same
 
 PLANNER = ExactCatch(rounds=(Round(1, LbfgsConfig(max_steps=20)),))
 NUM = 8
+NEAR, FAR = (-1.0, 0.0, 1.2), (2.0, 0.0, 1.2)  # [m] Targets; the quadrotor starts at (0, 0, 1).
 
 
 @jax.jit
@@ -52,12 +43,12 @@ def best(case):
 @jax.jit
 @jax.vmap
 def estimate(case, orders):
-    """Return for K orders (K, N) the sum of the estimated distances by which targets are missed."""
+    """Return the sum of estimated distances by which targets are missed, for K orders (K, N)."""
     return jax.vmap(lambda order: follow(case, timetable(case), order)[1])(orders)
 
 
 def shortfall(cases, choices):
-    """Return for each choice, (B,) or (B, K), the sum of estimated distances to missed targets."""
+    """Return the sum of estimated distances to missed targets for choices, (B,) or (B, K)."""
     shape = choices.order.shape
     orders = choices.order.reshape(shape[0], -1, shape[-1])
     return np.asarray(estimate(cases, orders)).reshape(shape[:-1])
@@ -75,12 +66,9 @@ def hanging(places, horizons):
     return pj.catch.case(targets, np.asarray(horizons, float), gravity=np.full(len(pos), 9.81))
 
 
-NEAR, FAR = (-1.0, 0.0, 1.2), (2.0, 0.0, 1.2)  # [m] Targets; the quadrotor starts at (0, 0, 1).
-
-
 @pytest.fixture(scope="module")
 def pairs():
-    """Return five pairs; the second target is farther, due soon, too far, too low, or rising."""
+    """Return five pairs of targets: one is farther, due soon, out of reach, too low or rising."""
     places = [(FAR, NEAR), (NEAR, FAR), ((100.0, 0.0, 1.2), NEAR), ((2.0, 0.0, 0.3), NEAR)]
     cases = hanging([*places, (FAR, NEAR)], [(4.0, 4.0), (4.0, 1.15)] + 3 * [(4.0, 4.0)])
     ball = cases.targets.ball
@@ -94,7 +82,7 @@ def triangles():
 
 
 def rank(cases, choices):
-    """Return an estimated cost of choices: the last catch [s], plus 10 s for each missing metre."""
+    """Return the time [s] of the last catch, plus 10 s for each metre to missed targets."""
     return np.asarray(choices.times[..., -1]) + 10.0 * shortfall(cases, choices)
 
 
@@ -107,26 +95,22 @@ def test_greedy_catches_next_what_it_reaches_first(pairs):
 
 def test_best_catches_first_what_is_due_first(pairs):
     found = best(pairs)
-    assert found.order.tolist()[0][0] == [1, 0]
-    assert found.order.tolist()[1][0] == [1, 0]
+    assert found.order[:2, 0].tolist() == [[1, 0], [1, 0]]
     assert shortfall(pairs, found)[1, 0] == 0.0
     assert found.times[1, 0, 0] <= 1.15
 
 
 def test_times_are_those_of_a_point_that_accelerates_evenly(pairs):
-    """One metre at 7 m/s^2 from standstill, after 0.2 s; 64 equally spaced times are tried."""
+    """Fly 1 m from standstill at 7 m/s^2, 0.2 s after the start; 64 times in 4 s are tried."""
     found = greedy(pairs)
     arrival = 0.2 + np.sqrt(2.0 * 1.0 / 7.0)
     assert arrival <= found.times[0, 0] <= arrival + 4.0 / 64.0 + 1e-6
 
 
-def test_shortfall_is_how_far_out_of_reach_a_target_stays(pairs):
-    for missing in (shortfall(pairs, greedy(pairs))[2], shortfall(pairs, best(pairs))[2, 0]):
+def test_shortfall_is_how_far_out_of_reach_a_target_stays_also_near_the_floor_or_rising(pairs):
+    far, low, rising = shortfall(pairs, greedy(pairs))[2:]
+    for missing in (far, shortfall(pairs, best(pairs))[2, 0]):
         assert 101.0 - 0.9 * 5.0 * 4.0 < missing < 101.0
-
-
-def test_a_target_near_the_floor_or_from_below_counts_as_out_of_reach(pairs):
-    low, rising = shortfall(pairs, greedy(pairs))[3:]
     np.testing.assert_allclose(low, 10.0 * (0.25 + 0.1 + 0.2 - 0.3), rtol=1e-4)
     np.testing.assert_allclose(rising, 10.0 * (1.0 / np.hypot(1.0, 0.2) - 0.2), rtol=1e-4)
 
@@ -212,7 +196,7 @@ class LongFirst(ExactCatch):
     [(ExactCatch, 2, [(1, 10), (1, 2)]), (LongFirst, 3, [(1, 10), (1, 2), (1, 2)])],
 )
 def test_later_rounds_are_for_cases_without_any_solved_order(kind, num, calls, pairs, monkeypatch):
-    """Only case 1 is planned again: case 0 is solved in one order, and case 2 is too far away."""
+    """Plan case 1 again; case 0 is solved in one order, and a target of case 2 is too far away."""
     horizon = np.array(pairs.horizon)
     horizon[1, 1] = 0.7
     pairs = dataclasses.replace(pairs, horizon=horizon)
@@ -229,9 +213,13 @@ def test_later_rounds_are_for_cases_without_any_solved_order(kind, num, calls, p
     assert planned == calls
 
 
-def test_greedy_plans_have_the_order_of_the_estimate(pairs):
-    decided = greedy(pairs)
-    plans = plan(by(Greedy()), pairs)
+@pytest.mark.parametrize(("array", "kind"), [(np.asarray, np.ndarray), (jnp.asarray, jax.Array)])
+def test_greedy_plans_have_the_estimated_order_and_targets_out_of_reach_are_named(
+    array, kind, pairs
+):
+    decided, plans = greedy(pairs), plan(by(Greedy()), jax.tree.map(array, pairs))
+    assert isinstance(plans.status, kind) and plans.status[2] == Status.TOO_FAR
+    assert (np.delete(plans.status, 2) != Status.TOO_FAR).all()
     np.testing.assert_array_equal(plans.order, decided.order)
     np.testing.assert_array_equal(plans.decided_times, decided.times)
     assert is_solved(plans.status[0])
@@ -267,7 +255,7 @@ def test_the_time_ratio_is_that_of_the_present_targets(pairs):
     plans = plan(by(Given()), pairs).replace(
         order=order, decided_times=given, times=given * [1.25, 0.8]
     )
-    ratio = optimal_time_ratio(pairs.replace(present=present), plans)
+    ratio = decisions.optimal_time_ratio(pairs.replace(present=present), plans)
     np.testing.assert_allclose(ratio, [(0.2 + 0.25) / 2.0] * 4 + [0.2], rtol=1e-6)
 
 
@@ -284,33 +272,23 @@ def test_a_given_order_that_is_no_permutation_is_refused(pairs, order):
 
 
 def test_closest_approach_is_what_the_greatest_speed_leaves(pairs):
-    """Fly 4 s at 5 m/s; the net's size and a 64th of the way are reserves."""
-    gap = np.array(jax.jit(closest_approach)(pairs))
+    """Approach a target 100 m away for 4 s at 5 m/s; net and sampling of times add reserves."""
+    closest_approach = jax.jit(decisions.closest_approach)
+    gap = np.array(closest_approach(pairs))
     left = np.hypot(100.0, 0.2) - 5.0 * 4.0 - (0.2 + 0.125) - 5.0 * 4.0 / 64.0
     assert gap[2, 0] == pytest.approx(left, rel=1e-4)
-    alone = jax.jit(closest_approach)(pj.take(pairs, 2))
-    np.testing.assert_allclose(alone, gap[2], rtol=1e-6)
+    np.testing.assert_allclose(closest_approach(pj.take(pairs, 2)), gap[2], rtol=1e-6)
     gap[2, 0] = 0.0
     assert not gap.any()
 
 
-@pytest.mark.parametrize(("array", "kind"), [(np.asarray, np.ndarray), (jnp.asarray, jax.Array)])
-def test_a_target_out_of_reach_is_named_and_its_neighbours_are_not(array, kind, pairs):
-    plans = plan(by(Greedy()), jax.tree.map(array, pairs))
-    assert isinstance(plans.status, kind)
-    assert plans.status[2] == Status.TOO_FAR
-    assert (np.delete(plans.status, 2) != Status.TOO_FAR).all()
-
-
 @pytest.fixture(scope="module")
 def swarm():
-    """Draw cases with eight optional balls each, in NumPy arrays."""
     return jax.tree.map(np.asarray, draw(NUM, "swarm8", 2))
 
 
 @pytest.fixture(scope="module")
 def caught(swarm):
-    """Return plans for the cases `swarm`, with the targets and times that `Greedy` chooses."""
     return plan(by(Greedy()), swarm)
 
 

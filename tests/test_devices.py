@@ -1,8 +1,4 @@
-"""Test that a batch has the same plans on several devices as on one device.
-
-The test runs this module as a script in a new process, because the number of simulated devices
-must be set before JAX starts.
-"""
+"""Batches have the same plans on several simulated devices as on one device."""
 
 import os
 import subprocess
@@ -20,14 +16,10 @@ GOALS = np.linspace(-1.0, 5.0, 203).astype(np.float32)
 
 @pytest.mark.slow
 def test_several_devices_give_the_plans_of_one():
-    flags = "--xla_force_host_platform_device_count=4"
-    process = subprocess.run(
-        [sys.executable, __file__],
-        env={**os.environ, "XLA_FLAGS": flags},
-        capture_output=True,
-        text=True,
-        timeout=240,
-    )
+    # XLA reads the number of devices when a process starts.
+    env = {**os.environ, "XLA_FLAGS": "--xla_force_host_platform_device_count=4"}
+    command = [sys.executable, __file__]
+    process = subprocess.run(command, env=env, capture_output=True, text=True, timeout=240)
     assert process.returncode == 0, process.stderr[-2000:]
     assert process.stdout.endswith("equal\n")
 

@@ -1,5 +1,3 @@
-"""Tests of ball estimation: Kalman filter, drag from lost energy, and recursive least squares."""
-
 import functools
 
 import jax
@@ -7,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import serve as balls
+from derivatives import along
 from serve import DRAG, GRAVITY, LINEAR_DRAG, float64
 
 from planner_jax.ball.estimation import EkfModel, EkfState, ekf_init, ekf_predict, ekf_update
@@ -17,8 +16,7 @@ NUM = 121
 PERIOD = 0.01  # [s] Time between two observations.
 NOISE = 0.02  # [m] Standard deviation of each observed coordinate.
 
-# These functions are compiled once for all tests with equal shapes and types. Functions with "many"
-# in their names take a batch of balls.
+# All tests with equal shapes and types share these compiled functions.
 predict_one = jax.jit(ekf_predict, static_argnames="flight")
 update_one = jax.jit(ekf_update)
 fly_one = jax.jit(fly, static_argnames="num_steps")
@@ -50,9 +48,6 @@ def linear_flight(ball, elapsed, drag):
     return jax.vmap(lambda t: linear_drag_flight(ball, t, drag, GRAVITY))(elapsed)
 
 
-# The functions below return NumPy arrays, so that operations on them need no compilation.
-
-
 def times(dtype=np.float32):
     return (3.0 + PERIOD * np.arange(NUM)).astype(dtype)
 
@@ -74,14 +69,12 @@ def drag_prior(estimate, variance, dtype=np.float32):
 
 
 def linear_path(dtype=np.float32, ball=None):
-    """Return the states of a ball with linear drag at all `times`."""
     ball = serve(dtype) if ball is None else ball
     path = linear_flight(ball, times(dtype) - times(dtype)[0], LINEAR_DRAG.astype(dtype))
     return jax.tree.map(np.asarray, path)
 
 
 def quadratic_path(dtype=np.float32):
-    """Return the states of a ball with quadratic drag at all `times`."""
     ball = serve(dtype)
     _, fine = fly_one(ball, PERIOD * (NUM - 1), DRAG, GRAVITY, num_steps=8 * (NUM - 1))
     return jax.tree.map(lambda x0, x: np.concatenate([x0[None], x[7::8]]), ball, fine)
@@ -149,7 +142,7 @@ def test_filter_recovers_the_exact_state(float64, flight, drag, path_of, noise, 
 
 
 def test_errors_agree_with_the_covariances():
-    """The mean of the squared error, normalised by the covariance, is the number of dimensions."""
+    """Compare the mean of e^T P^-1 e, for errors e and covariances P, with the dimension 6."""
     rng = np.random.default_rng(2)
     balls = jax.tree.map(lambda x: (x + rng.normal(size=(100, 3))).astype(x.dtype), serve())
     prior = ekf_init(serve().pos, serve().vel, pos_std=1.0, vel_std=1.0)
@@ -226,10 +219,10 @@ def test_filter_gradient_is_finite_from_rest_and_matches_finite_differences():
     observations = without(noisy(quadratic_path(np.float64).pos, seed=4), slice(3))
     belief = model(DRAG, density=0.1, dtype=np.float64)
 
+    start = wide_prior(np.float64), times(np.float64)
+
     def last(belief, observations):
-        states = filter_one(
-            wide_prior(np.float64), times(np.float64), observations, belief, flight=rk4_step
-        )
+        states = filter_one(*start, observations, belief, flight=rk4_step)
         return jnp.sum(states.mean[-1])
 
     last = jax.jit(jax.value_and_grad(last, argnums=(0, 1)))
@@ -238,11 +231,9 @@ def test_filter_gradient_is_finite_from_rest_and_matches_finite_differences():
     step = 1e-5
     zero_model, wave = model(0.0, std=0.0), np.sin(np.arange(3.0 * NUM)).reshape(NUM, 3)
     for direction in ((belief, 0.0 * wave), (zero_model.replace(gravity=0.0), wave)):
-        ends = (
-            jax.tree.map(lambda x, dx, h=h: x + h * dx, (belief, observations), direction)
-            for h in (step, -step)
+        forward, backward = (
+            last(*along((belief, observations), direction, h))[0] for h in (step, -step)
         )
-        forward, backward = (last(*end)[0] for end in ends)
         pairs = zip(*map(jax.tree.leaves, (gradient, direction)), strict=True)
         slope = sum(np.vdot(a, b) for a, b in pairs)
         np.testing.assert_allclose(slope, (forward - backward) / (2.0 * step), rtol=1e-6)

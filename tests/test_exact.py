@@ -1,5 +1,3 @@
-"""The exact hit planner: what is exact by construction, what is promised, what is refused."""
-
 import dataclasses
 import functools
 
@@ -21,7 +19,9 @@ from planner_jax.trajectory.polynomial import evaluate, total_duration
 
 PLANNER = ExactHit()
 FIRST_ROUND = ExactHit(rounds=PLANNER.rounds[:1])
+SUPPLE = dataclasses.replace(PLANNER, velocities=True)
 NUM = 16
+apex_of = jax.jit(apex_with_drag)
 
 
 @jax.jit
@@ -33,7 +33,6 @@ def first_guess(case):
 
 @pytest.fixture(scope="module")
 def cases():
-    """Draw NUM hits, in NumPy arrays, for which one program plans all batches of up to 16 cases."""
     return jax.tree.map(np.asarray, to_cases(generate_serves(NUM, 11)))
 
 
@@ -100,9 +99,6 @@ def test_an_impossible_lane_says_so_and_stays_finite(cases):
     assert is_solved(np.delete(found.status, 1)).all()
 
 
-apex_of = jax.jit(apex_with_drag)
-
-
 def test_drag_after_the_impact_is_aimed_for(float64):
     pos, target = np.array([-2.0, 0.4, 1.5]), np.array([4.0, -0.5, 0.0])
     time, drag, gravity = np.array(1.7), np.array(0.0616), np.array(9.8)
@@ -117,10 +113,8 @@ def test_drag_after_the_impact_is_aimed_for(float64):
 @pytest.mark.parametrize("function", [aim_with_drag, apex_with_drag])
 def test_derivatives_with_drag_are_those_of_finite_differences(float64, function):
     def value(x):
-        if function is aim_with_drag:
-            found = aim_with_drag(x[:3], x[3:6], *x[6:])
-        else:
-            found = apex_with_drag(BallState(x[:3], x[3:6]), *x[6:])
+        first = (x[:3], x[3:6]) if function is aim_with_drag else (BallState(x[:3], x[3:6]),)
+        found = function(*first, *x[6:])
         return jnp.sum(found * jnp.arange(1.0, found.size + 1.0))
 
     at = np.array([*(-2.0, 0.4, 1.5), *(4.0, -0.5, 3.0), *(1.7, 0.0616, 9.8)])
@@ -135,8 +129,8 @@ def test_derivatives_with_drag_are_those_of_finite_differences(float64, function
     np.testing.assert_allclose(bends, numeric[1], rtol=1e-3, atol=1e-5)
 
 
-def test_falling_ball_is_highest_now():
-    ball = BallState(np.array([0.0, 0.0, 2.0], np.float32), np.array([3.0, 0.0, -1.0], np.float32))
+def test_a_falling_ball_is_highest_at_once():
+    ball = BallState(*np.array([[0.0, 0.0, 2.0], [3.0, 0.0, -1.0]], np.float32))
     assert apex_of(ball, *np.array([1.0, 0.06, 9.8], np.float32)) == 2.0
 
 
@@ -151,9 +145,6 @@ def test_objective_gradient_agrees_with_finite_differences(float64):
         np.testing.assert_allclose(slope, numeric, rtol=1e-4, atol=1e-9)
 
 
-SUPPLE = dataclasses.replace(PLANNER, velocities=True)
-
-
 def test_with_zero_offsets_of_velocities_a_point_is_the_same_plan(cases):
     lane = pj.take(cases, 1)
     context, guess = first_guess(lane)
@@ -162,20 +153,14 @@ def test_with_zero_offsets_of_velocities_a_point_is_the_same_plan(cases):
     @jax.jit
     def both(point):
         converted = jnp.zeros(SUPPLE.held.shape).at[~SUPPLE.held].set(point)
-        plans = PLANNER.decode(point, context), SUPPLE.decode(converted, context)
-        return (
-            converted,
-            plans,
-            PLANNER.objective(point, context),
-            SUPPLE.objective(converted, context),
-        )
+        points = (PLANNER, point), (SUPPLE, converted)
+        plans = [planner.decode(x, context).trajectory.coeffs[:, :4] for planner, x in points]
+        return converted, plans, [planner.objective(x, context).cost for planner, x in points]
 
-    converted, (usual, supple), *costs = both(point)
+    converted, (usual, supple), costs = both(point)
     assert converted.size == point.size + 33 == len(SUPPLE.scale)
-    np.testing.assert_allclose(
-        supple.trajectory.coeffs[:, :4], usual.trajectory.coeffs[:, :4], atol=2e-3
-    )
-    np.testing.assert_allclose(costs[1].cost, costs[0].cost, rtol=1e-3)
+    np.testing.assert_allclose(supple, usual, atol=2e-3)
+    np.testing.assert_allclose(costs[1], costs[0], rtol=1e-3)
 
 
 def test_velocities_as_variables_have_exact_derivatives(float64, cases):
@@ -196,7 +181,7 @@ def test_velocities_as_variables_have_exact_derivatives(float64, cases):
     np.testing.assert_allclose(mine @ direction, (ahead - behind) / 2e-6, rtol=1e-5)
 
 
-def test_all_guesses_but_the_first_pass_the_ball_as_fast_as_the_way_there_asks(cases):
+def test_all_guesses_but_the_first_have_the_tangential_velocity_of_an_even_motion(cases):
     lane = pj.take(cases, 3)
 
     @jax.jit

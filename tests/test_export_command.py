@@ -1,5 +1,3 @@
-"""Tests of the command `planner-jax export`, for plans of runs and of saved files."""
-
 import socket
 import threading
 from types import SimpleNamespace
@@ -25,6 +23,8 @@ from planner_jax.sweep.hit.columns import COLUMNS as HIT
 from planner_jax.sweep.intercept.columns import COLUMNS as INTERCEPT
 from planner_jax.sweep.rows import read_plan
 from planner_jax.task.hit.plan import HitPlan
+from tests.sweeps import write_rows
+from tests.trees import assert_same
 
 NUM = 3
 TASKS = {"hit": ("quadrotor", HIT), "catch": ("quadrotor", CATCH)}
@@ -44,10 +44,7 @@ def batch(robot):
 
 
 def write_run(folder, task="hit", *, finished=True):
-    """Write the folder of a run with three plans that no planner made.
-
-    The rows have only the columns that are needed to read a plan.
-    """
+    """Write the folder of a run of three plans, with the columns that are needed to read a plan."""
     robot, columns = TASKS[task]
     plans = batch(robot)
     success, sentence = np.array([True, False, False]), lambda k: f"plan {k} is too fast"
@@ -56,25 +53,7 @@ def write_run(folder, task="hit", *, finished=True):
     refereed = known.RefereedBatch(Chunk(np.arange(NUM), cases), plans, verdict)
     names = READ if robot == "car" else READ - {"start"}
     rows = known.rows_of([each for each in columns if each.name in names], refereed, "world")
-    manifest = {"kind": f"sweep {task}", "state": "running", "parameters": {}, "sessions": []}
-    manifest |= {"run": "", "settings": "", "versions": {}, "device": {}}
-    manifest["setting"] = {"gravity": 9.81}
-    run = RunFolder(folder, name="RUN")
-    with run.create(manifest):
-        if finished:
-            summary = {"num": NUM, "successes": 1, "success_rate": 1 / 3, "wilson_95": [0.0, 1.0]}
-            summary |= {"plans_per_second_warm": 0.0, "status_counts": {}, "failed_limits": {}}
-            seconds = {f"{name}_seconds": 0.0 for name in ("compile", "referee", "wall")}
-            run.plans.write_rows(rows)
-            manifest |= {"state": "complete", "summary": summary, "times": seconds}
-            run.write_manifest(manifest)
-    return run
-
-
-def assert_same(one, other):
-    for ours, theirs in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
-        assert ours.dtype == theirs.dtype
-        np.testing.assert_array_equal(ours, theirs)
+    return write_rows(folder, rows, kind=f"sweep {task}", is_finished=finished)
 
 
 @pytest.mark.parametrize("task", TASKS)
@@ -138,7 +117,6 @@ def test_fields_of_a_task_are_left_out_and_files_of_something_else_are_refused(t
 
 @pytest.fixture
 def here(tmp_path, monkeypatch):
-    """Change to a folder with two runs, a saved batch of plans and a saved plan."""
     monkeypatch.chdir(tmp_path)
     write_run(tmp_path / "run")
     write_run(tmp_path / "arms", "block")

@@ -1,10 +1,8 @@
-"""Tests of extras: limits and costs along the trajectory that a user adds to a case.
-
-The planner `exact` plans with them, and the referee judges the limits.
-"""
+"""Tests of extras, which are limits and costs along the trajectory that a user adds to a case."""
 
 import dataclasses
 import functools
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -19,13 +17,15 @@ from planner_jax.trajectory.polynomial import PiecewisePolynomial, states_at
 from planner_jax.trajectory.proportional_minco import boundary_rows
 from tests.derivatives import assert_gradient_matches_differences
 
-# This planner starts from smooth trajectories, without the learned guess. Tests place obstacles
-# near the middles of its trajectories.
+# A planner that starts from smooth trajectories, near whose middles tests place obstacles.
 FREE = pj.hit.ExactHit(learned=False)
 CATCH = pj.catch.planner("exact", decide="given")
 HIT = FREE.with_settings((("rounds", FREE.rounds[1:2]),))  # One attempt needs one program.
 NUM, AT, FAR = 4, np.zeros(3), np.full((4, 3), 50.0)
 TRACES = []
+# Five extras without effect. All tests use five, so that they share one compiled program.
+PLAIN: dict[str, Any] = {"centre": FAR, "radius": 1.0, "disliked": FAR, "weight": 0.0}
+PLAIN |= {"acceleration": 99.0, "low": FAR, "size": 1.0, "point": -FAR, "normal": (0.0, 0.0, 1.0)}
 
 
 @struct.dataclass
@@ -39,31 +39,19 @@ class Gentle:
         return (acc[..., :2] ** 2).sum(-1) / self.acceleration**2 - 1.0
 
 
-def having(
-    cases,
-    centre=FAR,
-    radius: Any = 1.0,
-    disliked=FAR,
-    weight=0.0,
-    acceleration: Any = 99.0,
-    low=FAR,
-    size: Any = 1.0,
-    point=-FAR,
-    normal=(0.0, 0.0, 1.0),
-):
-    """Return cases with five extras, by default without effect: one compiled program."""
-    batch = cases.batch_shape
-    full = lambda value: np.broadcast_to(np.asarray(value, np.float32), batch)  # noqa: E731
+def having(cases, **changes):
+    """Return cases with five extras, `PLAIN` ones but for changes."""
+    given = SimpleNamespace(**PLAIN | changes)
 
-    def vectors(value):
-        return np.broadcast_to(np.asarray(value, np.float32), (NUM, 3))[: batch[0]]
+    def array(value, *shape):
+        return np.broadcast_to(np.asarray(value, np.float32), (NUM, *shape))
 
     zones = (
-        pj.KeepOut(vectors(centre), full(radius)),
-        pj.Dislike(vectors(disliked), full(0.4), full(weight)),
-        Gentle(full(acceleration)),
-        pj.KeepOutBox(vectors(low), vectors(low + size)),
-        pj.Plane(vectors(point), vectors(normal)),
+        pj.KeepOut(array(given.centre, 3), array(given.radius)),
+        pj.Dislike(array(given.disliked, 3), array(0.4), array(given.weight)),
+        Gentle(array(given.acceleration)),
+        pj.KeepOutBox(array(given.low, 3), array(given.low + given.size, 3)),
+        pj.Plane(array(given.point, 3), array(given.normal, 3)),
     )
     return cases.replace(extras=zones)
 
@@ -111,7 +99,8 @@ def middle(free):
 @pytest.fixture(scope="module")
 def blocked(hits, middle):
     """Return the hits with a forbidden sphere near the middle of each unconstrained trajectory."""
-    return having(hits, middle + np.array([0.0, 0.03, 0.0]), np.array([0.2, 0.25, 0.15, 0.2]))
+    centre = middle + np.array([0.0, 0.03, 0.0])
+    return having(hits, centre=centre, radius=np.array([0.2, 0.25, 0.15, 0.2]))
 
 
 @pytest.fixture(scope="module")
@@ -243,9 +232,8 @@ def test_the_peak_of_a_path_past_an_edge_is_found_between_samples(hits, free):
 def test_lanes_of_a_batch_are_those_planned_alone(blocked, around):
     for k in (0, 2):
         alone = pj.plan(HIT, pj.take(blocked, slice(k, k + 1)))
-        np.testing.assert_allclose(
-            alone.trajectory.coeffs[0, :, 0], around.trajectory.coeffs[k, :, 0], atol=2e-3
-        )
+        ours, theirs = alone.trajectory.coeffs[0], around.trajectory.coeffs[k]
+        np.testing.assert_allclose(ours[:, 0], theirs[:, 0], atol=2e-3)
 
 
 def test_another_value_compiles_nothing_anew(hits, around):
@@ -263,8 +251,7 @@ def test_boxes_and_planes_are_planned_around_and_judged(hits, free, middle):
     first, last = (np.array([way(free, k)[place] for k in range(NUM)]) for place in (0, -1))
     across = np.cross(last - first, [0.0, 0.0, 1.0])
     across /= np.linalg.norm(across, axis=1, keepdims=True)
-    # A plane is parallel to the straight line from start to end. It forbids the side of the line on
-    # which the middle of the trajectory lies.
+    # Planes are parallel to the line from start to end, and forbid the side of the trajectory.
     side = np.sign(((middle - first) * across).sum(1, keepdims=True))
     depth = np.abs(((middle - first) * across).sum(1, keepdims=True))
     point = np.where(np.arange(NUM)[:, None] < 2, -FAR, first + 0.5 * depth * side * across)
@@ -272,8 +259,7 @@ def test_boxes_and_planes_are_planned_around_and_judged(hits, free, middle):
     cases = having(hits, low=low, size=sides, point=point, normal=normal)
     verdict = pj.hit.judge(cases, free)
     assert (verdict.failed_limit == "extra").all() and list(verdict.worst_extra) == [3, 3, 4, 4]
-    # The planner with all attempts is used, because a single attempt sometimes gets stuck at an
-    # edge of a box.
+    # A single attempt sometimes gets stuck at an edge of a box.
     verdict = pj.hit.judge(cases, pj.plan(FREE, cases))
     assert verdict.success.all(), [verdict.sentence(k) for k in range(NUM)]
 
@@ -318,11 +304,8 @@ def test_a_users_class_is_planned_and_judged(hits, free):
 def test_a_cost_moves_the_trajectory(hits, free, middle):
     moved = pj.plan(HIT, having(hits, disliked=middle, weight=0.05))
     assert pj.hit.judge(hits, moved).success.all()
-    for k in range(NUM):
-        before, after = (
-            np.linalg.norm(way(plans, k) - middle[k], axis=1).min() for plans in (free, moved)
-        )
-        assert after > before + 0.05
+    away = lambda plans, k: np.linalg.norm(way(plans, k) - middle[k], axis=1).min()  # noqa: E731
+    assert all(away(moved, k) > away(free, k) + 0.05 for k in range(NUM))
 
 
 @pytest.mark.slow
@@ -350,7 +333,7 @@ def test_the_gradient_by_a_radius_matches_differences_of_plans(hits, float64):
     long = HIT.with_solver(solver)
     double = lambda cases: jax.tree.map(lambda leaf: np.asarray(leaf, float), cases)  # noqa: E731
     centre = places(pj.plan(long, double(having(hits)))) + np.array([0.0, 0.05, 0.0])
-    cases = double(having(hits, centre, 0.15))
+    cases = double(having(hits, centre=centre, radius=0.15))
     found = pj.gradient(HIT, cases, of="cost", by="extras.0.radius", steps=0, solver=solver)
 
     def costs(change):

@@ -1,5 +1,3 @@
-"""Tests of ball flight with quadratic drag [Yu2023bat, eq. 2] and linear drag, apex and fall."""
-
 import functools
 
 import jax
@@ -9,48 +7,31 @@ import pytest
 from convergence import observed_order
 from derivatives import assert_gradient_matches_differences
 from scipy.integrate import solve_ivp
-from serve import (
-    DRAG,
-    GRAVITY,
-    LINEAR_DRAG,
-    SERVE_POS,
-    SERVE_VEL,
-    assert_close,
-    float64,
-    pick,
-    three_balls,
-)
+from serve import DRAG, GRAVITY, LINEAR_DRAG, SERVE_POS, SERVE_VEL, assert_close, float64, pick
 from serve import serve as ball
 
-from planner_jax.ball.flight import (
-    BallState,
-    ball_acceleration,
-    drag_free_apex,
-    drag_free_fall_time,
-    drag_free_flight,
-    fly,
-    linear_drag_flight,
-    rk4_step,
-)
+from planner_jax.ball import flight
+from planner_jax.ball.flight import BallState, fly, linear_drag_flight
 from planner_jax.sims.sensing import specific_energy
 
 WEIGHT = np.array([0.0, 0.0, -GRAVITY])
 
-# These functions are compiled once for all tests with equal shapes and types.
-step_once = jax.jit(rk4_step)
+# All tests with equal shapes and types share these compiled functions.
+step_once = jax.jit(flight.rk4_step)
 fly_eight_steps = jax.jit(functools.partial(fly, num_steps=8))
-drag_free = jax.jit(drag_free_flight)
+drag_free = jax.jit(flight.drag_free_flight)
 linear_drag = jax.jit(linear_drag_flight)
-apex_and_slope = jax.jit(jax.value_and_grad(drag_free_apex))
-fall_and_slope = jax.jit(jax.value_and_grad(drag_free_fall_time, argnums=(0, 1, 2), has_aux=True))
+apex_and_slope = jax.jit(jax.value_and_grad(flight.drag_free_apex))
+fall = functools.partial(jax.value_and_grad, argnums=(0, 1, 2), has_aux=True)
+fall_and_slope = jax.jit(fall(flight.drag_free_fall_time))
 
 
 @jax.jit
 def linear_drag_and_rates(ball, duration, drag):
     """Return a ball's state, and its derivatives by time and by equal drag on all axes."""
-    flight = functools.partial(linear_drag_flight, gravity=GRAVITY)
-    state, in_time = jax.jvp(lambda t: flight(ball, t, drag), (duration,), (jnp.ones(()),))
-    _, in_drag = jax.jvp(lambda k: flight(ball, duration, k), (drag,), (jnp.ones(3),))
+    fly_on = functools.partial(linear_drag_flight, gravity=GRAVITY)
+    state, in_time = jax.jvp(lambda t: fly_on(ball, t, drag), (duration,), (jnp.ones(()),))
+    _, in_drag = jax.jvp(lambda k: fly_on(ball, duration, k), (drag,), (jnp.ones(3),))
     return state, in_time, in_drag
 
 
@@ -62,15 +43,10 @@ def fly_steps(start, duration, drag=DRAG, *, num=32):
 
 def integrate(acceleration, duration):
     """Integrate the serve's flight by SciPy with a tolerance of 1e-13; return the final state."""
-    flight = solve_ivp(
-        lambda _, state: np.concatenate([state[3:], acceleration(state[3:])]),
-        (0.0, duration),
-        np.array(SERVE_POS + SERVE_VEL),
-        method="DOP853",
-        rtol=1e-13,
-        atol=1e-13,
-    )
-    return BallState(pos=flight.y[:3, -1], vel=flight.y[3:, -1])
+    change = lambda _, state: np.concatenate([state[3:], acceleration(state[3:])])  # noqa: E731
+    options = {"method": "DOP853", "rtol": 1e-13, "atol": 1e-13}
+    states = solve_ivp(change, (0.0, duration), np.array(SERVE_POS + SERVE_VEL), **options).y
+    return BallState(pos=states[:3, -1], vel=states[3:, -1])
 
 
 def with_quadratic_drag(vel):
@@ -78,18 +54,16 @@ def with_quadratic_drag(vel):
 
 
 def test_a_ball_feels_its_weight_and_a_drag_against_its_velocity():
-    """The derivative at rest must be zero, not NaN."""
 
     def accelerate(vel):
-        acceleration = ball_acceleration(vel, 0.1, GRAVITY)
+        acceleration = flight.ball_acceleration(vel, 0.1, GRAVITY)
         return acceleration, acceleration
 
-    moving, rest = np.array([3.0, 4.0, 12.0], np.float32), np.zeros(3, np.float32)
-    jacobian, acceleration = jax.jit(jax.vmap(jax.jacfwd(accelerate, has_aux=True)))(
-        np.stack([moving, rest])
-    )
+    moving = np.array([3.0, 4.0, 12.0], np.float32)
+    both = jax.jit(jax.vmap(jax.jacfwd(accelerate, has_aux=True)))
+    jacobian, acceleration = both(np.stack([moving, 0.0 * moving]))
     np.testing.assert_allclose(acceleration, [WEIGHT - 1.3 * moving, WEIGHT], rtol=1e-6)
-    np.testing.assert_array_equal(jacobian[1], np.zeros((3, 3)))
+    np.testing.assert_array_equal(jacobian[1], np.zeros((3, 3)))  # not NaN at rest
 
 
 @float64
@@ -162,16 +136,14 @@ def test_linear_drag_goes_over_into_the_drag_free_flight():
     free = drag_free(ball(), 1.6, GRAVITY)
     assert_close(linear_drag(ball(), 1.6, np.zeros(3), GRAVITY), free, rtol=1e-15)
     drags = np.array([1e-2, 1e-4, 1e-6])
-    errors = [
-        np.linalg.norm(linear_drag(ball(), 1.6, np.full(3, k), GRAVITY).pos - free.pos)
-        for k in drags
-    ]
+    ends = [linear_drag(ball(), 1.6, np.full(3, k), GRAVITY).pos for k in drags]
+    errors = [np.linalg.norm(end - free.pos) for end in ends]
     assert float(observed_order(drags, errors)) == pytest.approx(1.0, abs=0.01)
 
 
 @float64
 def test_the_slope_in_linear_drag_at_no_drag_is_the_first_term_of_its_series():
-    """Check the derivative by K of s = s_0 + v t + g t^2/2 - K (v t^2/2 + g t^3/6) + ..."""
+    """Differentiate s = s_0 + v t + g t^2/2 - K (v t^2/2 + g t^3/6) + ... by the drag K."""
     t = 1.6
     _, _, slope = linear_drag_and_rates(ball(), t, np.zeros(3))
     expected = -(ball().vel * t**2 / 2.0 + WEIGHT * t**3 / 6.0)
@@ -242,7 +214,10 @@ def test_a_plane_that_is_not_reached_is_flagged_with_a_finite_gradient(height, v
 
 @float64
 def test_batch_equals_loop():
-    balls, durations, drags = three_balls(), np.array([1.8, 0.5, -0.2]), np.array([DRAG, 0.0, 0.3])
+    durations, drags = np.array([1.8, 0.5, -0.2]), np.array([DRAG, 0.0, 0.3])
+    # The balls are a served ball, one at rest, and a falling one.
+    positions = np.array([SERVE_POS, (0.0, 0.0, 0.0), (-1.0, 2.0, 0.3)])
+    balls = BallState(positions, np.array([SERVE_VEL, (0.0, 0.0, 0.0), (0.0, -20.0, 1.0)]))
     linear_drags = drags[:, None] * LINEAR_DRAG
     axes = (0, 0, 0, None)
     many = jax.jit(jax.vmap(functools.partial(fly, num_steps=8), axes))

@@ -1,5 +1,3 @@
-"""Results on a GPU, with kernels, agree with a CPU."""
-
 import dataclasses
 import functools
 import os
@@ -10,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from derivatives import double
 
 import planner_jax as pj
 from planner_jax.core.protocol import is_solved
@@ -29,7 +28,6 @@ LANES = 256
 
 @pytest.fixture(scope="module")
 def devices():
-    """Provide the first GPU, and the CPU."""
     assert jax.default_backend() == "gpu"
     return jax.devices()[0], jax.devices("cpu")[0]
 
@@ -40,7 +38,6 @@ def serves():
 
 
 def run(device, function, *args):
-    """Return the results of a function whose arguments and constants are on a device."""
     with jax.default_device(device):
         return jax.tree.map(np.asarray, function(*jax.device_put(args, device)))
 
@@ -81,11 +78,8 @@ np.savez(sys.argv[2], status=plans.status, time=plans.stroke.time)
 def test_hits_are_those_of_a_process_without_kernels(devices, serves, tmp_path):
     without = tmp_path / "plans.npz"
     off = {kernels.SWITCH: "off", "XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
-    subprocess.run(
-        [sys.executable, "-c", WITHOUT_KERNELS, str(LANES), str(without)],
-        env={**os.environ, **off},
-        check=True,
-    )
+    command = [sys.executable, "-c", WITHOUT_KERNELS, str(LANES), str(without)]
+    subprocess.run(command, env={**os.environ, **off}, check=True)
     ours, theirs = plan(ExactHit(), serves, devices=devices[:1]), np.load(without)
     np.testing.assert_array_equal(ours.status, theirs["status"])
     np.testing.assert_allclose(ours.stroke.time, theirs["time"], atol=1e-3)
@@ -93,13 +87,9 @@ def test_hits_are_those_of_a_process_without_kernels(devices, serves, tmp_path):
 
 def test_catches_are_those_of_a_cpu(devices):
     throws = draw(LANES, "throws", 0)
+    planner = pj.catch.planner(decide="greedy")
     ours, theirs = (
-        run(
-            device,
-            lambda s, d=device: plan(pj.catch.planner(decide="greedy"), s, devices=[d]),
-            throws,
-        )
-        for device in devices
+        run(device, lambda s, d=device: plan(planner, s, devices=[d]), throws) for device in devices
     )
     np.testing.assert_array_equal(ours.status, theirs.status)
     np.testing.assert_allclose(ours.times, theirs.times, atol=2e-2)
@@ -125,7 +115,7 @@ def test_gradients_at_the_same_points_are_those_of_a_cpu(devices, serves):
     points = run(devices[1], optima, lanes)
     ours, theirs = (run(device, gradients, lanes, points) for device in devices)
     with jax.enable_x64(True):
-        exact = run(devices[1], gradients, *jax.tree.map(in_float64, (lanes, points)))
+        exact = run(devices[1], gradients, *double((lanes, points)))
     is_there = [np.isfinite(by["drag"]) for by in (ours, theirs, exact)]
     assert (is_there[0] == is_there[1]).mean() > 0.98
     all_three = np.all(is_there, axis=0)
@@ -141,12 +131,7 @@ def test_gradients_at_the_same_points_are_those_of_a_cpu(devices, serves):
         assert off(found, other) <= 1e-3 * size
 
 
-def in_float64(leaf):
-    return leaf.astype(np.float64) if leaf.dtype == np.float32 else leaf
-
-
 def test_several_gpus_give_the_plans_of_one(devices, serves):
-    """The lanes are unevenly shared, and a later round must solve some."""
     gpus = jax.devices("gpu")
     if len(gpus) == 1:
         pytest.skip("there is one GPU")

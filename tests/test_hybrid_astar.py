@@ -1,5 +1,3 @@
-"""Hybrid A*: its closed forms, its cost bound, traps, and its results without a path."""
-
 import dataclasses
 import sys
 
@@ -40,23 +38,25 @@ def rear(meeting, heading):
     return np.append(meeting - MIDDLE * direction, heading)
 
 
-@jax.jit
-def dubins_lengths(starts, goals):
-    return jax.vmap(lambda start, goal: dubins(start, goal, CURVATURE).length)(starts, goals)
+lengths_of = jax.jit(jax.vmap(lambda start, goal: dubins(start, goal, CURVATURE).length))
+
+
+def dubins_from(starts, goals):
+    """Return the lengths (N,) of Dubins paths to poses (N, 3), from one pose or from as many."""
+    with jax.enable_x64(True):
+        return np.asarray(lengths_of(np.broadcast_to(starts, goals.shape), goals))
 
 
 @jax.jit
 def gaps(poses, walls):
-    """Return the distances of the body from walls, (N, M) [m], at poses (M, 3)."""
     x, y, heading = poses.T
     return separation(walls.vertices(0.0), walls.present, x[None], y[None], heading, BODY)
 
 
-def least_lengths(start, meeting):
-    """Return the lengths (720,) of Dubins paths to every heading at a meeting point."""
-    goals = np.stack([rear(meeting, heading) for heading in 2.0 * np.pi * np.arange(720) / 720])
-    with jax.enable_x64(True):
-        return np.asarray(dubins_lengths(np.broadcast_to(start, goals.shape), goals))
+def least_length(start, meeting):
+    """Return the least length of Dubins paths to a meeting point over 720 headings there."""
+    goals = [rear(meeting, heading) for heading in 2.0 * np.pi * np.arange(720) / 720]
+    return dubins_from(start, np.stack(goals)).min()
 
 
 def assert_drivable(path, meeting, polygons=(), start=START):
@@ -93,9 +93,7 @@ def test_the_closed_form_to_a_pose_is_dubins_of_the_library(pairs):
         kernels.least_length(start, kernels.Goal(goal, True), 0.0, CURVATURE, lengths)
         for start, goal in zip(starts, goals, strict=True)
     ]
-    with jax.enable_x64(True):
-        theirs = dubins_lengths(starts, goals)
-    np.testing.assert_allclose(ours, theirs, atol=1e-9)
+    np.testing.assert_allclose(ours, dubins_from(starts, goals), atol=1e-9)
 
 
 def test_the_closed_form_to_a_point_is_the_least_over_all_headings(pairs):
@@ -105,8 +103,7 @@ def test_the_closed_form_to_a_point_is_the_least_over_all_headings(pairs):
         goal = kernels.Goal(np.append(place, 0.0), False)
         ours = kernels.least_length(np.zeros(3), goal, 0.0, CURVATURE, lengths)
         goals = np.stack([np.append(place, angle) for angle in np.linspace(0.0, 2 * np.pi, 720)])
-        with jax.enable_x64(True):
-            theirs = np.asarray(dubins_lengths(np.zeros((720, 3)), goals)).min()
+        theirs = dubins_from(np.zeros(3), goals).min()
         assert ours <= theirs + 1e-9
         assert ours == pytest.approx(theirs, abs=5e-3)
 
@@ -130,11 +127,10 @@ def test_without_walls_the_path_is_the_shortest_to_within_a_primitive(end_headin
         path = find_path(meeting, (), end_heading)
         assert_drivable(path, meeting)
         if end_heading is None:
-            least = least_lengths(START, meeting).min()
+            least = least_length(START, meeting)
         else:
-            with jax.enable_x64(True):
-                goal = rear(meeting, end_heading)
-                least = float(dubins_lengths(START[None], goal[None])[0])
+            goal = rear(meeting, end_heading)
+            least = dubins_from(START, goal[None])[0]
             np.testing.assert_allclose(path.poses[-1], goal, atol=2.0 * np.pi + 1e-9)
             assert np.cos(path.poses[-1, 2] - end_heading) == pytest.approx(1.0, abs=1e-12)
         assert least - 1e-4 <= path.length <= least + 0.1745
@@ -145,12 +141,11 @@ def test_the_search_leaves_the_trap(end_heading):
     meeting = np.array([6.5, 4.0])
     path = find_path(meeting, TRAP, end_heading, slack=0.05)
     assert_drivable(path, meeting, TRAP)
-    assert path.length > 1.05 * least_lengths(START, meeting).min()
+    assert path.length > 1.05 * least_length(START, meeting)
 
 
 def test_more_slack_costs_more_and_no_more_than_allowed():
-    meeting = np.array([6.5, 4.0])
-    exact, loose = (find_path(meeting, TRAP, slack=slack) for slack in (0.0, 0.5))
+    exact, loose = (find_path((6.5, 4.0), TRAP, slack=slack) for slack in (0.0, 0.5))
     assert loose.expansions < exact.expansions
     assert loose.cost <= 1.5 * exact.cost
 

@@ -1,5 +1,3 @@
-"""The racket impact: conserved quantities, losses, and the inverse."""
-
 import jax
 import jax.numpy as jnp
 import numpy as np

@@ -1,5 +1,3 @@
-"""Gradients of optimal plans against finite differences of optima."""
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -32,7 +30,7 @@ def numbers(case):
 
 @pytest.fixture(scope="module")
 def study():
-    """Return two late serves under weak limits, one with an active limit, and their Jacobians."""
+    """Return two late serves under weak limits, one with an active limit, and their derivatives."""
     with jax.enable_x64(True):
         batch = to_cases(generate_serves(8, 3), delay=0.4, limit_scale=0.7, dtype=jnp.float64)
 

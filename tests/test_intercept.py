@@ -1,11 +1,10 @@
-"""Interceptions: the car's motion, the planner, and the status of unsolvable cases."""
-
 import dataclasses
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from derivatives import double
 
 import planner_jax as pj
 from planner_jax.benchmarks.latency import begin_replans
@@ -21,6 +20,8 @@ from planner_jax.task.intercept.terms import Weights
 SEARCHES = (Search(12, lattice=Lattice(layers=22)),)
 PLANNER = pj.intercept.planner(searches=SEARCHES)
 START = np.array([0.8, 4.0, 0.3])
+WALL = [[3.9, -0.5], [4.1, -0.5], [4.1, 8.5], [3.9, 8.5]]
+HALF = [[3.9, -0.5], [4.1, -0.5], [4.1, 5.5], [3.9, 5.5]]
 
 
 @pytest.fixture
@@ -104,18 +105,14 @@ def test_a_pose_is_the_integral_of_the_car_s_kinematics(knots, float64):
 # "early" has the unknowns of "given", and the time.
 @pytest.mark.parametrize("meet", [pytest.param("given", marks=pytest.mark.slow), "early"])
 def test_the_gradient_of_the_cost_matches_finite_differences(knots, float64, meet):
-    case = jax.tree.map(
-        lambda leaf: jnp.asarray(leaf[0], jnp.float64 if leaf.dtype != bool else bool),
-        pj.intercept.draw(1, "hard", 5),
-    )
-    case = dataclasses.replace(case, end_heading=jnp.array(2.0), heading_tolerance=jnp.array(0.1))
+    case = double(pj.take(pj.intercept.draw(1, "hard", 5), 0))
+    case = case.replace(end_heading=jnp.array(2.0), heading_tolerance=jnp.array(0.1))
     planner = pj.intercept.planner(pieces=8, meet=meet)
     problem = planner.problem
     field = jax.jit(lambda case: make_field(case, make_grid(case, SEARCHES[0].lattice)))(case)
     positions = np.random.default_rng(3).uniform(1.0, 7.0, (8, 2))
-    model = jax.jit(
-        lambda point: problem.build_model(point, case, field, Weights(follow=1.0), positions)
-    )
+    given = case, field, Weights(follow=1.0), positions
+    model = jax.jit(lambda point: problem.build_model(point, *given))
     speed, curvature = (jnp.asarray(1.2 * each[1:]) for each in knots)
     point = problem.pack(speed, curvature, jnp.array(9.0))
     found = model(point)
@@ -170,10 +167,6 @@ def still(x, y):
     return pj.TurningPath(jnp.array([x, y]), jnp.zeros(2), jnp.array(0.0))
 
 
-WALL = [[3.9, -0.5], [4.1, -0.5], [4.1, 8.5], [3.9, 8.5]]
-HALF = [[3.9, -0.5], [4.1, -0.5], [4.1, 5.5], [3.9, 5.5]]
-
-
 def scene(target, walls=(), **settings):
     return pj.intercept.case(still(*target), walls=walls, **settings)
 
@@ -214,7 +207,7 @@ def test_an_unsolvable_case_has_a_status_and_others_are_solved(scenes, name):
 
 
 def widen(obstacles, num, size):
-    """Add entries that are absent, at the front, and repeat corners, to N = `num`, V = `size`."""
+    """Add absent obstacles at the front, and repeat corners, up to `num` of `size` corners."""
     corners = np.asarray(obstacles.corners)
     more = size - corners.shape[2]
     wide = obstacles.replace(corners=np.concatenate([corners, *[corners[:, :, -1:]] * more], 2))
@@ -304,17 +297,9 @@ def test_a_plan_stays_the_same_for_an_unchanged_target(planned):
     # The new path is close to the remainder of the old path.
     apart = np.linalg.norm(after.pos - before.pos[:, 20:], axis=-1)
     assert np.median(apart) < 0.1
-    moved = dataclasses.replace(
-        cases,
-        start=again.start,
-        speed=again.speed[:, 0],
-        curvature=again.curvature[:, 0],
-        target=turned,
-        time=again.time,
-        movers=dataclasses.replace(
-            cases.movers, centre=cases.movers.centre + elapsed * cases.movers.velocity
-        ),
-    )
+    movers = cases.movers.replace(centre=cases.movers.centre + elapsed * cases.movers.velocity)
+    start = {"start": again.start, "speed": again.speed[:, 0], "curvature": again.curvature[:, 0]}
+    moved = cases.replace(target=turned, time=again.time, movers=movers, **start)
     assert pj.intercept.judge(moved, again).success.all()
 
 
@@ -324,10 +309,8 @@ def test_latency_plans_the_remainders_of_solved_plans_again(planned):
     assert planner == PLANNER.replanner()
     assert len(tasks.case.time) == pj.are_solved(plans).sum()
     np.testing.assert_allclose(tasks.case.time, 8.0, atol=1e-5)
-    goals = [
-        jax.vmap(lambda path, t: path.at(t).pos)(c.target, c.time) for c in (tasks.case, cases)
-    ]
-    np.testing.assert_allclose(goals[0], goals[1][pj.are_solved(plans)], atol=1e-4)
+    goal = jax.vmap(lambda case: case.target.at(case.time).pos)
+    np.testing.assert_allclose(goal(tasks.case), goal(cases)[pj.are_solved(plans)], atol=1e-4)
 
 
 def test_bad_input_is_rejected_in_one_line():

@@ -1,5 +1,3 @@
-"""Derivatives of interceptions at the point of least cost near a plan."""
-
 import dataclasses
 import functools
 from typing import Any
@@ -24,21 +22,10 @@ SMALL = {"pieces": 8, "samples": 3, "searches": (Search(4, lattice=Lattice(layer
 def crossing(dtype, wall=0.0):
     """Make a case with a target ahead, a mover from the right, and a wall at a distance [m]."""
     target = TurningPath(*(jnp.asarray(x, dtype) for x in ([3.5, 4.4], [0.0, -0.2], 0.0)))
-    corners = np.array([(1.6, 4.0), (2.4, 4.0), (2.0, 5.0)]) + [0.0, wall]
-    mover = [(2.5, 3.1), (3.0, 3.1), (3.0, 3.6), (2.5, 3.6)]
-    return pj.intercept.case(
-        target,
-        6.0,
-        walls=[corners],
-        movers=[mover],
-        mover_velocities=(0.0, 0.2),
-        curvature=1.0,
-        dtype=dtype,
-    )
-
-
-def duration(plan):
-    return plan.time
+    walls = [np.array([(1.6, 4.0), (2.4, 4.0), (2.0, 5.0)]) + [0.0, wall]]
+    movers = {"movers": [[(2.5, 3.1), (3.0, 3.1), (3.0, 3.6), (2.5, 3.6)]]}
+    movers |= {"mover_velocities": (0.0, 0.2)}
+    return pj.intercept.case(target, 6.0, walls=walls, **movers, curvature=1.0, dtype=dtype)
 
 
 @functools.cache
@@ -75,7 +62,7 @@ def move(case, name, by):
 def test_gradients_match_differences_of_new_plans(meet, binding, float64):
     planner = pj.intercept.planner(meet=meet, **SMALL)
     smooth, case = optimum_near_straight(planner, crossing(jnp.float64))
-    quantity = duration if meet == "early" else "cost"
+    quantity = "time" if meet == "early" else "cost"
     steps = 1 if meet == "early" else 0
     found = differentiate(smooth, quantity, BY, steps)(case)
 
@@ -102,7 +89,7 @@ def test_gradients_match_differences_of_new_plans(meet, binding, float64):
 def test_the_gradient_by_a_distant_obstacle_is_zero(float64):
     planner = pj.intercept.planner(meet="early", **SMALL)
     smooth, case = optimum_near_straight(planner, crossing(jnp.float64, wall=2.0))
-    assert not np.any(differentiate(smooth, duration, BY, 1)(case).by["walls.centre"])
+    assert not np.any(differentiate(smooth, "time", BY, 1)(case).by["walls.centre"])
 
 
 @pytest.mark.slow
@@ -130,5 +117,5 @@ def test_an_optimal_plan_has_the_same_gradient(float64):
     slope, plan = jax.jit(jax.grad(time, has_aux=True))(case.limits.acceleration)
     assert pj.are_solved(plan)
     smooth, case = planner.settle(case)
-    found = differentiate(smooth, duration, BY, 1)(move_to_optimum(smooth, case))
+    found = differentiate(smooth, "time", BY, 1)(move_to_optimum(smooth, case))
     assert slope == pytest.approx(float(found.by["limits.acceleration"]), rel=1e-3)

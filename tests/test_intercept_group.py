@@ -1,5 +1,3 @@
-"""Groups of targets for one car: suites, decisions, plans leg after leg, and the referee."""
-
 import dataclasses
 import itertools
 
@@ -24,6 +22,7 @@ from planner_jax.task.group.spec import SUITES, TASK
 from planner_jax.task.intercept.default_planner import SpacetimeIntercept
 from planner_jax.task.intercept.searches import Search
 from planner_jax.task.intercept.suites import SIZE
+from tests.trees import as_numpy
 
 # A single search, so that a single program is compiled.
 SEARCH = Search(12, LevenbergConfig(40), lattice=Lattice(layers=22))
@@ -34,12 +33,8 @@ def planner(decide):
     return pj.group.planner(decide=decide, planner=LEGS, patient=LEGS)
 
 
-def numpy(tree):
-    return jax.tree.map(np.asarray, tree)
-
-
 def draw(num, seed, count):
-    groups = numpy(pj.group.draw(num, seed=seed))
+    groups = as_numpy(pj.group.draw(num, seed=seed))
     present = np.broadcast_to(np.arange(4) < count, (num, 4))
     return dataclasses.replace(groups, present=present)
 
@@ -61,7 +56,7 @@ def test_a_group_is_the_same_in_every_batch():
 
 
 def test_groups_have_two_to_four_targets_that_stay_on_the_map():
-    groups, suite = numpy(pj.group.draw(40, seed=3)), SUITES["group"]
+    groups, suite = as_numpy(pj.group.draw(40, seed=3)), SUITES["group"]
     assert set(groups.present.sum(axis=1)) == {2, 3, 4}
     assert not (groups.present[:, 1:] & ~groups.present[:, :-1]).any()
     np.testing.assert_array_equal(groups.shared.time, suite.time)
@@ -97,9 +92,8 @@ def test_targets_on_a_line_are_met_in_sequence(decision):
 def test_best_proposes_every_order_once():
     group = line(6.0, 2.0, 3.0, 4.5, present=[True, False, True, True])
     propose = jax.jit(Best(6).propose)
-    three = {(*front, 1) for front in itertools.permutations([0, 2, 3])}
-    orders = propose(group).order.tolist()
-    assert len(orders) == 6 and set(map(tuple, orders)) == three
+    three = [(*front, 1) for front in itertools.permutations([0, 2, 3])]
+    assert sorted(map(tuple, propose(group).order.tolist())) == three
     two = dataclasses.replace(group, present=jnp.array([True, False, False, True]))
     assert set(map(tuple, propose(two).order.tolist())) == {(0, 3, 1, 2), (3, 0, 1, 2)}
 
@@ -115,7 +109,7 @@ def test_a_given_order_is_kept_and_must_be_a_permutation():
 
 @pytest.fixture(scope="module")
 def planned():
-    """Plan groups of two targets; the last group has too little time for both."""
+    """Plan groups of two targets, which the last group leaves too little time to meet."""
     groups = draw(6, 4, 2)
     time = np.array([15.0] * 5 + [1.0], np.float32)
     groups = dataclasses.replace(groups, shared=dataclasses.replace(groups.shared, time=time))
@@ -172,7 +166,7 @@ def test_one_target_is_planned_as_an_interception(planned):
     shared = groups.shared
     cars = CarState(shared.start, shared.speed, shared.curvature)
     leg = jax.vmap(lambda group, car: group.leg(0, jnp.float32(0.0), car))
-    alone = pj.plan(LEGS, numpy(jax.jit(leg)(groups, cars)))
+    alone = pj.plan(LEGS, as_numpy(jax.jit(leg)(groups, cars)))
     np.testing.assert_array_equal(plans.status, alone.status)
     solved = pj.are_solved(alone)
     assert solved.sum() >= 4
@@ -195,12 +189,9 @@ def test_the_referee_rejects_a_plan_with_a_wrong_leg(planned):
     aside[1, 0] = 0.01
     faster = legs.speed + 0.01 * (np.arange(4) == 1)[:, None]
     other = plans.order[:, [1, 0, 2, 3]]
+    cut = change_legs(plans, time=shorter * legs.time)
     wrong = {
-        "a leg that is cut": (
-            change_legs(plans, time=shorter * legs.time),
-            1,
-            {"meeting", "acceleration"},
-        ),
+        "a leg that is cut": (cut, 1, {"meeting", "acceleration"}),
         "a leg aside": (change_legs(plans, start=legs.start + aside), 1, {"start"}),
         "a faster leg": (change_legs(plans, speed=faster), 1, {"start"}),
         "the other order": (dataclasses.replace(plans, order=other), 0, {"meeting"}),

@@ -1,5 +1,3 @@
-"""The oracle of interceptions agrees with closed forms, and with the referee."""
-
 from dataclasses import replace
 
 import jax

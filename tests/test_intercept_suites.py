@@ -1,5 +1,3 @@
-"""The named suites of interceptions: every draw has the properties that their module states."""
-
 from dataclasses import replace
 
 import jax
@@ -16,15 +14,12 @@ from planner_jax.task.intercept.api import draw, observe
 from planner_jax.task.intercept.plan import InterceptPlan
 from planner_jax.task.intercept.searches import earliest_arrival
 from planner_jax.task.intercept.spec import SUITES
+from tests.trees import as_numpy
 
 NUM, SEED = 24, 3
 PLAIN = [name for name, suite in SUITES.items() if not suite.is_maze]
 
 each_suite = pytest.mark.parametrize("name", SUITES)
-
-
-def numpy(tree):
-    return jax.tree.map(np.asarray, tree)
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +28,7 @@ def batches():
         batches = {
             name: suites.draw_with_counts(name, NUM, SEED, dtype=jnp.float64) for name in SUITES
         }
-        return {name: replace(each, cases=numpy(each.cases)) for name, each in batches.items()}
+        return {name: replace(each, cases=as_numpy(each.cases)) for name, each in batches.items()}
 
 
 def least_distance(group, points, time=0.0):
@@ -91,10 +86,7 @@ def test_numbers_of_obstacles_are_in_their_ranges_and_all_occur(batches, name):
 @pytest.mark.parametrize("name", PLAIN)
 def test_polygons_are_convex_and_their_sizes_in_range(batches, name):
     cases = batches[name].cases
-    for group, (fewest, radius) in (
-        (cases.walls, (3, (0.2, 0.8))),
-        (cases.movers, (4, (0.2, 0.4))),
-    ):
+    for group, fewest, radius in (*((cases.walls, 3, (0.2, 0.8)), (cases.movers, 4, (0.2, 0.4))),):
         present, corners = group.present, group.corners
         edge = np.roll(corners, -1, axis=2) - corners
         num_corners = np.sum(np.any(np.abs(edge) > 1e-12, axis=3), axis=2)
@@ -173,10 +165,8 @@ def test_a_car_that_brakes_at_once_stops_before_every_wall(batches, name):
     cases = batches[name].cases
     blank = dict.fromkeys(("cost", "violation", "iterations", "status", "meeting"), np.zeros(NUM))
     speed = np.tile([0.5, 0.0, 0.0], (NUM, 1))
-    time = np.full(NUM, 1.0)
-    plans = InterceptPlan(
-        start=cases.start, time=time, speed=speed, curvature=np.zeros_like(speed), **blank
-    )
+    drive = {"start": cases.start, "time": np.ones(NUM), "speed": speed, "curvature": 0.0 * speed}
+    plans = InterceptPlan(**drive, **blank)
     verdict = referee_intercepts(cases, plans)
     assert verdict.wall_clearance.min() > 0.0
     assert set(verdict.failed_limit) <= {"mover", "meeting"}
@@ -284,7 +274,7 @@ def test_draws_that_are_just_far_enough_are_accepted():
 
 
 def test_observations_are_positions_of_the_target_with_noise():
-    cases = numpy(draw(200, "easy", 1))
+    cases = as_numpy(draw(200, "easy", 1))
     times, positions = observe(cases, 4)
     np.testing.assert_array_equal(times, np.arange(-14.0, 1.0))
     assert positions.shape == (200, 15, 2)

@@ -1,7 +1,11 @@
-"""Bitwise comparison of pytrees."""
+"""Conversions and comparisons of pytrees, leaf by leaf."""
 
 import jax
 import numpy as np
+
+
+def as_numpy(tree):
+    return jax.tree.map(np.asarray, tree)
 
 
 def assert_same(ours, theirs, lanes=...):

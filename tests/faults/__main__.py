@@ -20,7 +20,6 @@ from tests.faults.trials import TRIALS, make_whole, try_some
 
 
 def main() -> int:
-    """Inject all selected faults and print the table; return 1 if a run did not survive."""
     parser = argparse.ArgumentParser("python -m tests.faults", description=__doc__)
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.add_argument("--share", type=float, default=1.0, help="of all trials (default: 1)")

@@ -28,7 +28,6 @@ sweep hit --resume --out gone                | --out must be
 sweep hit stray                              | unrecognized .. stray
 sweep hit --speed 3                          | unrecognized arguments .. --speed
 sweep hit --batch 0                          | --batch must be >= 1, got 0
-sweep hit --num 1 --out /proc/nowhere        | --out must be a folder that can be written
 sweep hit --resume                           | --out must name the folder to resume
 sweep hit --suite throws                     | --suite must be one of court, S.1 .. got 'throws'
 sweep hit --delay 3            | --delay must be shorter than each serve's flight .. got 3
@@ -61,8 +60,6 @@ plan hit --vel -3 0.2 4 --target 4 0 0 --pos 4 0 1 --speed inf | --speed must be
 plan hit --vel -3 0.2 4 --target 4 0 0 --pos 4 0 1 --out junk/below | --out must be in a folder
 plan catch --horizon 1 --ball 1 2 3          | --ball
 plan block                                   | block
-compare junk junk --out x.txt                | --out must end in .csv
-export junk --row 0 --to cvs                 | --to must be one of csv .. did you mean 'csv'?
 export junk --row 0 --to csv --recovery land   | --recovery must be one of none
 serve hit --port 65536                       | --port must
 serve catch --deadline 0                     | --deadline must
@@ -102,12 +99,9 @@ ROWS = [
 WHOLE = (
     *((f"sweep {task}", option) for task in TASKS for option in ("--num", "--batch", "--seed")),
     *((f"fly {task}", option) for task in TASKS for option in ("--num", "--batch", "--record")),
-    *(
-        ("fly catch", "--balls"),
-        ("export junk --to csv", "--row"),
-        ("export junk --to px4", "--udp"),
-    ),
-    *(("serve hit", "--port"), ("serve catch", "--horizon"), ("view folder", "--port")),
+    *(("fly catch", "--balls"), ("export junk --to csv", "--row")),
+    *(("export junk --to px4", "--udp"), ("view folder", "--port")),
+    *(("serve hit", "--port"), ("serve catch", "--horizon")),
     *(("library check junk", "--num"), ("library check junk", "--seed")),
     *(("bench throughput", "--devices"), ("bench throughput", "--repeat"), ("train", "--num-envs")),
 )

@@ -35,14 +35,7 @@ def run(*arguments: str | Path) -> Ended:
     return Ended(code, out.getvalue(), err.getvalue())
 
 
-def start(
-    *arguments: str | Path,
-    cwd: Path,
-    module: str = "planner_jax",
-    cache: str | None = None,
-    blocks: int | None = None,
-    cores: int | None = None,
-) -> subprocess.Popen:
+def start(*arguments, cwd, module="planner_jax", cache=None, blocks=None, cores=None):
     """Start `python -m MODULE` on some random cores, with files of at most `blocks` KiB."""
     path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
     environment = {"PYTHONFAULTHANDLER": "1", "PYTHONPATH": path}
@@ -55,18 +48,11 @@ def start(
         command = ["taskset", "--cpu-list", ",".join(map(str, some)), *command]
     if blocks is not None:
         command = ["bash", "-c", f'ulimit -f {blocks}; exec "$@"', "limited", *command]
-    return subprocess.Popen(
-        command,
-        cwd=cwd,
-        env={**os.environ, **environment},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    return subprocess.Popen(command, cwd=cwd, env={**os.environ, **environment}, **pipes)
 
 
 def wait_for(process: subprocess.Popen, within: float = 300.0) -> Ended:
-    """Wait for the end of a process; kill it after `within` seconds."""
     try:
         out, err = process.communicate(timeout=within)
     except subprocess.TimeoutExpired:

@@ -54,20 +54,16 @@ def make_runs(place: Path) -> None:
 
 def make_flights(out: Path) -> None:
     """Write a run folder of simulated flights with invented content."""
-    manifest = {
-        **{"kind": "fly catch", "state": "complete", "seed": 0},
-        "parameters": dataclasses.asdict(CatchFly()),
-        **{"device": {}, "loop": {}, "times": {"compile_seconds": 0.0, "wall_seconds": 1.0}},
-        "summary": {
-            **{"num": 1, "successes": 1, "success_rate": 1.0, "wilson_95": [0.2, 1.0]},
-            **{"tracking_rms_median": 0.0, "tracking_worst": 0.0},
-        },
-    }
+    manifest = {"kind": "fly catch", "state": "complete", "seed": 0, "device": {}, "loop": {}}
+    manifest |= {"parameters": dataclasses.asdict(CatchFly())}
+    manifest |= {"times": {"compile_seconds": 0.0, "wall_seconds": 1.0}}
+    summary = {"num": 1, "successes": 1, "success_rate": 1.0, "wilson_95": [0.2, 1.0]}
+    summary |= {"tracking_rms_median": 0.0, "tracking_worst": 0.0}
     folder = RunFolder(out)
     with folder.lock():
         Dataset(out / FLIGHTS).write_rows(to_rows(recording()))
         folder.plans.write_rows(pa.table({"index": [0]}))
-        folder.write_manifest(manifest)
+        folder.write_manifest({**manifest, "summary": summary})
 
 
 def make_training(out: Path) -> None:
@@ -123,10 +119,10 @@ def _resume(place: Path, out: Path) -> str | None:
 
 
 def _view(place: Path, out: Path) -> str | None:
-    """Run the command `view` with a replaced viewer; return the outcome, None for wrong flights."""
     shown: list[Any] = []
     with pytest.MonkeyPatch.context() as patch:
-        viewer = SimpleNamespace(Viewer=lambda _, found, *__: shown.append(found) or _Shut())
+        closes_at_once = SimpleNamespace(url="nowhere", run=lambda: None)
+        viewer = SimpleNamespace(Viewer=lambda _, found, *__: shown.append(found) or closes_at_once)
         patch.setitem(__import__("sys").modules, "planner_jax.sims.view", viewer)
         ended = run("view", out)
     if ended.code:
@@ -137,15 +133,6 @@ def _view(place: Path, out: Path) -> str | None:
         for name, value in wanted.items()
     ]
     return IDENTICAL if all(same) else None
-
-
-class _Shut:
-    """A replacement of the flight viewer, which ends immediately."""
-
-    url = "nowhere"
-
-    def run(self) -> None:
-        """Return immediately."""
 
 
 def _curves(place: Path, out: Path) -> str | None:

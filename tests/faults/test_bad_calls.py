@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 import planner_jax as pj
 from planner_jax.core.rules import part_at
-from planner_jax.policies.policy import Policy, policy
+from planner_jax.policies.policy import policy
 from planner_jax.task.block.plan import BlockPlan
 from planner_jax.task.block.replan import ReplanBlock
 from planner_jax.task.catch.decide import Best
@@ -19,10 +19,7 @@ from planner_jax.task.catch.plan import CatchPlan
 from planner_jax.task.hit.plan import HitPlan, Stroke
 from planner_jax.task.intercept.plan import InterceptPlan
 from tests.faults.bad_calls import ARGUMENTS, ROWS
-
-
-def host(tree):
-    return jax.tree.map(np.asarray, tree)
+from tests.trees import as_numpy
 
 
 def zeros(*shape):
@@ -35,7 +32,7 @@ def pieces(num, degree, dimensions):
 
 
 def make_plans():
-    """Return two plans of every task, with the shapes of real ones."""
+    """Return two plans of every task."""
     whole = np.zeros(2, np.int32)
     of_all = {"cost": zeros(), "violation": zeros(), "iterations": whole, "status": whole}
     flown = {**of_all, "gravity": zeros() + np.float32(9.8)}
@@ -66,10 +63,6 @@ def first(num, plans):
     return jax.tree.map(lambda leaf: np.resize(leaf, (num, *leaf.shape[1:])), plans)
 
 
-def lane0(tree):
-    return pj.take(tree, 0)
-
-
 def ball_path(num):
     vectors = np.zeros((num, 3), np.float32)
     return pj.BallPath(pj.BallState(vectors, vectors), vectors, vectors[:, 0])
@@ -82,7 +75,7 @@ def turning(num):
 
 @pytest.fixture(scope="module")
 def given(tmp_path_factory):
-    """Provide the names in the calls, and a folder with files of every kind."""
+    """Provide the names that the calls use, and a folder with files of every kind."""
     folder = tmp_path_factory.mktemp("calls")
     os.mkfifo(folder / "pipe")
     (folder / "empty").touch()
@@ -90,7 +83,7 @@ def given(tmp_path_factory):
     exact, catcher = pj.hit.planner(), pj.catch.planner(decide="given")
     driver, blocker = pj.intercept.planner(), pj.block.planner()
     hits, catches, drives, blocks = (
-        host(task.draw(2)) for task in (pj.hit, pj.catch, pj.intercept, pj.block)
+        as_numpy(task.draw(2)) for task in (pj.hit, pj.catch, pj.intercept, pj.block)
     )
     square = np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)])
     ball = pj.take(hits.ball, 0)
@@ -101,16 +94,12 @@ def given(tmp_path_factory):
 
     names = {
         **{"pj": pj, "np": np, "jax": jax, "nan": np.nan, "inf": np.inf},
-        **{"dataclasses": dataclasses, "Best": Best, "Policy": Policy, "policy": policy},
-        "ReplanBlock": ReplanBlock,
-        **{"HitPlan": HitPlan, "CatchPlan": CatchPlan},
-        **{"having": having, "fill": fill, "first": first, "lane0": lane0, "save": save},
-        **{"ball_path": ball_path, "turning": turning, "SQUARE": square},
+        **{"Best": Best, "policy": policy, "ReplanBlock": ReplanBlock},
+        **{"HitPlan": HitPlan, "CatchPlan": CatchPlan, "turning": turning, "SQUARE": square},
+        **{"having": having, "fill": fill, "first": first, "save": save},
         **{"exact": exact, "catcher": catcher, "driver": driver, "blocker": blocker},
         **{"hits": hits, "catches": catches, "drives": drives, "blocks": blocks},
-        "hit": pj.take(hits, 0),
         **make_plans(),
-        "two_walls": jax.tree.map(lambda leaf: np.stack([leaf] * 2), host(pj.obstacles([square]))),
         "HIT": {"ball_pos": (0, 5, 1), "ball_vel": (0, -5, 4), "target": (0, 4, 0)},
         "HITS": {name: np.ones((2, 3)) for name in ("ball_pos", "ball_vel", "target")},
         "CATCH": {"targets": ball_path(2), "horizon": (2.0, 2.0)},
@@ -119,7 +108,6 @@ def given(tmp_path_factory):
         "BLOCK": {"ball_pos": (4, 0, 1), "ball_vel": (-8, 0, 2)},
         "PATH": {"ball": ball, "horizon": 1.0, "drag": 0.06, "gravity": 9.8, "num_nodes": 8},
         "FLY": {"ball": ball, "duration": 1.0, "drag": 0.06, "gravity": 9.8, "num_steps": 8},
-        "table": pj.predict_path(ball, 1.0, 0.06, 9.8, num_nodes=8),
     }
     return folder, names
 

@@ -12,7 +12,6 @@ from tests.faults.commands import is_one_line, run
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory):
-    """Enter a folder with files of every kind."""
     folder = tmp_path_factory.mktemp("files")
     os.mkfifo(folder / "pipe")
     (folder / "folder").mkdir()
@@ -41,8 +40,6 @@ def test_it_is_refused_in_one_line_and_leaves_nothing(files, arguments, words):
 
 
 def is_no(kind):
-    """Return a filter of texts that do not denote a number."""
-
     def is_malformed(text):
         try:
             kind(text)
@@ -54,7 +51,6 @@ def is_no(kind):
 
 
 def spoil(options, texts):
-    """Return a strategy of a command, an option, and a text that the option does not accept."""
     return st.tuples(st.sampled_from(options), texts)
 
 

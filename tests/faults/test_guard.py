@@ -1,5 +1,3 @@
-"""Requests that the viewer accepts or rejects."""
-
 import pytest
 
 from planner_jax.sims.guard import is_allowed

@@ -1,4 +1,4 @@
-"""Absurd cases in a batch are marked, and no other case loses a bit."""
+"""Absurd cases in a batch are marked, and the plans of other cases are unchanged bit for bit."""
 
 import dataclasses
 
@@ -27,12 +27,10 @@ def test_a_table_names_arrays_of_its_case_and_every_rule_can_be_broken(name):
     options = {"robot": with_all_limits(pj.robot_named(robots[name]))} if name in robots else {}
     drawn = pj.task_named(name).draw(1, **options) if options else CASES[name]
     case = pj.take(jax.tree.map(np.asarray, drawn), 0)
-    fields = [field.name for field in type(case).rules]
-    for field in fields:
-        part_at(case, field)
-    assert {place for place, _ in poisons(case)} >= {
-        field.name for field in type(case).rules if field.kind is np.floating
-    }
+    for field in type(case).rules:
+        part_at(case, field.name)
+    places = {place for place, _ in poisons(case)}
+    assert places >= {field.name for field in type(case).rules if field.kind is np.floating}
 
 
 @pytest.mark.parametrize("name", TASKS)
@@ -53,8 +51,7 @@ def test_the_host_names_field_rule_value_and_lane(name):
     cases = CASES[name]
     for place, value in poisons(pj.take(cases, 0))[::5]:
         broken = jax.tree.map(np.array, cases)
-        leaf = part_at(broken, place.replace("extras.", "extras."))
-        leaf[1] = value
+        part_at(broken, place)[1] = value
         with pytest.raises(pj.CaseError) as caught:
             pj.require_sound(broken)
         line = str(caught.value)

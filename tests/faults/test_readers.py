@@ -40,17 +40,10 @@ def manifest_of(out):
 
 
 def assert_resumed(runs, out, *told, planned=None):
-    """Assert that a resumed run has the rows of the undisturbed one, and what it reports."""
     ended = run("sweep", "hit", "--resume", "--out", out)
     assert ended.code == 0 and all(part in ended.err for part in told)
     assert planned is None or ended.err.count("planned again") == planned
     assert rows_of(out) == rows_of(runs / "whole")
-
-
-def rewritten(out, **entries):
-    """Write the manifest with other entries and a fitting digest."""
-    folder = RunFolder(out)
-    folder.write_manifest({**manifest_of(out), **entries})
 
 
 @pytest.mark.parametrize(
@@ -75,15 +68,16 @@ def test_an_edited_manifest_is_refused(runs, tmp_path):
 
 def test_a_summary_that_its_rows_do_not_have_is_refused(runs, tmp_path):
     out = copy_run(runs, "whole", tmp_path)
-    summary = manifest_of(out)["summary"]
-    rewritten(out, summary={**summary, "successes": summary["successes"] - 1})
+    manifest = manifest_of(out)
+    manifest["summary"]["successes"] -= 1
+    RunFolder(out).write_manifest(manifest)
     ended = run("report", out)
     assert is_one_line(ended) and "RUN must be a run whose entry successes agrees" in ended.err
 
 
-def test_a_run_is_not_gone_on_with_by_other_versions_code_or_devices(runs, tmp_path):
+def test_other_versions_code_or_devices_do_not_resume_a_run(runs, tmp_path):
     out = copy_run(runs, "begun", tmp_path)
-    makers = manifest_of(out)["makers"]
+    manifest = manifest_of(out)
     for what, value, told in (
         ("jax", "0.0.1", r"jax 0\.0\.1, as it started, got 0\."),
         ("devices of kind", "abacus", "devices of kind abacus, as it"),
@@ -91,7 +85,8 @@ def test_a_run_is_not_gone_on_with_by_other_versions_code_or_devices(runs, tmp_p
         ("threads of a computation (NPROC)", 99, r"\(NPROC\) 99, as it started, got "),
         ("files of planner-jax", "0" * 12, "files of planner-jax 000000000000, as it started, got"),
     ):
-        rewritten(out, makers={**makers, what: value})
+        makers = {**manifest["makers"], what: value}
+        RunFolder(out).write_manifest({**manifest, "makers": makers})
         with pytest.raises(ArgumentError, match=told):
             resume_sweep(TASK, out, progress=False)
 

@@ -1,6 +1,5 @@
 """Signals end a command with their own code and a line, whatever its threads do."""
 
-import importlib.util
 import signal
 import subprocess
 import sys
@@ -40,18 +39,15 @@ NUMBERS = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
 
 
 def stop_script(script, *numbers, ignored=()):
-    """Send signals to a script when it is ready, and return how it ends."""
+    """Send signals to a script when it is ready; return its exit code and output."""
     # Under `nohup` the children of the tests inherit that SIGHUP is ignored.
     heard = {number: "SIG_IGN" if number in ignored else "SIG_DFL" for number in NUMBERS}
     before = "".join(
         f"import signal; signal.signal({int(n)}, signal.{how})\n" for n, how in heard.items()
     )
-    process = subprocess.Popen(
-        [sys.executable, "-c", before + PREPARED + script],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+    command = [sys.executable, "-c", before + PREPARED + script]
+    pipes: dict = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    process = subprocess.Popen(command, **pipes)
     assert process.stdout is not None and process.stdout.readline() == "ready\n"
     for number in numbers:
         process.send_signal(number)
@@ -82,9 +78,8 @@ def test_a_second_signal_ends_a_busy_command_at_once():
 
 
 def test_nohup_is_respected_and_a_background_job_hears_ctrl_c():
-    ended = stop_script(
-        NOTHING_UNDER_WAY, signal.SIGHUP, signal.SIGINT, ignored=[signal.SIGHUP, signal.SIGINT]
-    )
+    both = signal.SIGHUP, signal.SIGINT
+    ended = stop_script(NOTHING_UNDER_WAY, *both, ignored=both)
     assert is_stopped(ended, signal.SIGINT)
 
 
@@ -97,13 +92,10 @@ def test_a_command_that_imports_is_ended_without_a_traceback(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.skipif(
-    importlib.util.find_spec("viser") is None,
-    reason="viser is not installed; it comes with the extra view",
-)
 @pytest.mark.slow
 @pytest.mark.parametrize("number", NUMBERS)
 def test_a_viewer_is_ended_with_its_code_and_a_line(tmp_path, number):
+    pytest.importorskip("viser", reason="viser is not installed; it comes with the extra view")
     make_flights(tmp_path / "flights")
     process = start("view", "flights", "--port", "0", cwd=tmp_path)
     assert process.stdout is not None

@@ -23,11 +23,11 @@ COMMAND = ("sweep", "hit", "--num", "40", "--batch", "13", "--seed", "3", "--out
 
 
 class Killed(BaseException):
-    """Stands for SIGKILL."""
+    """Exception in place of SIGKILL."""
 
 
 def failing(monkeypatch, number, error):
-    """Let the write of this number fail before the renaming; return a count of writes."""
+    """Let the write with this number fail before its file is renamed; return a count of writes."""
     real, count = os.replace, [0]
 
     def replace(*names):
@@ -69,9 +69,7 @@ def test_a_folder_without_its_first_manifest_is_new(runs, tmp_path, monkeypatch)
 
 
 @pytest.mark.parametrize("code", [errno.ENOSPC, errno.EACCES])
-def test_a_write_that_fails_names_file_and_option_and_how_to_go_on(
-    runs, tmp_path, monkeypatch, code
-):
+def test_a_failed_write_names_file_option_and_how_to_resume(runs, tmp_path, monkeypatch, code):
     out = tmp_path / "run"
     with monkeypatch.context() as patch:
         failing(patch, 3, OSError(code, os.strerror(code)))
@@ -86,7 +84,7 @@ def test_a_write_that_fails_names_file_and_option_and_how_to_go_on(
 
 
 def test_files_that_may_not_grow_are_told_of(runs, tmp_path):
-    """The limit of file sizes lies between the smallest part and the others."""
+    """Limit the size of files to a value between the smallest part of a run and the others."""
     out, before = tmp_path / "run", resource.getrlimit(resource.RLIMIT_FSIZE)
     small, other, *_ = sorted(path.stat().st_size for path in (runs / "whole/plans").iterdir())
     resource.setrlimit(resource.RLIMIT_FSIZE, ((small + other) // 2, before[1]))
@@ -121,7 +119,6 @@ def test_the_second_writer_is_refused_and_told_of_the_first(runs, tmp_path):
 
 
 def test_of_many_that_begin_at_once_one_owns_the_folder(tmp_path):
-    """Each thread opens the lock file itself, as another process would."""
     barrier, won = threading.Barrier(4), []
 
     def hold(number):

@@ -15,14 +15,8 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import NamedTuple
 
-from tests.faults.commands import (
-    children_of,
-    is_one_line,
-    is_stopped,
-    start,
-    wait_for,
-    wait_until_listening,
-)
+from tests.faults import commands
+from tests.faults.commands import children_of, is_one_line, is_stopped, start, wait_for
 from tests.faults.quick import quick_sweeps
 from tests.sweeps import rows_of
 
@@ -39,8 +33,6 @@ sweep = partial(start, "sweep", module=QUICK)
 
 
 class Trial(NamedTuple):
-    """One kind of fault: its name, and the function that injects it."""
-
     name: str
     words: str  # of the table
     # Takes a random generator, a number of faults, an empty folder, and one of undisturbed runs.
@@ -98,9 +90,8 @@ def kill_workers(moment: random.Random, num: int, place: Path, base: Path) -> Su
         return
     working, tried, out = 1.0, 0, place / "run"  # seconds from the first worker to the end
     while tried < num:
-        process = start(
-            *("sweep", *SWEEPS["many"], "--workers", "ray", "--out", out), cwd=place, cores=2
-        )
+        command = ("sweep", *SWEEPS["many"], "--workers", "ray", "--out", out)
+        process = start(*command, cwd=place, cores=2)
         workers: list[int] = []
         while process.poll() is None and not workers:
             raylets = children_of(process.pid, "raylet")
@@ -149,7 +140,7 @@ def interrupt(moment: random.Random, num: int, place: Path, base: Path) -> Survi
         number = moment.choice((signal.SIGINT, signal.SIGINT, signal.SIGTERM, signal.SIGHUP))
         process = sweep(*SWEEPS["hit"], "--out", out, cwd=place, cache=cache)
         late = moment.uniform(0.5, 12.0 if compiles else 6.0)
-        wait_until_listening(process)
+        commands.wait_until_listening(process)
         time.sleep(moment.choice((moment.uniform(0.0, 1.0), late)))
         times = 1 + 2 * (tried % 3 == 0)
         alive = process.poll() is None
@@ -185,6 +176,9 @@ def fill_disk(limits: random.Random, num: int, place: Path, base: Path) -> Survi
         shutil.rmtree(out, ignore_errors=True)
 
 
+NUM_DAMAGED = {"manifest": 500, "manifest of an interrupted run": 300}
+NUM_DAMAGED |= {"parts of an interrupted run": 300, "parts": 300, "flights": 300}
+NUM_DAMAGED |= {"training": 200, "plans.npz": 100}
 TRIALS = [
     *(
         Trial(
@@ -203,15 +197,7 @@ TRIALS = [
             *(f"mutants-{what.replace(' ', '-')}", f"damage to {what}"),
             *(partial(damage_files, what), num, 50, ""),
         )
-        for what, num in (
-            ("manifest", 500),
-            ("manifest of an interrupted run", 300),
-            ("parts of an interrupted run", 300),
-            ("parts", 300),
-            ("flights", 300),
-            ("training", 200),
-            ("plans.npz", 100),
-        )
+        for what, num in NUM_DAMAGED.items()
     ),
     Trial("interrupts", "SIGINT, SIGTERM, SIGHUP at a random moment", interrupt, 200, 10, "hit"),
     Trial("full-disk", "files that may not grow beyond a limit", fill_disk, 20, 2, "hit"),

@@ -1,0 +1,194 @@
+"""Planners of every task and of a user's task, each with a function that draws its cases."""
+
+import dataclasses
+import functools
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax import Array, lax
+from test_block_library import make_library
+
+import planner_jax as pj
+from planner_jax.baselines.block.library.planner import LibraryBlock
+from planner_jax.baselines.intercept.projection import Projection
+from planner_jax.baselines.intercept.static_paths import PathSource
+from planner_jax.core.planner import Kind
+from planner_jax.core.protocol import Attempt, Plan, outcome
+from planner_jax.optimise.levenberg import LevenbergConfig
+from planner_jax.optimise.settings import LbfgsConfig, Round
+from planner_jax.plane.reach import Lattice
+from planner_jax.task.block.default_planner import Search as BlockSearch
+from planner_jax.task.intercept.problem import MotionProblem
+from planner_jax.task.intercept.searches import Search
+
+NUM = 6  # Number of cases in a batch, which fits into the smallest padded batch size.
+
+# The following classes define a task as a user would: approach a point in the plane.
+
+
+@struct.dataclass
+class Place:
+    """A case of the user's task."""
+
+    goal: Array  # (2,), position of the goal
+    reach: Array  # (), greatest permitted distance from the goal
+
+    @property
+    def batch_shape(self):
+        return np.shape(self.reach)
+
+
+@struct.dataclass
+class Stand(Plan):
+    """A plan of the user's task."""
+
+    point: Array  # (2,), the point that is reached
+
+
+def places(num):
+    goals = np.random.default_rng(0).uniform(-1.0, 1.0, (num, 2)).astype(np.float32)
+    return Place(goals, np.full(num, 0.4, np.float32))
+
+
+@struct.dataclass
+class LibraryPlanner(pj.Planner):
+    """A planner that selects the nearest of the first 8 stored points, and then of 64."""
+
+    points: Array  # (K, 2), stored points
+    attempts: ClassVar[tuple[Attempt, ...]] = (Attempt(1), Attempt(2))
+    case_type: ClassVar[type] = Place
+
+    def solve(self, case: Place, attempt: Attempt) -> Stand:
+        points = self.points[: 8 * attempt.starts**3]
+        along = jnp.matmul(points, case.goal, precision=lax.Precision.HIGHEST)
+        away = jnp.sum(points**2, axis=1) - 2.0 * along + jnp.sum(case.goal**2)
+        nearest = jnp.argmin(away)
+        excess = jnp.sqrt(jnp.maximum(away[nearest], 0.0)) - case.reach
+        return Stand(point=points[nearest], **outcome(away[nearest], excess, stationary=False))
+
+
+@dataclasses.dataclass(frozen=True)
+class NumpyPlanner(pj.Planner):
+    """A planner in NumPy, which steps 0.5 towards the goal, and in its second attempt 1."""
+
+    attempts: ClassVar[tuple[Attempt, ...]] = (Attempt(1), Attempt(2))
+    case_type: ClassVar[type] = Place
+
+    def solve_on_host(self, cases: Place, attempt: Attempt) -> Stand:
+        away = np.linalg.norm(cases.goal, axis=1)
+        share = np.minimum(0.5 * attempt.starts / away, 1.0)[:, None]
+        point = share * cases.goal
+        left = np.linalg.norm(cases.goal - point, axis=1)
+        fields = jax.vmap(outcome)(left, left - cases.reach)
+        return Stand(point=point, **jax.tree.map(np.asarray, fields))
+
+
+def library(seed):
+    return np.random.default_rng(seed).uniform(-1.0, 1.0, (64, 2)).astype(np.float32)
+
+
+# Settings with which each planner compiles quickly, because compilation takes most of the tests'
+# time: two iterations of the optimiser, or none.
+FEW = {"rounds": (Round(solver=LbfgsConfig(max_steps=2, memory=1, trial_steps=(1.0,))),)}
+NONE = {"rounds": (Round(solver=LbfgsConfig(max_steps=0)),)}
+# These settings are also used in test_block, test_block_peers and test_block_library, so that the
+# compiled programs can be used again.
+SMALL_SEARCH = {
+    "pieces": 6,
+    "points": 10,
+    "searches": (BlockSearch(straight=12, tries=3, solver=LevenbergConfig(8)),),
+}
+SHORT = {"proportions": (0.2, 0.5, 1.0, 1.0, 1.0, 1.0), "nodes": 3, "num_table_nodes": 16}
+
+
+@dataclasses.dataclass(frozen=True)
+class Entry:
+    """A planner that is tested, with a function that draws its cases."""
+
+    planner: Any
+    cases: Any  # function that draws a given number of cases
+    broken: str  # name of a floating-point array of the case, which tests fill with NaN
+    gradient: dict[str, Any] | None = None  # arguments of `pj.gradient`; None without a gradient
+
+    @functools.cached_property
+    def batch(self):
+        return jax.tree.map(np.asarray, self.cases(NUM))
+
+    @functools.cached_property
+    def plans(self):
+        return pj.plan(self.planner, self.batch)
+
+    @property
+    def on_host(self):
+        return self.planner.kind is Kind.HOST
+
+
+def hit(name, gradient, **options):
+    return Entry(pj.hit.planner(name, **options), pj.hit.draw, "ball.pos", gradient)
+
+
+def catch(name, suite, gradient, **options):
+    cases = lambda num: pj.catch.draw(num, suite, 4)  # noqa: E731
+    return Entry(pj.catch.planner(name, **options), cases, "targets.ball.vel", gradient)
+
+
+def drive(planner, gradient=None):
+    return Entry(planner, lambda num: pj.intercept.draw(num, "easy", 4), "start", gradient)
+
+
+def path_then_speed(name, **options):
+    small = MotionProblem(pieces=12, samples=2, checked=2)
+    source = PathSource(problem=small, drawn=2, later=2, points=33)
+    projection = Projection(runs=1, slabs=2)
+    step = pj.intercept.planner(name).step
+    speed = step.speed and dataclasses.replace(step.speed, pieces=4)
+    step = dataclasses.replace(step, speed=speed, projection=projection, pieces=40)
+    searches = (Search(2, LevenbergConfig(15), lattice=Lattice(layers=20)),)
+    options |= {"source": source, "step": step, "searches": searches}
+    return drive(pj.intercept.planner(name, **options))
+
+
+def block(name, suite="pole", **options):
+    cases = lambda num: pj.block.draw(num, suite, 8, regime="R1", wide=True)  # noqa: E731
+    return Entry(pj.block.planner(name, **options), cases, "ball.vel")
+
+
+BY_NET = {"of": lambda plan: plan.times[-1], "by": "net"}
+ONE_SEARCH = (Search(1, LevenbergConfig(2), lattice=Lattice(layers=20, headings=16)),)
+ENTRIES = {
+    # The gradient of the cost needs no adjoint solver, which would take three times as long to
+    # compile.
+    "hit exact": hit("exact", {"of": "cost", "by": "racket_height", "steps": 0}, **SHORT, **NONE),
+    "hit bat": hit("bat", {"of": "cost", "by": ["target", "gravity"]}, nodes=6, **NONE),
+    "hit bat-lite": hit("bat-lite", {"of": "stroke.time", "by": "limits"}, nodes=6, **NONE),
+    "hit juggle": hit("juggle", None, nodes=6),
+    "catch exact": catch("exact", "throws", BY_NET, decide="greedy", nodes=3, **FEW),
+    "catch catch": catch(
+        "catch", "throws", {"of": "cost", "by": "net.height"}, decide="given", nodes=6, **NONE
+    ),
+    "catch mpp": catch(
+        "mpp", "parabola2", None, decide=pj.catch.Best(finalists=2), speeds=(0.0, 1.0), nodes=6
+    ),
+    "intercept spacetime": drive(
+        pj.intercept.planner(pieces=6, samples=2, checked=2, searches=ONE_SEARCH),
+        {"of": "cost", "by": "time", "steps": 0},
+    ),
+    "intercept lattice": path_then_speed("lattice"),
+    "intercept em": path_then_speed("em", tries=1),
+    "intercept constant": path_then_speed("constant", tries=1),
+    "block online": block("online", **SMALL_SEARCH),
+    "block brisk": block("brisk", **SMALL_SEARCH),
+    "block direct": block("direct", points=6),
+    # In the suite `open`, which has no pole, the search finds a spline long before its time limit.
+    "block insat": block("insat", "open", points=6, budget=20.0, longest=20.0),
+    "block library": Entry(
+        LibraryBlock(make_library(regime="R1")),
+        lambda num: pj.block.draw(num, "pole", 8, regime="R1", anywhere=True),
+        "ball.vel",
+    ),
+    "library": Entry(LibraryPlanner(library(1)), places, "goal"),
+    "NumPy": Entry(NumpyPlanner(), places, "goal"),
+}
