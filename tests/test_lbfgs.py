@@ -98,9 +98,8 @@ def test_an_iteration_without_descent_empties_the_memory_and_shortens_steps():
     state = step(without_limits(lambda x: jnp.sum(x**2)), state, config)
     np.testing.assert_array_equal(state.step, 0.0)
     assert state.numbers.reach < 1.0
-    memory = lbfgs.remember(
-        lbfgs.Memory(jnp.ones((6, 3)), jnp.ones((6, 3)), jnp.ones(6)), state.step, jnp.zeros(3)
-    )
+    full = lbfgs.Memory(jnp.ones((6, 3)), jnp.ones((6, 3)), jnp.ones(6))
+    memory = lbfgs.remember(full, state.step, jnp.zeros(3))
     np.testing.assert_array_equal(memory.inverse_curvature, 0.0)
 
 

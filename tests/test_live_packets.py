@@ -33,9 +33,8 @@ def test_an_answer_comes_back_as_it_was_packed():
     packet = packets.read_request(BALL_SEEN)
     rows = np.arange(2 * packets.WIDTH, dtype=np.float32).reshape(2, packets.WIDTH)
     assert isinstance(packet, Packet)
-    found = packets.read_answer(
-        packets.answer(packet, Fault.OUTLIER, packets.Motion.PLAN, (5.0, 0.01, 5.5), rows)
-    )
+    state = Fault.OUTLIER, packets.Motion.PLAN, (5.0, 0.01, 5.5)
+    found = packets.read_answer(packets.answer(packet, *state, rows))
     assert found is not None
     assert (found.sequence, found.sent, found.motion) == (7, 5.0, packets.Motion.PLAN)
     assert (found.fault, found.begin, found.period, found.contact) == (11, 5.0, 0.01, 5.5)

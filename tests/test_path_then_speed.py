@@ -28,10 +28,8 @@ def still(x, y):
     return pj.TurningPath(jnp.array([x, y]), jnp.zeros(2), jnp.array(0.0))
 
 
-def scene(target=(6.0, 4.0), movers=(), velocities: Any = 0.0, walls=(), **settings):
-    return pj.intercept.case(
-        still(*target), walls=walls, movers=movers, mover_velocities=velocities, **settings
-    )
+def scene(target=(6.0, 4.0), velocities: Any = 0.0, **settings):
+    return pj.intercept.case(still(*target), mover_velocities=velocities, **settings)
 
 
 EMPTY = scene()
@@ -179,7 +177,7 @@ def test_a_drive_follows_its_path_and_ends_where_it_ends():
     movers = [SQUARE + [3.0, 2.0]]
     heading = BENT.heading[-1]
     end = np.asarray(BENT.pos[-1]) + 0.15 * np.array([np.cos(heading), np.sin(heading)])
-    case = scene(tuple(end), movers, [0.0, 0.4], time=14.0, start=(0.8, 2.0, 0.0))
+    case = scene(tuple(end), [0.0, 0.4], movers=movers, time=14.0, start=(0.8, 2.0, 0.0))
     plan = drive(case, BENT)
     assert plan.status == pj.Status.CONVERGED, pj.intercept.judge(case, plan).sentence()
     assert pj.intercept.judge(case, plan).success

@@ -26,9 +26,7 @@ def energies_of(trajectory):
 
 def trajectory(dtype=np.float64, seed=0):
     coeffs = np.random.default_rng(seed).normal(size=(3, DEGREE + 1, 3))
-    return polynomial.PiecewisePolynomial(
-        coeffs=coeffs.astype(dtype), durations=np.array(DURATIONS, dtype)
-    )
+    return polynomial.PiecewisePolynomial(coeffs.astype(dtype), np.array(DURATIONS, dtype))
 
 
 def exact(piece, local, order=0):

@@ -107,10 +107,8 @@ def assert_fails(leaves, name, *, part="", **found):
 
 
 def still(angles, **options):
-    return good(durations=(SPAN,), **options) | {
-        COEFFS: angles[None, None, None],
-        "angles": angles[None],
-    }
+    still = {COEFFS: angles[None, None, None], "angles": angles[None]}
+    return good(durations=(SPAN,), **options) | still
 
 
 def test_an_arm_that_swings_to_the_balls_place_blocks_it():

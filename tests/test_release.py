@@ -12,9 +12,8 @@ ROOT = Path(__file__).parents[1]
 def test_package_citation_and_changelog_name_one_version() -> None:
     version = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
-    latest = re.search(
-        r"^## \[(\d[^\]]*)\] - ([\d-]+)$", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE
-    )
+    changes = (ROOT / "CHANGELOG.md").read_text()
+    latest = re.search(r"^## \[(\d[^\]]*)\] - ([\d-]+)$", changes, re.MULTILINE)
     assert latest is not None
     assert (version, version) == (citation["version"], latest[1])
     assert str(citation["date-released"]) == latest[2]

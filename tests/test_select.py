@@ -12,13 +12,9 @@ GOOD, BAD = Status.FEASIBLE, Status.MAX_STEPS
 
 
 def plans(*rows, xp=np):
-    status, cost, violation = zip(*rows, strict=True)
-    return Plan(
-        cost=xp.asarray(cost, xp.float32),
-        violation=xp.asarray(violation, xp.float32),
-        iterations=xp.arange(len(rows)),
-        status=xp.asarray(status, xp.int32),
-    )
+    status, *numbers = zip(*rows, strict=True)
+    cost, violation = xp.asarray(numbers, xp.float32)
+    return Plan(cost, violation, xp.arange(len(rows)), xp.asarray(status, xp.int32))
 
 
 CASES = [  # later, before, whether the later one is selected

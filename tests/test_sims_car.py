@@ -171,9 +171,8 @@ def test_contacts_of_planned_poses_equal_those_of_the_referee():
 def test_predictions_use_only_observations_that_have_arrived():
     loop = DriveLoop(driving.CAR_WORLD, dataclasses.replace(EXACT, target_std=0.1, latency=0.05))
     seen = driving.meetings("easy", 2, seed=4, observation_rate=1.0)
-    of = jax.jit(
-        functools.partial(driving.predict_scene, loop, known_target=False, predict_movers=True)
-    )
+    options = {"known_target": False, "predict_movers": True}
+    of = jax.jit(functools.partial(driving.predict_scene, loop, **options))
     path, movers = jax.device_get(of(seen, np.float32(3.04)))
     later = dataclasses.replace(seen, target=seen.target + 9.0 * (seen.times > 2.5)[..., None])
     np.testing.assert_array_equal(path.pos, of(later, np.float32(3.04))[0].pos)

@@ -123,11 +123,8 @@ def test_chunks_of_a_round_are_not_begun_after_the_time(clock):
 
 def test_all_attempts_are_reported_and_a_report_is_a_line(clock):
     pj.plan(Rounds(), Task(NUMBERS), progress=clock.progress)
-    assert [(one.round, one.tried, one.cases) for one in clock.reports] == [
-        *((1, 0, 5), (1, 5, 5)),
-        *((2, 0, 3), (2, 3, 3)),
-        *((3, 0, 2), (3, 2, 2)),
-    ]
+    expected = [(1, 0, 5), (1, 5, 5), (2, 0, 3), (2, 3, 3), (3, 0, 2), (3, 2, 2)]
+    assert [(one.round, one.tried, one.cases) for one in clock.reports] == expected
     assert str(clock.reports[3]) == "round 2 of at most 3: 3 of 3 cases tried, after 3.0 s"
 
 
