@@ -186,10 +186,7 @@ def _judge(case: dict, links: tuple, relative: float, contact: float) -> dict:
         tests[kind], parts[kind] = (-least > contact, -least, time), part
     measured = {name: np.where(sound, value, np.nan) for name, value in measured.items()}
     measured |= {"contact_time": case["plan.contact_time"], "execution_time": execution}
-    tests = {
-        name: (failed & sound, np.where(sound, excess, 0.0), time)
-        for name, (failed, excess, time) in tests.items()
-    }
+    tests = judging.clear_where(~sound, tests)
     tests["time"] = (wrong_times[0], np.where(finite, wrong_times[1], 0.0), wrong_times[2])
     found = judging.first_failures(tests, LIMITS, finite)
     failed_part = np.full(len(finite), "")

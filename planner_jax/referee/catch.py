@@ -282,11 +282,7 @@ def _judge(
     motion, tests = quadrotor.judge_motion(
         whole, case, extras, intervals, tolerances["relative"], tolerances["continuity"]
     )
-    flying = whole.flown.any(axis=1)
-    tests = {
-        name: (failed & flying, np.where(flying, excess, 0.0), time)
-        for name, (failed, excess, time) in tests.items()
-    }
+    tests = judging.clear_where(~whole.flown.any(axis=1), tests)
     measured, catch_tests = _judge_catches(case, pieces, held, ends, net_test, tolerances)
     tests |= {name: _worst(test, held) for name, test in catch_tests.items()}
     tests["order"] = order_test

@@ -206,10 +206,7 @@ def _judge(case: dict, relative: float, contact: float) -> dict:
     tests["start"] = _start(case, relative)
     tests["meeting"] = (miss > case["tolerance"] * (1.0 + relative), miss, end)
     tests["heading"] = (off > case["heading_tolerance"] * (1.0 + relative), off, end)
-    tests = {
-        name: (failed & driven, np.where(driven, excess, 0.0), time)
-        for name, (failed, excess, time) in tests.items()
-    }
+    tests = judging.clear_where(~driven, tests)
     late = end - np.minimum(case["time"], LONGEST_PLAN)
     tests["time"] = (
         (late > judging.CONTACT_TIME_TOLERANCE) | (finite & ~driven),

@@ -208,6 +208,14 @@ def first_failures(tests: dict, limits: tuple[str, ...], finite: np.ndarray) -> 
     }
 
 
+def clear_where(invalid: np.ndarray, tests: dict) -> dict:
+    """Return tests (failed, excess, time) by name that pass, with excess 0, for invalid plans."""
+    return {
+        name: (failed & ~invalid, np.where(invalid, 0.0, excess), time)
+        for name, (failed, excess, time) in tests.items()
+    }
+
+
 def above(value: np.ndarray, limit: np.ndarray, tolerance: float, time: np.ndarray) -> tuple:
     """Test value <= limit up to a relative tolerance; return (failed, relative excess, time)."""
     scale = np.where(np.isinf(limit), 1.0, np.maximum(np.abs(limit), SMALLEST_LIMIT))

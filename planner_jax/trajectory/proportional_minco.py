@@ -266,7 +266,7 @@ def offset_energy(maps: ProportionalMinco, offsets: Array, piece_duration: Array
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _boundary_form(maps: ProportionalMinco, rows: Array) -> Array:
-    """Return the least integral () of |p^(s)|^2 for end states (2s, 3), with pieces of mean 1 s."""
+    """Return the least integral () of |p^(s)|^2 for end states (2s, 3), for a mean piece of 1 s."""
     return jnp.sum(rows * _by_rows(maps, rows))
 
 
@@ -281,7 +281,7 @@ def _boundary_form_jvp(
 
 
 def _by_rows(maps: ProportionalMinco, rows: Array) -> Array:
-    """Multiply `maps.boundary_energy` by end states (2s, 3), as a sum: faster than `matmul`."""
+    """Return the energy's matrix times end states (2s, 3); this sum is faster than `matmul`."""
     return jnp.sum(jnp.asarray(maps.boundary_energy, rows.dtype)[..., None] * rows[None], axis=1)
 
 
