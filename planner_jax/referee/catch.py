@@ -282,7 +282,7 @@ def _judge(
     motion, tests = quadrotor.judge_motion(
         whole, case, extras, intervals, tolerances["relative"], tolerances["continuity"]
     )
-    tests = judging.clear_where(~whole.flown.any(axis=1), tests)
+    tests = judging.clear_where(np.logical_not(whole.flown.any(axis=1)), tests)
     measured, catch_tests = _judge_catches(case, pieces, held, ends, net_test, tolerances)
     tests |= {name: _worst(test, held) for name, test in catch_tests.items()}
     tests["order"] = order_test
