@@ -88,7 +88,7 @@ def _cache(folder: Path | None) -> Finding:
         is_off = os.environ.get(SWITCH) == "off"
         text = f"off, by {SWITCH}" if is_off else "no folder for compiled programs can be made"
         return Finding("cache", text, good=is_off)
-    sizes = [entry.stat().st_size for entry in folder.iterdir() if entry.is_file()]
+    sizes = [entry.stat().st_size for entry in folder.rglob("*") if entry.is_file()]
     limit = f" of at most {LIMIT / 1e6:,.0f} MB" if folder == cache_folder() else ""
     programs = f"{len(sizes):,} files, {sum(sizes) / 1e6:,.0f} MB{limit} of compiled programs"
     return Finding("cache", f"{programs} in {folder}")

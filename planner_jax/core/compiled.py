@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 from typing import Any, TypeVar
 
 import jax
-import jax.numpy as jnp
+import numpy as np
 from jax.extend.backend import backends
 
 Settings = TypeVar("Settings")
@@ -73,9 +73,9 @@ def cached_by_precision(load: Callable[..., Settings]) -> Callable[..., Settings
     The function's arguments must be hashable. Results in float32 and float64 are cached separately.
     """
 
-    def place(leaf: object) -> jax.Array:
+    def place(leaf: Any) -> jax.Array:
         is_whole = isinstance(leaf, int) and not isinstance(leaf, bool)
-        return jnp.asarray(leaf, jnp.int32 if is_whole else None)
+        return jax.device_put(np.int32(leaf) if is_whole else leaf)
 
     @functools.lru_cache(maxsize=1024)
     def load_once(is_float64: bool, *args: object) -> Settings:

@@ -24,6 +24,7 @@ from planner_jax.core.compiled import QUICK_OPTIONS, Fixed, trace_for
 from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import Attempt, is_unsolved, mark_bad_input
 from planner_jax.core.rules import require_shapes
+from planner_jax.planning.traced import Results, Stored, load_or_trace, settings
 
 # Numbers of lanes (cases) that a device solves in one call. Each number needs its own program.
 BUCKETS = (16, 128, 1024, 8192, 65536)
@@ -158,7 +159,6 @@ COMPILER_OPTIONS: Any = {"xla_gpu_enable_triton_gemm": False}
 # Batches, and loops over cases, run about 10 % longer with `QUICK_OPTIONS`. For batches of up to
 # `FEW` cases this is less than the seconds of compiling that the options save.
 FEW = 256
-_Layout = tuple[tuple[tuple[int, ...], np.dtype], ...]  # shapes and dtypes of a tree's leaves
 
 
 def solve_cases(planner: Planner, cases: PyTree, loaded: PyTree) -> PyTree:
@@ -174,29 +174,50 @@ def solve_cases(planner: Planner, cases: PyTree, loaded: PyTree) -> PyTree:
     return mark_bad_input(plans, cases)
 
 
+class PerDevice:
+    """A pure function `function(static, *trees, lanes)`, compiled for the devices of a mesh.
+
+    Every device applies the function to its share of `lanes`, a pytree with the lanes (cases) on
+    the first axis. The other arguments are the same on all devices; `static` is hashable. The
+    programs of a single device are stored on the disk.
+    """
+
+    def __init__(self, function: Callable[..., PyTree], options: Any) -> None:
+        self._function = function
+        self._alone = Stored(function, options)
+        self._together = jax.jit(
+            self._run_together, static_argnames=("mesh", "static"), compiler_options=options
+        )
+
+    def __call__(self, mesh: Mesh, static: Hashable, *trees: PyTree) -> PyTree:
+        """Return the function's results, with the lanes of all devices."""
+        if mesh.size == 1:
+            return self._alone(mesh.devices[0].platform, static, *trees)
+        return self._together(*trees, mesh=mesh, static=static)
+
+    def _run_together(self, *trees: PyTree, mesh: Mesh, static: Hashable) -> PyTree:
+        function = functools.partial(self._function, static)
+        specs = (PartitionSpec(),) * (len(trees) - 1)
+        with trace_for(mesh.devices[0].platform):
+            return run_per_device(mesh, function, *specs, LANES)(*trees)
+
+
 def solve_on_devices(
     planner: Planner, attempt: Attempt, mesh: Mesh, cases: PyTree, *, compiles_quickly: bool = False
 ) -> tuple[PyTree, Array]:
     """Return plans of all cases, and the number of unsolved cases on each device, (devices,)."""
     run = _solve_quickly if compiles_quickly and QUICK_OPTIONS else _solve_fast
-    return run(planner, planner.load_attempt(attempt, cases), mesh, cases)
+    return run(mesh, None, planner, planner.load_attempt(attempt, cases), cases)
 
 
-def _solve_on_devices(
-    planner: Planner, loaded: PyTree, mesh: Mesh, cases: PyTree
+def _solve_and_count(
+    _: None, planner: Planner, loaded: PyTree, cases: PyTree
 ) -> tuple[PyTree, Array]:
-    def solve(planner: Planner, loaded: PyTree, cases: PyTree) -> tuple[PyTree, Array]:
-        return with_unsolved(solve_cases(planner, cases, loaded))
-
-    specs = PartitionSpec(), PartitionSpec(), LANES
-    with trace_for(mesh.devices[0].platform):
-        return run_per_device(mesh, solve, *specs)(planner, loaded, cases)
+    return with_unsolved(solve_cases(planner, cases, loaded))
 
 
-_solve_fast, _solve_quickly = (
-    jax.jit(_solve_on_devices, static_argnames="mesh", compiler_options=options)
-    for options in (COMPILER_OPTIONS, COMPILER_OPTIONS | QUICK_OPTIONS)
-)
+_solve_fast = PerDevice(_solve_and_count, COMPILER_OPTIONS)
+_solve_quickly = PerDevice(_solve_and_count, COMPILER_OPTIONS | QUICK_OPTIONS)
 
 
 def with_unsolved(plans: PyTree) -> tuple[PyTree, Array]:
@@ -248,39 +269,36 @@ def call_packed(
     leaves, tree = jax.tree.flatten(case)
     arrays = [np.asarray(leaf) for leaf in leaves]
     kept, own_tree = jax.tree.flatten(own)
-    layouts = _layout(kept), _layout(arrays)
-    program = _program(function, static, own_tree, tree, *layouts, compiles_quickly)
+    layouts = tuple(map(jax.typeof, kept)), tuple([(each.shape, each.dtype) for each in arrays])
+    program = _program(function, static, own_tree, tree, *layouts, compiles_quickly, settings())
     pieces = [array.ravel() for array in arrays]
     vector = np.concatenate(pieces, dtype=program.dtype, casting="unsafe")
-    packed = np.asarray(program.run(kept, vector))
-    result = program.result
-    found = [packed[where].reshape(shape) for where, shape in result.fields]
-    for k, dtype in result.others:
+    packed = np.asarray(program.run(*kept, vector))
+    found = [packed[where].reshape(shape) for where, shape in program.fields]
+    for k, dtype in program.others:
         found[k] = found[k].astype(dtype)
-    return jax.tree.unflatten(result.tree, found)
-
-
-def _layout(leaves: Sequence[PyTree]) -> _Layout:
-    return tuple([(leaf.shape, leaf.dtype) for leaf in leaves])
-
-
-@dataclasses.dataclass
-class _Result:
-    """Positions of a result's leaves in its packed vector; set when JAX traces the function."""
-
-    tree: PyTree = None
-    fields: list[tuple[slice, tuple[int, ...]]] = dataclasses.field(default_factory=list)
-    # Indices and dtypes of the result's arrays whose dtype differs from the packed vector's dtype.
-    others: list[tuple[int, np.dtype]] = dataclasses.field(default_factory=list)
+    return jax.tree.unflatten(program.results.tree, found)
 
 
 @dataclasses.dataclass(frozen=True)
 class _Program:
     """A compiled function of arrays on the device and a packed vector; it returns a vector."""
 
-    run: Callable[[list[PyTree], np.ndarray], Array]
+    run: Callable[..., Array]
     dtype: np.dtype  # type of the input and output vectors
-    result: _Result
+    results: Results
+
+    @functools.cached_property
+    def fields(self) -> list[tuple[slice, tuple[int, ...]]]:
+        """Positions in the packed vector, and shapes, of the results' arrays."""
+        stops = np.cumsum([math.prod(shape) for shape in self.results.shapes]).tolist()
+        starts = [0, *stops[:-1]]
+        return list(zip(map(slice, starts, stops), self.results.shapes, strict=True))
+
+    @functools.cached_property
+    def others(self) -> list[tuple[int, np.dtype]]:
+        """Indices and dtypes of the arrays whose dtype differs from the packed vector's dtype."""
+        return [(k, each) for k, each in enumerate(self.results.dtypes) if each != self.dtype]
 
 
 @functools.cache
@@ -289,30 +307,29 @@ def _program(
     static: Hashable,
     own_tree: PyTree,
     tree: PyTree,
-    own: _Layout,
-    layout: _Layout,
+    own: Sequence[Any],
+    layout: Sequence[tuple[tuple[int, ...], np.dtype]],
     compiles_quickly: bool,
+    _: tuple,
 ) -> _Program:
     canonical = jax.dtypes.canonicalize_dtype
     dtype = canonical(np.result_type(*[d for _, d in layout if np.issubdtype(d, np.floating)]))
     ends = np.cumsum([math.prod(shape) for shape, _ in layout])
-    result = _Result()
+    results = Results()
 
-    def run(kept: list[PyTree], vector: Array) -> Array:
+    def run(*arrays: Array) -> Array:
+        *kept, vector = arrays
         leaves = [
             piece.reshape(shape).astype(canonical(kind))
             for piece, (shape, kind) in zip(jnp.split(vector, ends[:-1]), layout, strict=True)
         ]
         stays = jax.tree.unflatten(own_tree, kept)
         found = function(static, stays, jax.tree.unflatten(tree, leaves))
-        leaves, result.tree = jax.tree.flatten(found)
-        stops = np.cumsum([leaf.size for leaf in leaves]).tolist()
-        result.fields = [
-            (slice(stop - leaf.size, stop), leaf.shape)
-            for stop, leaf in zip(stops, leaves, strict=True)
-        ]
-        result.others = [(k, leaf.dtype) for k, leaf in enumerate(leaves) if leaf.dtype != dtype]
-        return jnp.concatenate([leaf.ravel().astype(dtype) for leaf in leaves])
+        return jnp.concatenate([leaf.ravel().astype(dtype) for leaf in results.flatten(found)])
 
     options = QUICK_OPTIONS if compiles_quickly else None
-    return _Program(jax.jit(run, compiler_options=options), dtype, result)
+    shapes = *own, jax.typeof(np.zeros(ends[-1], dtype))
+    identity = function, static, own_tree, tree, layout
+    platform = jax.default_backend()
+    compiled = load_or_trace(run, shapes, identity, results, platform, options)
+    return _Program(compiled, dtype, results)

@@ -5,15 +5,13 @@ search of every case is one lane of a batch. The host cuts the lanes of a stage 
 size. All rounds and stages with equal settings thus share a compiled program.
 """
 
-import functools
-
 import jax
 import numpy as np
 from jax import Array
-from jax.sharding import Mesh, PartitionSpec
+from jax.sharding import Mesh
 from jaxtyping import PyTree
 
-from planner_jax.core.compiled import QUICK_OPTIONS, Fixed, trace_for
+from planner_jax.core.compiled import QUICK_OPTIONS, Fixed
 from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import Attempt, mark_bad_input
 from planner_jax.core.rules import require_shapes
@@ -22,11 +20,10 @@ from planner_jax.optimise.planner import OptimisedPlanner
 from planner_jax.optimise.settings import Round, Stage, load_stage
 from planner_jax.planning.programs import (
     COMPILER_OPTIONS,
-    LANES,
+    PerDevice,
     is_one_cpu,
     lane_sharding,
     on_devices,
-    run_per_device,
 )
 
 # Number of searches in one call on each device, for a batch. Few lanes keep a CPU from waiting for
@@ -65,30 +62,22 @@ def _plan(planner: Planner, attempt: Attempt, mesh: Mesh, lanes: int, cases: PyT
             lanes = np.minimum(np.arange(begin, begin + size), total - 1)
             own = jax.tree.map(lambda leaf, lanes=lanes: leaf[lanes], (cases, index, points))
             own = jax.device_put(Searches(*own), spec)
-            found.append(_search_on_devices(planner, loaded, mesh, guesses, own))
+            found.append(_search_on_devices(mesh, guesses, planner, loaded, own))
         ends = [jax.tree.map(np.asarray, each) for each in found]  # waits for the results
         return jax.tree.map(lambda *leaves: np.concatenate(leaves)[:total], *ends)
 
     return mark_bad_input(divide_round(search, attempt, cases), cases)
 
 
-@functools.partial(
-    jax.jit,
-    static_argnames=("mesh", "guesses"),
-    compiler_options=COMPILER_OPTIONS | QUICK_OPTIONS,
-)
-def _search_on_devices(
-    planner: OptimisedPlanner, loaded: Stage | Fixed, mesh: Mesh, guesses: int, searches: Searches
+def _search(
+    guesses: int, planner: OptimisedPlanner, loaded: PyTree, searches: Searches
 ) -> tuple[Array, PyTree]:
     require_shapes(searches.cases)
+    stage: PyTree = loaded.attempt if isinstance(loaded, Fixed) else loaded
+    return run_searches(planner, stage, guesses, searches)
 
-    def search(planner: OptimisedPlanner, loaded: PyTree, searches: Searches) -> PyTree:
-        stage: PyTree = loaded.attempt if isinstance(loaded, Fixed) else loaded
-        return run_searches(planner, stage, guesses, searches)
 
-    specs = PartitionSpec(), PartitionSpec(), LANES
-    with trace_for(mesh.devices[0].platform):
-        return run_per_device(mesh, search, *specs)(planner, loaded, searches)
+_search_on_devices = PerDevice(_search, COMPILER_OPTIONS | QUICK_OPTIONS)
 
 
 @jax.jit

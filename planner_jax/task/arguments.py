@@ -26,8 +26,11 @@ def array_of(
     name: str, value: object, *shape: int, batch: tuple[int, ...], dtype: DTypeLike
 ) -> Array:
     """Return the argument `value` as an array of shape `batch + shape`; raise as `numbers_of`."""
+    numbers = checks.numbers_of(name, value, batch, shape)
     with np.errstate(over="ignore"):  # a number too large for `dtype` becomes infinite, no warning
-        return jnp.asarray(checks.numbers_of(name, value, batch, shape), dtype)
+        if isinstance(numbers, np.ndarray):
+            numbers = numbers.astype(dtype)  # JAX would compile a program for each shape
+        return jnp.asarray(numbers, dtype)
 
 
 def batch_of(name: str, vectors: object, *shape: int) -> tuple[int, ...]:

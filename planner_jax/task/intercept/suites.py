@@ -256,11 +256,9 @@ def _boxes(left, low, right, high) -> np.ndarray:
 
 def path_of(draws: Draws, dtype: DTypeLike) -> TurningPath:
     """Return the paths of the targets in draws, which are dictionaries of arrays."""
-    return TurningPath(
-        pos=jnp.asarray(draws["pos"], dtype),
-        vel=jnp.asarray(draws["speed"][..., None] * _unit(draws["angle"]), dtype),
-        turn_rate=jnp.asarray(draws["rate"], dtype),
-    )
+    velocity = draws["speed"][..., None] * _unit(draws["angle"])
+    parts = (np.asarray(part, dtype) for part in (draws["pos"], velocity, draws["rate"]))
+    return TurningPath(*map(jnp.asarray, parts))
 
 
 def cases_of(draws: Draws, dtype: DTypeLike) -> InterceptCase:
@@ -271,9 +269,9 @@ def cases_of(draws: Draws, dtype: DTypeLike) -> InterceptCase:
         corners = np.where(present[..., None, None], draws[kind], 0.0)
         centre = corners.mean(axis=2)
         return Obstacles(
-            centre=jnp.asarray(centre, dtype),
-            corners=jnp.asarray(corners - centre[:, :, None], dtype),
-            velocity=jnp.asarray(np.where(present[..., None], velocity, 0.0), dtype),
+            centre=jnp.asarray(centre.astype(dtype)),
+            corners=jnp.asarray((corners - centre[:, :, None]).astype(dtype)),
+            velocity=jnp.asarray(np.where(present[..., None], velocity, 0.0).astype(dtype)),
             present=jnp.asarray(present),
         )
 
