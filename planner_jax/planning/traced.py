@@ -32,7 +32,6 @@ from jaxtyping import PyTree
 
 from planner_jax.core.compiled import trace_for
 from planner_jax.host.compile_cache import SWITCH
-from planner_jax.host.files import replacing
 
 Treedef = Any  # a PyTreeDef, whose class JAX hides from type checkers
 _TREEDEF: Any = type(jax.tree.structure(0))
@@ -207,8 +206,9 @@ def _write(path: Path, content: bytes, results: Results) -> None:
         others = sorted(path.parent.iterdir(), key=lambda each: each.stat().st_mtime)
         for oldest in others[: max(len(others) - MOST + 1, 0)]:
             oldest.unlink()
-        with replacing(path) as scratch:
-            scratch.write_bytes(json.dumps(described).encode() + b"\n" + content)
+        scratch = path.with_name(f"{path.name}.{os.getpid()}")
+        scratch.write_bytes(json.dumps(described).encode() + b"\n" + content)
+        scratch.replace(path)
 
 
 def _digest(identity: tuple, layout: Sequence[Any], platform: str) -> str:

@@ -87,7 +87,7 @@ def limits_of(
     own = robot.limits
     least, most = robot.thrust_bounds if robot.tool.kind == NET else own.thrust or (None, None)
     names = ("speed", "body_rate", "min_height", "acceleration")
-    values = {name: getattr(own, name) for name in names}
+    values = {name: vars(own)[name] for name in names}
     values |= {"min_thrust": least, "max_thrust": most}
     values |= {name: value for name, value in given.items() if value is not None}
     # If only one bound of the thrust is specified, the lower one is 0 or the upper one infinite.

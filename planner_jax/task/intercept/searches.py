@@ -83,7 +83,7 @@ def load_search(search: Search, searches: tuple[Search, ...], is_apart: bool) ->
     has its own program with arrays of its own sizes, because a GPU tries all paths at once.
     """
     sizes = (search,) if is_apart else searches
-    paths, candidates = (max(getattr(each, name) for each in sizes) for name in _PADDED)
+    paths, candidates = (max(vars(each)[name] for each in sizes) for name in _PADDED)
     noise = cell_paths.draw_noise(search.lattice, search.paths, search.seed, search.candidates)
     path = np.minimum(np.arange(paths), search.paths - 1)
     candidate = np.arange(candidates) % search.candidates
@@ -92,7 +92,7 @@ def load_search(search: Search, searches: tuple[Search, ...], is_apart: bool) ->
         ends=noise.ends[path][:, candidate],
         steps=noise.steps[path][:, candidate],
     )
-    fields = {field.name: getattr(search, field.name) for field in dataclasses.fields(search)}
+    fields = dict(vars(search))
     del fields["starts"]
     fields |= {"seed": 0, "candidates": candidates, "within": None}
     return LoadedSearch(**fields, noise=noise, is_last=search == searches[-1])
