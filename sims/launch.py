@@ -15,6 +15,7 @@ import numpy as np
 from jax import Array, lax
 
 from planner_jax.ball.flight import BallState, fly
+from planner_jax.core.compiled import QUICK_OPTIONS
 from planner_jax.core.errors import ArgumentError
 from planner_jax.sims import sensing as sight
 from planner_jax.sims.loop_state import FlightState, Loop
@@ -92,7 +93,7 @@ def launch_ball(
     return dataclasses.replace(after, plan=flights.plan)
 
 
-@functools.partial(jax.jit, static_argnames=("loop", "seen"))
+@functools.partial(jax.jit, static_argnames=("loop", "seen"), compiler_options=QUICK_OPTIONS)
 def _launch_ball(
     loop: Loop,
     flights: FlightState,

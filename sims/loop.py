@@ -24,6 +24,7 @@ import numpy as np
 from jax import Array, lax
 
 from planner_jax.ball.flight import BallState, fly
+from planner_jax.core.compiled import QUICK_OPTIONS
 from planner_jax.host.machine import as_here
 from planner_jax.sims import sensing as sight
 from planner_jax.sims.loop_state import FlightState, Loop, Outlook, Pilot, Record
@@ -228,23 +229,50 @@ def _next_period(
     return _with_plans(pilot, flights, outlook, asked, tuple(each() for each in found)), record
 
 
-@functools.partial(jax.jit, static_argnames=("loop", "pilot", "num_periods"))
+@functools.partial(
+    jax.jit, static_argnames=("loop", "pilot", "most_periods"), compiler_options=QUICK_OPTIONS
+)
 def _fly_and_plan(
-    loop: Loop, pilot: Pilot, flights: FlightState, cases: Any, drag: Array, num_periods: int
+    loop: Loop,
+    pilot: Pilot,
+    flights: FlightState,
+    cases: Any,
+    drag: Array,
+    num_periods: Array,
+    most_periods: int,
 ) -> tuple[FlightState, Record | None]:
-    """Simulate B flights with replanning in one program; return final states and records."""
+    """Simulate B flights with replanning in one program; return final states and records.
+
+    The records have the same length for any number of periods, so that all legs share a program.
+    """
     begin = lambda part, *given: lambda: part(*given)  # noqa: E731
 
-    def next_period(flights: FlightState, _: None) -> tuple[FlightState, Record | None]:
-        return _next_period(loop, pilot, flights, cases, drag, begin)
+    def next_period(k: Array, carry: tuple) -> tuple[FlightState, Record | None]:
+        flights, records = carry
+        flights, record = _next_period(loop, pilot, flights, cases, drag, begin)
+        put = lambda every, one: lax.dynamic_update_index_in_dim(every, one, k, 0)  # noqa: E731
+        return flights, jax.tree.map(put, records, record)
 
-    flights, record = lax.scan(next_period, flights, None, length=num_periods)
+    def empty(leaf: jax.ShapeDtypeStruct) -> Array:
+        num, *shape = leaf.shape
+        return jnp.zeros((most_periods, num, loop.observations_per_plan, *shape), leaf.dtype)
+
+    one = jax.eval_shape(jax.vmap(functools.partial(_record, loop, pilot)), flights, drag)
+    records = jax.tree.map(empty, one) if loop.record else None
+    flights, records = lax.fori_loop(0, num_periods, next_period, (flights, records))
     flat = lambda leaf: jnp.moveaxis(leaf, 0, 1).reshape(len(drag), -1, *leaf.shape[3:])  # noqa: E731
-    return flights, jax.tree.map(flat, record)
+    return flights, jax.tree.map(flat, records)
 
 
 def fly_leg(
-    loop: Loop, pilot: Pilot, flights: FlightState, cases: Any, drag: Array, *, num_periods: int
+    loop: Loop,
+    pilot: Pilot,
+    flights: FlightState,
+    cases: Any,
+    drag: Array,
+    *,
+    num_periods: int,
+    most_periods: int | None = None,
 ) -> tuple[FlightState, list[Record]]:
     """Simulate a batch of B flights of N balls for some planning periods.
 
@@ -259,6 +287,8 @@ def fly_leg(
         cases: cases of the task, leaves (B, ...); times count from the start of the first plan.
         drag: (B, N), true drag coefficients K_D [1/m].
         num_periods: number of planning periods.
+        most_periods: greatest number of planning periods of all legs; by default `num_periods`.
+            Legs with the same greatest number share their program.
 
     Returns:
         The flights at the end, and with `loop.record` the records of all observations in order.
@@ -266,7 +296,10 @@ def fly_leg(
     if loop.replan == 0.0:
         flights, record = _fly(loop, pilot, flights, drag, num_periods)
     elif not in_parts(flights):
-        flights, record = _fly_and_plan(loop, pilot, flights, cases, drag, num_periods)
+        most = most_periods or num_periods
+        flights, record = _fly_and_plan(loop, pilot, flights, cases, drag, num_periods, most)
+        num = num_periods * loop.observations_per_plan
+        record = jax.tree.map(lambda leaf: np.asarray(leaf)[:, :num], record)
     else:
         with ThreadPoolExecutor() as pool:
             begin = lambda part, *given: pool.submit(as_here(part), *given).result  # noqa: E731

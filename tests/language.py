@@ -51,7 +51,7 @@ def _functions(paths: tuple[str, ...]) -> Iterator[tuple[str, ast.FunctionDef]]:
 
 
 def share_of_imperatives(paths: tuple[str, ...] = CODE) -> tuple[float, list[str]]:
-    """Return the share of function docstrings that begin with a verb of VERBS, and the others."""
+    """Return the share of docstrings that begin with a verb, and the places of the others."""
     num, others = 0, []
     for place, node in _functions(paths):
         text = ast.get_docstring(node)

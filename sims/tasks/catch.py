@@ -184,6 +184,8 @@ def fly_catches(
     first: Any = plan
     records, planning = [], 0.0
     shortest, window = earliest_throw("throws")
+    last_leg = loop.num_periods(float(cases.horizon.max()) + _AFTER)
+    legs = [loop.num_periods(INTERVAL)] * (num_balls - 1) + [last_leg]
     for ball in range(num_balls):
         flight = launch_ball(loop, flight, balls, drag, guess, ball=ball, seen=SEEN)
         until = cases.horizon + INTERVAL * (np.arange(num_balls) - ball)
@@ -218,7 +220,8 @@ def fly_catches(
             flight,
             dataclasses.replace(known, horizon=horizon + flight.time[:, None]),
             drag,
-            num_periods=loop.num_periods(float(cases.horizon.max()) + _AFTER if last else INTERVAL),
+            num_periods=legs[ball],
+            most_periods=max(legs),
         )
         records += leg
     return CatchFlights(first, collect_flights(flight, records), planning)

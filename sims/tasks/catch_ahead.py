@@ -13,6 +13,7 @@ from jax import Array
 
 from planner_jax.ball.flight import BallState
 from planner_jax.ball.target import BallPath
+from planner_jax.core.compiled import QUICK_OPTIONS
 from planner_jax.core.planner import Kind, Planner
 from planner_jax.core.protocol import Attempt, is_solved
 from planner_jax.host.machine import as_here
@@ -36,7 +37,7 @@ _AIM = 0.4
 LIMITS = ((2.0 / 7.0, 0.6), (1.0 / 7.0, 0.9), (0.0, 1.0))
 
 
-@functools.partial(jax.jit, static_argnames="loop")
+@functools.partial(jax.jit, static_argnames="loop", compiler_options=QUICK_OPTIONS)
 def predict_case(loop: Loop, flights: FlightState, new: Array, horizon: Array) -> CatchCase:
     """Return the cases for planning the catches of a newly seen ball and of the next ball.
 

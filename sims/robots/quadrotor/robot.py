@@ -123,7 +123,7 @@ class Quadrotor:
     def tool_motion(self, state: RobotState) -> tuple[Array, Array, Array, Array]:
         """Return the body's position [m], velocity [m/s], rate [rad/s] and z axis, in the world."""
         R = rotation(state.quat_wxyz)
-        return state.pos, state.vel, jnp.sum(R * state.rate, axis=1), R[:, 2]
+        return state.pos, state.vel, jnp.sum(R * state.rate[None], axis=1), R[:, 2]
 
     def head_state(self, plan: Any, time: Array) -> Array:
         """Return planned position, velocity, acceleration and jerk (4, 3) at a time () [s].
