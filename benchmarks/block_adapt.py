@@ -5,8 +5,9 @@
 
 A robot arm blocks thrown balls with a shield. Balls are drawn from the suite `pole`, in which a
 pole stands in front of the arm. Each ball must meet the middle of the shield at a right angle, and
-the arm may start at time 0. Without --library a library of motions is built first. These planners
-get the same balls:
+the arm may start at time 0. Without --library a library of motions is built first, for the joint
+limits --regime and a division --layout of the space around the arm into cells. These planners get
+the same balls:
 * `adapt`, with its short search alone, and with a longer search if the short one fails;
 * planners that try 6 or 48 straight motions, in which all joints move in proportion;
 * the default planner `online`;
@@ -38,7 +39,10 @@ WARM = 50  # Number of balls that are planned before the measurement.
 
 
 def measure_planner(bench: Bench, name: str, planner: Any, cases: Any) -> None:
-    """Plan a batch of throws one by one; report success, planning times and compile time."""
+    """Plan the throws `cases` one by one; print how many are blocked, and the planning times.
+
+    The compile time is printed separately. `name` labels the printed line.
+    """
     cases = jax.tree.map(np.asarray, cases)
     lanes = [pj.take(cases, k) for k in range(cases.batch_shape[0])]
     began = time.perf_counter()

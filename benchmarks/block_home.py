@@ -36,7 +36,8 @@ from planner_jax.task.block.scene import paper_scene
 # [rad] Bounds between which the first round draws the six joint angles of a pose.
 LOWEST = np.array([-0.8, -1.05, -2.0, -0.5, -1.9, -0.8])
 HIGHEST = np.array([0.8, 1.5, 0.95, 0.5, 1.9, 0.8])
-# [m] Least distance between the arm at home and the obstacles or itself, and from the pole.
+# [m] At home the arm must be farther than MARGIN from itself and from all obstacles, and farther
+# than POLE_MARGIN from the pole in front of it.
 MARGIN, POLE_MARGIN = 0.005, 0.03
 ELITE = 8  # The best eighth of all poses defines the normal distribution of the next round.
 LATE = 0.133  # [s] In the search the arm may start this long after the ball is first seen.
@@ -60,7 +61,7 @@ def from_home(cases: Any, homes: np.ndarray) -> Any:
 
 
 def share_solved(planner: Any, cases: Any, homes: np.ndarray) -> np.ndarray:
-    """Return for H start poses of the arm the share of cases that a planner solves, (H,)."""
+    """Return the share of cases that a planner solves from each of H start poses, (H,)."""
     plans = pj.plan(planner, from_home(cases, homes))
     return pj.are_solved(plans).reshape(len(homes), -1).mean(axis=1)
 

@@ -6,7 +6,8 @@
 A robot arm blocks balls with a shield. Two boxes, one inside the other, stand around the region
 that the arm protects. Their faces are divided into rectangular cells. The library stores a motion
 for each pair of an outer and an inner cell. The tunnel of a pair is the space between its two
-cells. Without --library a library is built first. Then the program reports:
+cells. Without --library a library is built first, for the joint limits --regime and the division of
+the faces into cells --layout. Then the program reports:
 * coverage: the share of pairs with a motion, among the pairs that a ball can pass through;
 * random balls through the tunnels of stored motions: the share that is blocked, according to the
   referee, an independent check in float64;
@@ -57,7 +58,10 @@ ROUNDS = 20  # The time of a batch lookup is measured over this number of calls.
 
 
 def time_call(function: Any, *arguments: Any, **how: Any) -> tuple[Any, float]:
-    """Call a function; return its result, and its duration [s] without JAX's compile time."""
+    """Call `function` with the arguments and the keyword arguments `how`.
+
+    Returns its result, and the duration [s] of the call minus the time that JAX compiled.
+    """
     began = time.perf_counter()
     with CompileClock() as clock:
         found = function(*arguments, **how)
@@ -93,7 +97,7 @@ def build_timed(bench: Bench, path: Path, layout: str, regime: str) -> Library:
 
 
 def describe(bench: Bench, library: Library) -> None:
-    """Report the share of pairs (outer cell, inner cell) with a stored motion, and the memory."""
+    """Report the share of pairs (outer cell, inner cell) with a stored motion, and the size."""
     covered = coverage(library)
     shares = {
         "feasible": float(covered.share(covered.is_feasible)[0]),
@@ -229,7 +233,6 @@ def single_queries(bench: Bench, library: Library, num: int) -> None:
 
 @jax.jit
 def look_up(table: Table, balls: BallState, gravity: Any) -> Answer:
-    """Look up the stored motion for each of B balls; the arrays of the answer are (B, ...)."""
     return jax.vmap(lookup, (None, 0, None))(table, balls, gravity)
 
 
@@ -259,7 +262,8 @@ def batch_queries(bench: Bench, library: Library, batch: int) -> None:
 def measure_repair(bench: Bench, library: Library, shift: float, num: int) -> None:
     """Move the pole along y by `shift` [m], and time planning again all motions that now collide.
 
-    Then the referee, an independent check, judges how the new library blocks `num` balls.
+    Then draw `num` balls. Report how many the changed library blocks, according to the referee, an
+    independent check.
     """
     scene = library.setting.scene
     pole: Any = np.asarray(scene.pole) + np.array([0.0, shift], np.float32)

@@ -47,8 +47,9 @@ from planner_jax.task.block.spec import SUITES
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate, total_duration
 
 PEERS = "ompl and toppra not installed: pip install 'planner-jax[arm-peers]' for rrt-connect, epase"
-# Row of the table -> planner and its options. `direct-soonest` tries a single motion. The rows
-# "plain" use the first path that is found, as the paper's planners presumably do.
+# Row of the table -> planner and its options. `direct` tries up to 384 motions, `direct-soonest`
+# only one. Rows with names in "-plain" use the first path that the planner finds, without trying to
+# improve it, as the planners of [Natarajan2024] presumably do.
 PLANNERS: dict[str, tuple[str, dict[str, Any]]] = {
     "online": ("online", {}),
     "brisk": ("brisk", {}),
@@ -62,8 +63,8 @@ PLANNERS: dict[str, tuple[str, dict[str, Any]]] = {
 }
 NEED_PEERS = ("rrt-connect", "epase")
 LASTS_UNTIL_CONTACT = ("online", "brisk")
-# [%] Quantile of the planning times of `online` and `brisk`. If planning time counts, they plan for
-# an arm that starts later by this quantile.
+# [%] To count planning time, `online` and `brisk` plan for an arm that starts later by this
+# quantile of their planning times.
 RESERVE = 90.0
 WARM = 2  # Number of throws, drawn with another seed, that are planned before the measurement.
 # Tables I and II of [Natarajan2024] as printed. Columns of Table I: motion found [%], blocked if
@@ -83,7 +84,7 @@ TABLE_II = {
 
 @struct.dataclass
 class Torques:
-    """Torques of the arm's six joints over a motion."""
+    """RMS and greatest torques of the arm's six joints during a motion."""
 
     rms: Array  # (6,) [N m], root mean square over the duration of the motion
     peak: Array  # (6,) [N m], greatest magnitude during the motion
@@ -131,7 +132,10 @@ class Outcome:
 
 
 def remove_waits(motion: PiecewisePolynomial) -> PiecewisePolynomial:
-    """Set the durations of pieces in which no joint moves to zero, for a batch of motions."""
+    """Set the durations of pieces in which no joint moves to zero, for a batch of motions.
+
+    The sum of the durations is then the time during which the arm moves.
+    """
     coeffs = np.asarray(motion.coeffs)
     moves = np.any(coeffs[:, :, 1:] != 0.0, axis=(2, 3))
     durations: Any = np.where(moves, motion.durations, 0.0)
@@ -149,11 +153,11 @@ def run_planner(planner: Any, cases: Any, warm: Any, *, lasts: bool) -> Outcome:
     """Plan throws one by one, judge the plans, and compute their times and torques.
 
     `warm` are throws that are planned before the measurement. `lasts` is true if the planner's
-    motions always end at the contact. Then planning time is counted by planning a second time, for
-    an arm that starts later.
+    motions always end at the contact, so that any planning time would make them late. These throws
+    are planned a second time, for an arm that starts later by a quantile of the planning times.
     """
-    # Each of these throws is planned exactly once. Every call advances RRT-Connect's random
-    # generator, so with another number of calls the measured paths would differ.
+    # Every call advances the random generator of RRT-Connect. The number of calls before the
+    # measurement is therefore constant, so that the measured paths are reproducible.
     for k in range(WARM):
         pj.plan(planner, pj.take(warm, k))
     plans, query = measure_plans(planner, cases)
@@ -183,9 +187,9 @@ def with_spread(values: np.ndarray, digits: int) -> str:
 
 
 def table_of_rates(bench: Bench, outcomes: dict[str, Outcome], common: np.ndarray) -> None:
-    """Print Table I: block rates, planning times and execution times of the paper and each planner.
+    """Print block rates, planning and execution times, as in Table I of [Natarajan2024].
 
-    `common` (B,) bool marks the throws that all planners block.
+    The paper's rows come first. `common` (B,) bool marks the throws that all planners block.
     """
     bench.say(
         "| Table I | found | blocked | with query time | query [ms] | p50 | p99 | execution [s] "
@@ -219,7 +223,7 @@ def table_of_rates(bench: Bench, outcomes: dict[str, Outcome], common: np.ndarra
 
 
 def table_of_torques(bench: Bench, outcomes: dict[str, Outcome], common: np.ndarray) -> None:
-    """Print Table II: mean torques of the paper and of each planner.
+    """Print mean joint torques of each planner below the rows of Table II of [Natarajan2024].
 
     Means are over the throws that the planner blocks, and over the throws that all planners block,
     which `common` (B,) bool marks.

@@ -101,11 +101,12 @@ PIPELINES: dict[str, tuple[float | None, tuple[float, float, float], dict[str, A
 def errors_after(
     cases: Any, eye: Eye, times: Array, places: Array, moments: Array, middle: Array
 ) -> tuple[Array, Array]:
-    """Fit the flights of B balls at M times; return errors of the fitted positions.
+    """Fit the flights of B balls M times, from ever more observations; return position errors.
 
-    Each fit uses the observed positions `places` (B, K, 3) [m] at the times `times` (K,) [s] up to
-    one of the times `moments` (M,). Returns the errors at the times `middle` (B,), and their
-    standard deviations as estimated by the fit, both (B, M) [m] and perpendicular to the flight.
+    The camera `eye` observes the positions `places` (B, K, 3) [m] at the times `times` (K,) [s].
+    Fit m uses the observations up to the time `moments[m]` (M,) [s]. Returns the errors of the
+    fitted positions at the times `middle` (B,) [s], and the standard deviations that the fit
+    estimates for them, both (B, M) [m] and perpendicular to the flight. `cases` has the true balls.
     """
 
     def one(ball: BallState, gravity: Array, places: Array, middle: Array) -> Any:
@@ -123,7 +124,7 @@ def errors_after(
 
 @jax.jit
 def middle_of(cases: Any) -> Array:
-    """Return the times (B,) [s] at which balls are midway between the outer and the inner box."""
+    """Return the times (B,) [s] when balls are midway between two nested boxes around the arm."""
     flights = jax.vmap(flight_of)(cases)
     return 0.5 * (flights.earliest + flights.latest)
 
@@ -141,7 +142,7 @@ class Table:
         bench.say("|---|---|---|" + "---|" * len(heads))
 
     def line(self, suite: str, rate: float, noise: str, errors: np.ndarray, stds: Any) -> None:
-        """Print the row of one suite of throws, frame rate and kind of noise.
+        """Print the row of one suite of throws, frame rate [Hz] and kind of noise.
 
         `errors` (B, M) [m] of B balls and M fits are NaN for balls that were not seen. `stds` (B,
         M) [m] are the standard deviations that the fits estimate for these errors.
@@ -245,8 +246,8 @@ def report_frames(bench: Bench, sensor: Eye, truth: np.ndarray, places: np.ndarr
     """Report errors of ball positions that were found in images: mean and standard deviation.
 
     Errors in the image plane are in pixels. Errors along the camera's axis are divided by the
-    standard deviation of the noise model. `places` are the positions found, `truth` the true
-    positions, both (B, K, 3) [m] for B balls and K images.
+    standard deviation of the noise model. `sensor` has the camera and its noise model, `places` the
+    positions found, `truth` the true positions, both (B, K, 3) [m] for B balls and K images.
     """
     camera: Any = sensor.camera
     noise: Any = sensor.noise
@@ -269,7 +270,6 @@ def report_frames(bench: Bench, sensor: Eye, truth: np.ndarray, places: np.ndarr
 def report_times(
     bench: Bench, sensor: Eye, times: Array, places: np.ndarray, frame_seconds: list[float]
 ) -> None:
-    """Report quantiles of the time to process a camera frame, and of the time to fit a flight."""
     camera, noise = sensor.camera, sensor.noise
 
     @jax.jit

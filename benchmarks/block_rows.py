@@ -77,7 +77,9 @@ def has_end_pose(case: pj.block.BlockCase) -> Array:
 
 @jax.jit
 def long_search(cases: pj.block.BlockCase, bumps: Array, ranks: Array) -> pj.block.BlockPlan:
-    """Run least squares for each case (B,) from N starts; return its plan with the least violation.
+    """Plan each of B cases by least squares from N starts; return the plan nearest to feasible.
+
+    This is the plan that exceeds the limits by the least amount.
 
     The planner sorts the poses in which the shield meets the ball. Start n is a motion to the pose
     with rank `ranks[n]` in this order, in which all joints move in proportion, plus a smooth
@@ -128,7 +130,8 @@ def find_blocked(cases: pj.block.BlockCase, planner: Any) -> np.ndarray:
 def measure(bench: Bench, name: str, options: Any) -> dict[str, np.ndarray]:
     """Draw the throws of the row `name`, and print the share of them that each method blocks.
 
-    Returns for each method, by name, which of the N throws it blocks, (N,) bool.
+    `options` are the command-line options. Returns for each method, by name, which of the N throws
+    it blocks, (N,) bool.
     """
     suite, settings = ROWS[name]
     cases = pj.block.draw(options.num, suite, options.seed, **settings)

@@ -193,8 +193,8 @@ def learn(bench: Bench, num: int, tries: int, lanes: int) -> list[dict[str, Any]
     if not solvable.size:
         return []
 
-    # Of the random starts that solve a throw, at most 8 are used. Otherwise easy throws, which
-    # nearly every start solves, would determine most candidates.
+    # The candidates for bumps come from random starts that solve a throw, at most 8 of each throw.
+    # Otherwise most candidates would come from easy throws, which nearly every start solves.
     some = [rng.permutation(np.flatnonzero(good & (places == throw)))[:8] for throw in solvable]
     picked = np.concatenate(some)
     # The initial cluster centres are drawn here and passed to `kmeans2`: its own argument `seed` is

@@ -48,7 +48,11 @@ _QUICK, _QUICK_COARSE = 45, 60
 
 
 def read_set(path: Path, dtype) -> tuple[pj.catch.CatchCase, dict[str, np.ndarray]]:
-    """Read a CSV file of throws; return cases, and the published times and costs by name."""
+    """Read a CSV file of throws; return cases, and published numbers by their columns.
+
+    `Tp` and `T_ref` [s] are the catching times of the initial guess and of the optimum, `J0_M4` and
+    `J0_M8` the costs of the guess with 4 and 8 pieces, and `cost_ref` is the cost of the optimum.
+    """
     with path.open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
 
@@ -152,7 +156,7 @@ def quick_paper_catch() -> PaperCatch:
 
 
 def report_set(bench: Bench, data: Path, name: str, repeats: int) -> None:
-    """Print cost, success and speed of `catch` and `exact` on one set of throws, in float32."""
+    """Print cost, success and speed of `catch` and `exact` on the set `name`, in float32."""
     cases, known = read_set(data / f"catch_{name}.csv", jnp.float32)
     quick, exact = quick_paper_catch(), pj.catch.ExactCatch()
     bench.say(

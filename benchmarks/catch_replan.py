@@ -51,7 +51,7 @@ SCRATCH, AGAIN = pj.catch.ExactCatch(), pj.catch.ReplanCatch()
 
 
 class Estimator:
-    """Kalman filter of one ball; a vector stores the mean and covariance of its state."""
+    """Kalman filter of one ball's position and velocity; a vector stores mean and covariance."""
 
     def __init__(self, period: float, noise: float, drag: Any, gravity: Any) -> None:
         model = EkfModel(
@@ -102,7 +102,7 @@ class Times:
     replans: list[tuple[Any, CatchPlan]] = dataclasses.field(default_factory=list)
 
     def keep(self, left: Any, found: CatchPlan) -> None:
-        """Store a re-planning problem and its plan, unless 1,024 of them are stored."""
+        """Store the re-planning problem `left` and its plan `found`, but at most 1,024 pairs."""
         if len(self.replans) < COMPARED:
             self.replans.append((left, found))
 
@@ -128,7 +128,10 @@ def balls_of(case: CatchCase) -> pj.BallPath:
 
 
 def first_plan(case: CatchCase) -> tuple[CatchCase, CatchPlan]:
-    """Choose the time of the catch, and plan from scratch; return the new case and the plan."""
+    """Plan a catch from scratch, for an estimate of the earliest time at which it is possible.
+
+    Returns the case with this time, and the plan.
+    """
     case = case.with_choice(jax.tree.map(lambda leaf: np.asarray(leaf)[0], _propose(case)))
     return case, pj.plan(SCRATCH, case)
 
@@ -283,8 +286,8 @@ def throws(num: int, period: float, noise: float) -> tuple[CatchCase, np.ndarray
 def time_replans(bench: Bench, lanes: list[CatchCase], period: float, noise: float) -> None:
     """Time one re-plan and one plan from scratch for each case, and print percentiles.
 
-    A re-plan starts at a random time of the first plan. The ball's position and velocity then
-    deviate from the expected values by random errors with the standard deviation `noise`.
+    A re-plan starts at a random time of the first plan. The ball's position [m] and velocity [m/s]
+    then deviate from the expected values by random errors with the standard deviation `noise`.
     """
     random = np.random.default_rng(0)
     tasks = []

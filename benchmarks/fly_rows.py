@@ -144,7 +144,9 @@ def catches(
 ) -> CatchFlights | None:
     """Simulate catches, and print one line: success rate, distances, tracking error and times.
 
-    Returns the flights, or None if the time limit was exceeded. `bar` is the required success rate.
+    `name` labels the line. The initial estimate of the ball's drag has the relative error
+    `drag_error`. `bar` is the required success rate. Returns the flights, or None if the time limit
+    was exceeded.
     """
     cases = throws(args.num, loop.world.num_balls, args.seed, drag_error=drag_error)
     with limit_time(name, args.limit):
@@ -166,8 +168,9 @@ def hits(
 ) -> HitFlights | None:
     """Simulate hits, and print one line: landing errors, success rates, tracking error and times.
 
-    Returns the flights, or None if the time limit was exceeded. `regions` are the names of the
-    court scenarios from which serves are drawn.
+    `name` labels the line, and `regions` names the court scenarios from which serves are drawn. The
+    initial estimate of the ball's drag has the relative error `drag_error`. Returns the flights, or
+    None if the time limit was exceeded.
     """
     cases = volleys(args.num, regions, args.seed, drag_error=drag_error)
     with limit_time(name, args.limit):
@@ -239,7 +242,7 @@ def hit_rows(args: Any) -> None:
 
 
 def make_ablations(whole: Loop) -> dict[str, Loop]:
-    """Return the control loop `whole`, and copies that each lack one part, by name of that part."""
+    """Return the loop `whole`, and copies without Kalman filter, drag estimate or re-planning."""
     return {
         "everything": whole,
         "no Kalman filter": dataclasses.replace(whole, kalman=False),
@@ -249,7 +252,6 @@ def make_ablations(whole: Loop) -> dict[str, Loop]:
 
 
 def ablation_rows(args: Any) -> None:
-    """Print lines for control loops that each lack one part, and for other planners."""
     for name, loop in make_ablations(Loop(CATCH_WORLD, LAB, replan=CATCH_RATE)).items():
         catches(f"lab, one ball, {name}", loop, args, DRAG_ERROR)
     loop = Loop(CATCH_WORLD, LAB)

@@ -44,10 +44,6 @@ def _last_catch(plan: Any) -> jax.Array:
 
 
 def _case(task: str, num: int) -> tuple[Any, Any, Any]:
-    """Return a planner, `num` drawn cases with NumPy leaves, and the quantity to differentiate.
-
-    The quantity is the contact time of a hit, or the time of the last catch.
-    """
     if task == "hit":
         found = pj.hit.planner("exact"), pj.hit.draw(num, seed=_SEED), "stroke.time"
     else:
@@ -160,7 +156,6 @@ def _measure(
 
 
 def _compare(bench: Bench, options: argparse.Namespace, differentiate: Any, few: Any) -> None:
-    """Print errors of the gradients of the cases `few`, relative to float64 gradients."""
     found = differentiate(few, steps=options.steps)
     with jax.enable_x64(True):
         best = differentiate(_double(few), curvature="whole", solver=_LONG)

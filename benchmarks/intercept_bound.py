@@ -21,11 +21,11 @@ _SLACK = CELL * np.sqrt(0.5)  # [m] Distance from the middle of a cell to its co
 
 
 def earliest_bound(scene: Scene) -> tuple[bool, float]:
-    """Return whether a car may meet the target at the case's time, and the earliest meeting [s].
+    """Return whether a car may meet the target at the prescribed time, and a bound on the earliest.
 
-    False proves that a meeting at the case's time is impossible. The earliest meeting is the time
-    of a layer (time step): at every earlier layer a meeting is impossible. It is infinite if no
-    layer permits a meeting.
+    False proves that a meeting at the time which the case prescribes is impossible. The bound [s]
+    is the time of a layer (time step): at every earlier layer a meeting is impossible. It is
+    infinite if no layer permits a meeting.
     """
     middle = scene.start[:2] + scene.middle * np.array(
         [np.cos(scene.start[2]), np.sin(scene.start[2])]
@@ -103,7 +103,7 @@ def _grow(plane: int, distance: float, stride: int) -> int:
 
 
 def _draw_goal(scene: Scene, layer: int, origin: np.ndarray, count: np.ndarray, stride: int) -> int:
-    """Return the cells that are within the case's tolerance of the target at a time step.
+    """Return the cells that are near enough to the target after `layer` time steps to meet it.
 
     The result is an integer with one bit for each cell.
     """

@@ -31,8 +31,8 @@ _PEDALS = np.array([-1.0, 0.0, 1.0])  # Accelerations, relative to their limit.
 def departs(scene: Scene, far: float = 1.5, until: float = 6.0, alive: float = 2.0) -> bool:
     """Return whether a collision-free motion gets `far` [m] away from the start within `until` [s].
 
-    If the meeting with the target is nearer to the start or earlier, it suffices that a motion is
-    free of collisions for `alive` [s], or until the meeting.
+    If the target is met so near to the start or so early that the car need not get that far, a
+    motion suffices that is free of collisions for `alive` [s] or until the meeting.
     """
     random = np.random.default_rng(0)
     steering = np.arctan(scene.wheelbase * scene.initial_curvature)
@@ -54,7 +54,7 @@ def departs(scene: Scene, far: float = 1.5, until: float = 6.0, alive: float = 2
 
 
 def _advance(scene: Scene, states: np.ndarray, time: float) -> np.ndarray:
-    """Return all collision-free states (M, 5) that are reached one step after N states (N, 5).
+    """Return all collision-free states (M, 5) that are reached from N states (N, 5) in 0.1 s.
 
     A state has x [m], y [m], heading [rad], speed [m/s] and steering angle [rad].
     """
@@ -85,7 +85,10 @@ def _advance(scene: Scene, states: np.ndarray, time: float) -> np.ndarray:
 def is_free(
     scene: Scene, x: np.ndarray, y: np.ndarray, heading: np.ndarray, time: float
 ) -> np.ndarray:
-    """Return which cars at N poses of the rear axle are on the map and touch nothing at `time`."""
+    """Return which of N cars are on the map and touch nothing at `time` [s], (N,) bool.
+
+    The rear axles are at `x`, `y` [m], with the headings `heading` [rad], all (N,).
+    """
     cos, sin = np.cos(heading), np.sin(heading)
     x, y = x + scene.middle * cos, y + scene.middle * sin
     free = (x >= scene.lower[0]) & (x <= scene.upper[0])

@@ -48,7 +48,7 @@ STEP = 0.005  # [s] Time step of the lower bound on the time of the last meeting
 
 
 def draw(num: int, seed: int) -> InterceptGroup:
-    """Draw `num` groups of targets and keep their first three targets; NumPy arrays."""
+    """Draw `num` groups of moving targets, each reduced to its first three; NumPy arrays."""
     groups = jax.tree.map(np.asarray, pj.group.draw(num, seed=seed))
     present = np.broadcast_to(np.arange(groups.num_targets) < TARGETS, groups.present.shape)
     return dataclasses.replace(groups, present=present)
@@ -126,7 +126,10 @@ def _meet_in_order(
 
 
 def time_planning(groups: InterceptGroup, decide: str | Best) -> tuple[GroupPlan, float, float]:
-    """Plan all groups twice; return the plans, and the durations [s] of both calls."""
+    """Plan all groups twice, with the method `decide` to order the targets.
+
+    Returns the plans, and the durations [s] of the first call, which compiles, and of the second.
+    """
     planner, began = pj.group.planner(decide=decide), time.perf_counter()
     pj.plan(planner, groups)
     between = time.perf_counter()

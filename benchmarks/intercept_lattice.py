@@ -32,7 +32,7 @@ _FINE = CELL / FINER  # [m] Side of a cell of the grid for obstacles.
 
 @dataclasses.dataclass(frozen=True)
 class Scene:
-    """One interception as plain numbers, and the target's position at each layer (time step)."""
+    """One interception problem as plain numbers, with the target's position at each time step."""
 
     start: np.ndarray  # (3,) x [m], y [m] of the rear axle's middle and heading [rad]
     initial_speed: float  # [m/s]
@@ -76,9 +76,9 @@ STRICT = Rules(discs=2, turns_up=False)
 
 @dataclasses.dataclass(frozen=True)
 class Reach:
-    """Result of a lattice search for one scene: whether and when the target can be met."""
+    """Result of a search on the grid of states: whether and when a car can meet the target."""
 
-    at_end: bool  # whether the target can be met at the case's time
+    at_end: bool  # whether the target can be met at the time that the case prescribes
     earliest: float  # [s], time of the first layer at which the target can be met, or infinity
     # (2 n + 1, 5): time, x, y, heading and speed after each half of n time steps, or None.
     path: np.ndarray | None
@@ -321,7 +321,7 @@ class Lattice:
         return [(bits.bit_length() - 1, level, h) for bits, level, h in found if bits]
 
     def reach(self, keep_path: bool = False) -> Reach:
-        """Return whether and when the target can be met; with `keep_path`, also a path to it."""
+        """Search all time steps for meetings with the target; `keep_path` also returns a path."""
         earliest, at_end, kept, path = np.inf, False, [], None
         for layer, planes in enumerate(self.sets()):
             if keep_path and path is None:

@@ -115,10 +115,11 @@ def _polygons(group: Obstacles) -> tuple[tuple[np.ndarray, ...], np.ndarray]:
 
 
 def search(scene: Scene) -> tuple[list[bool], list[float]]:
-    """Run the searches `bound`, `minimal` and `strict` on one scene.
+    """Run three searches for a meeting with the target on one scene.
 
-    Returns for each search whether the target is met at the case's time, and the earliest meeting
-    [s].
+    `bound` is a proven bound, `minimal` an optimistic and `strict` a cautious search on a grid of
+    states. Returns for each of them whether the target is met at the time that the case prescribes,
+    and the earliest meeting [s].
     """
     of_bound = earliest_bound(scene)
     minimal, strict = (Lattice(scene, rules).reach() for rules in (MINIMAL, STRICT))
@@ -128,9 +129,10 @@ def search(scene: Scene) -> tuple[list[bool], list[float]]:
 
 
 def search_all(found: list[Scene], workers: int) -> tuple[np.ndarray, np.ndarray]:
-    """Run the three searches on B scenes in `workers` processes.
+    """Run the searches `bound`, `minimal` and `strict` on B scenes, in `workers` processes.
 
-    Returns whether targets are met at the case's time (B, 3), and the earliest meetings (B, 3) [s].
+    Returns whether each search meets the target at the prescribed time (B, 3), and the earliest
+    meetings (B, 3) [s].
     """
 
     def gather(results: Iterator) -> tuple[np.ndarray, np.ndarray]:
@@ -149,10 +151,10 @@ def format_indices(indices: np.ndarray) -> str:
 
 
 def report(bench: Bench, index: np.ndarray, at_end: np.ndarray, earliest: np.ndarray) -> None:
-    """Print the results of the three searches on B cases.
+    """Print the results of the searches `bound`, `minimal` and `strict` on B cases.
 
-    `at_end` (B, 3) bool states whether targets are met at the case's time. `earliest` (B, 3) [s]
-    has the earliest meetings. `index` (B,) has the numbers of the cases in the suite.
+    `at_end` (B, 3) bool states whether targets are met at the prescribed time. `earliest` (B, 3)
+    [s] has the earliest meetings. `index` (B,) has the numbers of the cases in the suite.
     """
     bench.say(
         "| search | solved at the case's time | at any time up to it | earliest median | p95 "
@@ -188,8 +190,8 @@ def report(bench: Bench, index: np.ndarray, at_end: np.ndarray, earliest: np.nda
 def compare(bench: Bench, index: np.ndarray, reached: np.ndarray, solved: np.ndarray) -> None:
     """Print the share of feasible cases that the planner solves.
 
-    A case is feasible if the search `strict` reaches its target (`reached`, (B,) bool), or if the
-    planner solves it (`solved`, (B,) bool).
+    A case is feasible if the exhaustive search `strict` reaches its target (`reached`, (B,) bool),
+    or if the planner solves it (`solved`, (B,) bool). `index` (B,) has the numbers of the cases.
     """
     feasible = reached | solved
     good, num = int(solved.sum()), int(feasible.sum())
@@ -205,7 +207,10 @@ def compare(bench: Bench, index: np.ndarray, reached: np.ndarray, solved: np.nda
 
 
 def report_early(bench: Bench, cases: InterceptCase, earliest: np.ndarray) -> None:
-    """Plan B cases to meet early; compare with the earliest meetings (B,) [s] on the lattice."""
+    """Plan B cases to meet the target as soon as possible, and print how early the plans are.
+
+    `earliest` (B,) [s] has the earliest meetings of the exhaustive search `strict`, for comparison.
+    """
     plans = pj.plan(pj.intercept.planner(meet="early"), cases)
     solved = np.asarray(pj.intercept.judge(cases, plans).success)
     met = np.where(solved, plans.time, np.inf)

@@ -64,7 +64,7 @@ def body_of(case: Any) -> tuple[float, float, float]:
 def search(case: Any, meeting: np.ndarray, share: float = 1.0, **options: Any) -> HybridPath:
     """Search a path from the start of one case to its meeting point (2,) [m] by Hybrid A*.
 
-    `share` is a factor of the curvature limit. The case has NumPy leaves.
+    The curvature limit is multiplied by `share`. The case has NumPy leaves.
     """
     return hybrid_astar(
         case.start,
@@ -176,7 +176,7 @@ def say_rows(bench: Bench, suite: str, heading: str, rows: dict[str, Row]) -> No
 
 
 def say_smoothing(bench: Bench, suite: str, batch: Any, cases: list, meetings: np.ndarray) -> None:
-    """Search paths with a reduced curvature limit, smooth them, and print lengths and times."""
+    """Search paths with 0.9 times the curvature limit, smooth them, and print lengths and times."""
     pairs = zip(cases, meetings, strict=True)
     paths = [search(case, meeting, CURVATURE_SHARE) for case, meeting in pairs]
 
@@ -231,7 +231,7 @@ def main() -> None:
             row = search_row(cases, meetings, [None] * options.num)
             say_rows(bench, suite, "free", {"this library": row})
             bench.count(row.clear)
-            # If no path was found, any heading can be prescribed.
+            # If no path was found, the heading 0 is prescribed at the meeting.
             headings = [float(path.poses[-1, 2]) if path.found else 0.0 for path in paths]
             rows = {"this library": search_row(cases, meetings, list(headings))}
             if is_installed():

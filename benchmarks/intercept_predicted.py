@@ -129,8 +129,8 @@ def replace_lanes(tree: Any, lanes: np.ndarray, some: Any) -> Any:
 def plan_cases(cases: InterceptCase, around: np.ndarray) -> InterceptPlan:
     """Plan B cases from scratch, and unsolved cases again with weaker requirements.
 
-    Unsolved cases are planned with a larger tolerance of the meeting, and then to points around the
-    target.
+    Unsolved cases are planned with a tolerance of the meeting of 0.2 m. If this fails too, they are
+    planned to eight points 0.5 m around the target.
 
     Args:
         cases: a batch, leaves (B, ...).
@@ -168,7 +168,7 @@ def plan_beside(cases: InterceptCase) -> InterceptPlan:
 
 @dataclasses.dataclass
 class Drives:
-    """Drives of B cars: speed and curvature every 20 ms, from the start to the case's time."""
+    """Drives of B cars: speed and curvature every 20 ms, from the start to the meeting."""
 
     plans: InterceptPlan  # plans that the cars follow at present
     cases: InterceptCase  # problems that these plans solve
@@ -192,9 +192,9 @@ class Drives:
         )
 
     def renew(self, now: float, target: TurningPath) -> None:
-        """Plan all drives again at the time `now` [s], for newly predicted targets.
+        """Plan all drives again at the time `now` [s], for targets that are predicted anew.
 
-        Time 0 of the predicted paths is `now`.
+        Time 0 of the predicted paths `target` is `now`.
         """
         again = PLANNER.replanner()
         task = again.begin(self.cases, self.plans, now - self.began, target=target)

@@ -95,8 +95,8 @@ def predict(truth: jax.Array, seen: jax.Array) -> tuple[jax.Array, ...]:
 
     Returns:
         off: (methods, 4) [m], distances of the predictions from the true positions.
-        nearer: () probability, computed by `select`, that the error 10 s ahead is smaller than the
-            actual error.
+        nearer: () probability, according to the error distribution that `select` estimates, of an
+            error 10 s ahead below the actual error. It is uniform if the estimate is right.
         residual: () [m], deviation of the observations from the path that `select` chose.
         is_turning: () bool, whether `select` chose a turn.
     """

@@ -101,8 +101,8 @@ def judge(problems: Any, points: np.ndarray, solved: np.ndarray) -> Judged:
 
     Args:
         problems: a batch of B problems.
-        points: (B, K, n + 1), control points of K pieces of degree n. The curves are evaluated
-            every millisecond.
+        points: (B, K, n + 1) [m], control points of K Bezier pieces of degree n, which state the
+            distance along the path over time. The curves are evaluated every millisecond.
         solved: (B,) bool, whether the planner reports the problem as solved.
     """
     pieces, degree = points.shape[1], points.shape[2] - 1
@@ -315,7 +315,10 @@ def solve_by_all(problems: Any, planner: SpeedPlanner) -> dict[str, tuple]:
 
 
 def program_of(problem: Any, planner: SpeedPlanner) -> tuple:
-    """Return right-hand sides and bounds of a planner's quadratic program for one problem."""
+    """Return the numbers of a planner's quadratic program that depend on the problem.
+
+    These are the right-hand sides of the equalities, and the bounds of the inequalities.
+    """
     return speed_bounds(problem, reference_line(problem, planner.grid), planner)
 
 

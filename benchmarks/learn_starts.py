@@ -66,7 +66,10 @@ def _add_motion(random: np.random.Generator, head: Any) -> Any:
 
 
 def draw_hits(num: int, seed: int) -> pj.hit.HitCase:
-    """Draw `num` training cases of hits: half as usual, half with varied states and limits."""
+    """Draw `num` training cases of hits: half as in benchmarks, half with varied numbers.
+
+    Initial states, balls, rackets, targets and limits are varied.
+    """
     random, half = np.random.default_rng(seed), num // 2
     plain = pj.hit.draw(num - half, seed=seed)
     varied = pj.hit.draw(half, seed=seed + 1)
@@ -118,9 +121,10 @@ def draw_hard_hits(num: int, seed: int) -> pj.hit.HitCase:
 
 
 def draw_catches(num: int, seed: int) -> pj.catch.CatchCase:
-    """Draw `num` training cases of catches: half as usual, half with varied states and limits.
+    """Draw `num` training cases of catches: half as in benchmarks, half with varied numbers.
 
-    The usual cases are from the suites `throws` and `hard`, with the earliest catching times.
+    All are from the suites `throws` and `hard`, with estimates of the earliest catching times. The
+    second half has varied initial states, catching times, nets and limits.
     """
     random, half = np.random.default_rng(seed), num // 2
 

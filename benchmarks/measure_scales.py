@@ -45,7 +45,8 @@ from planner_jax.trajectory.proportional_minco import (
 HIT_PIECES, CATCH_PIECES = (6, 12), (6,)
 
 # Scales of the variables at the end of a hit with which the measurement starts: logarithms of the
-# duration, of the ball's flight time and of the thrust, two speeds [m/s], and jerk [m/s^3].
+# duration, of the ball's flight time and of the thrust, the racket's two speeds within its plane
+# [m/s], and jerk [m/s^3].
 _FIRST_HIT = (0.05, 0.1, 0.2, 0.6, 0.8, 30.0, 30.0, 30.0)
 # Scales of the variables at the end of a catch with which the measurement starts: logarithm of the
 # duration, position in the net (2), velocity [m/s], acceleration [m/s^2], jerk [m/s^3].
@@ -180,7 +181,7 @@ def draw_weak_throws(num: int, seed: int) -> pj.catch.CatchCase:
 
 
 def hit_planners() -> dict[str, Any]:
-    """Return planners of hits with rough scales, by their keys in the shipped file of scales."""
+    """Return planners of hits, by their keys in the file of scales; their scales are guesses."""
     found = {}
     for pieces in HIT_PIECES:
         first = (0.2,) * (3 * (pieces - 1)) + _FIRST_HIT
@@ -190,7 +191,7 @@ def hit_planners() -> dict[str, Any]:
 
 
 def catch_planners() -> dict[str, Any]:
-    """Return planners of catches with rough scales, by their keys in the shipped file of scales."""
+    """Return planners of catches, by their keys in the file of scales; their scales are guesses."""
     found = {}
     for pieces in CATCH_PIECES:
         first = (0.3,) * (3 * (pieces - 1)) + _FIRST_CATCH

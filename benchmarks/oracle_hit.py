@@ -45,7 +45,10 @@ def read_failures(plans: Path) -> np.ndarray:
 
 
 def summarise(findings: list[Finding]) -> dict:
-    """Return the number of cases with each verdict, its share, excesses and CPU times, by name."""
+    """Return number and share of cases with each verdict, excesses over limits, and CPU times.
+
+    The verdicts are "feasible", "infeasible" and "undecided". Excesses are of infeasible cases.
+    """
     num, verdicts = len(findings), {}
     for name in VERDICTS:
         count = sum(finding.verdict == name for finding in findings)

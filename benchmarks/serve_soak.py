@@ -144,7 +144,7 @@ class Soak:
         self.thrown = self.met = 0
 
     def send(self, kind: int, measured: float, values: tuple, ball: int) -> Any:
-        """Send a packet and wait for the answer; return None if there is no answer in time.
+        """Send a packet and wait for the answer; return None if there is no answer in 0.25 s.
 
         Some packets are intentionally lost, delayed or sent twice.
 

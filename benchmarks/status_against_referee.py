@@ -69,7 +69,10 @@ class Row:
 
 
 def tighten_limits(row: Row, cases: Any, random: np.random.Generator) -> Any:
-    """Set the limits of speed, acceleration and body rate to 2.5 m/s, 10 m/s^2 and 3 rad/s."""
+    """Set the limits of speed, acceleration and body rate to 2.5 m/s, 10 m/s^2 and 3 rad/s.
+
+    `row` and `random` are not used, but passed to every function that changes cases.
+    """
     own = cases.limits
     weak = {"speed": 2.5 + 0.0 * own.speed, "body_rate": 3.0 + 0.0 * own.body_rate}
     if own.acceleration is not None:

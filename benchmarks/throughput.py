@@ -222,7 +222,6 @@ def _peak_memory(devices: list) -> float:
 
 
 def _compare_with_cpu(card: Task, planner: Any, cases: Any, devices: list) -> str:
-    """Plan cases on the devices and on a CPU; return text on differences between the plans."""
     cases = jax.tree.map(np.asarray, cases)
     ours = plan(planner, cases, devices=devices)
     with jax.default_device(jax.devices("cpu")[0]):

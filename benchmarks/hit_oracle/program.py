@@ -160,8 +160,10 @@ def path_limits(motion: list, case: dict, allowance) -> tuple[list, Any]:
 def impact_limits(case: dict, unknown: dict, end: list, impact_time) -> tuple[list, list]:
     """Return the constraints at the impact: expressions that must be 0, and that must be <= 0.
 
-    `unknown` has the program's unknowns by name. `end` holds the quadrotor's position, velocity and
-    acceleration at the impact.
+    The racket's centre must meet the ball, with the speed and the direction of thrust that send the
+    ball to its target. Inequalities bound the quadrotor's velocity, the ball's highest point and
+    the impact time. `unknown` has the program's unknowns by name. `end` has the quadrotor's
+    position, velocity and acceleration at the impact.
     """
     ball = ca.horzsplit(ca.reshape(case["ball"], 3, BALL_DEGREE + 1))
     up, allowance = ca.DM([0.0, 0.0, 1.0]), 1.0 + unknown["excess"]

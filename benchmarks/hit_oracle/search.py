@@ -110,14 +110,14 @@ class Finding:
 
 
 class Oracle:
-    """Search for a feasible hit with a trajectory of 20 pieces, then with twice as many pieces."""
+    """Search for a feasible hit: with 20 pieces, and from promising solutions with 40 pieces."""
 
     def __init__(self):
         self.coarse = Program(COARSE_PIECES, COARSE_SAMPLES, COARSE_FLOOR)
         self.fine = Program(2 * COARSE_PIECES, FINE_SAMPLES, FINE_FLOOR)
 
     def find(self, case: HitCase, starts) -> Finding:
-        """Search for a feasible hit in one case from several starting points.
+        """Search for a feasible hit in one case from the starting points `starts`.
 
         The case has NumPy leaves without a batch axis. The search ends at the first hit that the
         referee, an independent check, accepts.
@@ -145,11 +145,11 @@ class Oracle:
         return finding
 
     def _refine(self, case: HitCase, values: dict, coarse: np.ndarray, finding: Finding) -> float:
-        """Solve with halved pieces from the solution `coarse`, store the result, return its excess.
+        """Divide each piece of the solution `coarse` into two, solve again, and return the excess.
 
-        Limits of pieces that exceed them between samples are tightened, and the program is solved
-        again, until the referee (an independent check) accepts the hit, but at most
-        five times.
+        If the trajectory exceeds limits between samples, the limits on these pieces are tightened,
+        and the program is solved again: at most five times, or until the referee (an independent
+        check) accepts the hit. The result is stored in `finding`.
         """
         guess, margins = self.coarse.halve(values, coarse), np.zeros(self.fine.pieces)
         unknowns, converged = self.fine.solve(values, guess)
@@ -177,7 +177,8 @@ class Oracle:
 def passes_referee(case: HitCase, coeffs: np.ndarray, durations: np.ndarray) -> bool:
     """Return whether the referee, an independent check in float64, accepts a trajectory as a hit.
 
-    `coeffs` (M, 5, 3) and `durations` (M,) [s] define a polynomial with M pieces.
+    The trajectory has M pieces with `durations` (M,) [s]. `coeffs` (M, 5, 3) has for each piece the
+    coefficients of x, y and z by ascending power of the time since the piece's start.
     """
     none: Any = np.zeros(1)
     path: Any = coeffs[None], durations[None]
@@ -203,7 +204,11 @@ def passes_referee(case: HitCase, coeffs: np.ndarray, durations: np.ndarray) -> 
 
 
 def starting_points(num: int, seed: int) -> list[tuple[float, ...]]:
-    """Return `num` starting points of the search: eight fixed points, then random ones."""
+    """Return `num` starting points of the search: eight fixed points, then random points.
+
+    A point has the impact time over the ball's landing time, the ball's flight time after the
+    impact [s], and the thrust at the impact [g].
+    """
     low, high = np.transpose(START_RANGES)
     draws = np.random.default_rng(seed).uniform(low, high, (max(num - len(STARTS), 0), 3))
     return [*STARTS, *map(tuple, draws)][:num]
@@ -219,9 +224,9 @@ def find_hit(case: HitCase, starts) -> Finding:
 
 
 def find_hits(cases: HitCase, starts, workers: int = 1) -> list[Finding]:
-    """Search for a feasible hit in each case of a batch, in `workers` processes.
+    """Search for a feasible hit in each case of a batch, from the starting points `starts`.
 
-    Shows a progress bar. Returns the results in the order of the cases.
+    Runs in `workers` processes, and shows a progress bar. Returns one result for each case.
     """
     cases = jax.tree.map(np.asarray, cases)
     num = len(cases.drag)
