@@ -36,6 +36,6 @@ def device_put_replicated(tree: Any, devices: Sequence[Any]) -> Any:
 
 
 def install() -> None:
-    """Set `jax.device_put_replicated` if the installed JAX lacks it."""
+    """Set `jax.device_put_replicated` to this replacement if the installed JAX lacks it."""
     if not hasattr(jax, "device_put_replicated"):
         setattr(jax, "device_put_replicated", device_put_replicated)  # noqa: B010

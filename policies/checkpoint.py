@@ -22,8 +22,8 @@ from planner_jax.policies.networks import NETWORKS
 from planner_jax.policies.observation import FEATURES
 
 FORMAT = 2  # version number of the format of checkpoints
-# Names of the trained policies in the package: "catch" is trained on eight families of cases, and
-# "rush6" on one family.
+# Names of the trained policies in the package: "catch" is trained on eight suites (families of
+# generated cases), and "rush6" on the suite `rush6` alone, whose six targets have deadlines.
 SHIPPED = ("catch", "rush6")
 _OF_FLAX = ("parent", "name")  # fields of every Flax module, which are not sizes of the network
 
@@ -57,7 +57,7 @@ def save_checkpoint(
 
 
 def name_and_sizes(network: Any) -> tuple[str, dict[str, int]]:
-    """Return a network's name, "attention" or "mlp", and its sizes by the names of its fields."""
+    """Return a network's name, "attention" or "mlp", and its sizes, such as {"width": 64}."""
     (name,) = (name for name, kind in NETWORKS.items() if isinstance(network, kind))
     fields = (field.name for field in dataclasses.fields(network))
     return name, {field: getattr(network, field) for field in fields if field not in _OF_FLAX}

@@ -48,10 +48,10 @@ def draw_curves(folders: Sequence[str | os.PathLike], path: str | os.PathLike) -
 
 
 def curves_figure(figure: Figure, runs: Sequence[Rows]) -> None:
-    """Draw the mean reward and its terms over the number of decisions in training.
+    """Draw one panel for the mean reward and for each of its terms, over the number of decisions.
 
-    If the rows contain evaluations, further panels show the results of each suite (family
-    of cases) after each part of the training (call of PPO).
+    `runs` has the rows of `progress.jsonl` of each training run. If the rows contain evaluations,
+    further panels show the results on each suite (family of cases) after each call of PPO.
     """
     curve = [[row for row in rows if "reward" in row] for rows in runs]
     evaluated = [[row for row in rows if "suites" in row] for rows in runs]
@@ -74,11 +74,6 @@ def curves_figure(figure: Figure, runs: Sequence[Rows]) -> None:
 
 
 def _draw_evaluations(panels: Sequence[Axes], evaluated: Sequence[Rows]) -> None:
-    """Draw success rate, time of the last catch and optimal time ratio, one line for each suite.
-
-    The time of the last catch is drawn in percent of its first value.
-    """
-
     def value_of(suite: str, name: str) -> Any:
         return lambda row: row["suites"][suite][name]
 
@@ -104,8 +99,8 @@ def _line(
     """Draw the mean of a quantity over runs; for several runs also a band around it.
 
     The band is one standard deviation wide to each side. The x axis is the number of decisions.
-    `value` extracts the quantity from a row, and `scale` multiplies it. With `relative` each run is
-    divided by its first value.
+    `value` extracts the quantity from a row, and `scale` multiplies it. With `relative` each run's
+    values are divided by the run's first value. `look` has keyword arguments of `Axes.plot`.
     """
     num = min(len(rows) for rows in runs)
     values = scale * np.array([[value(row) for row in rows[:num]] for rows in runs], float)

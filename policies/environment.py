@@ -44,13 +44,13 @@ _GATED = ("solved", "last", "ratio", "caught")
 class CatchEnv(Env):
     """An environment that rewards decisions by the planner's results, or by a cheap estimate.
 
-    The planner is `ExactCatch` with one start per case. Suites whose cases have equal shapes and
-    the same number of iterations are planned in one call.
+    The planner `ExactCatch` optimises a trajectory for each case from one initial guess, the
+    decision. Suites whose cases have equal shapes and equal iterations are planned in one call.
 
     Args:
-        suites: names of the suites from which cases are drawn.
-        iterations: number of planner iterations for each suite. For zero, the estimate of
-            `task.catch.estimate` is used instead of the planner.
+        suites: names of the suites (families of cases) from which cases are drawn.
+        iterations: number of planner iterations for each suite. For zero, the planner is replaced
+            by an estimate of how far a point of bounded acceleration misses the targets.
         weights: weights of the reward terms of `evaluate_actions`, by name. A weight is one number,
             or one number for each suite.
     """
@@ -71,8 +71,8 @@ class CatchEnv(Env):
     def reset(self, rng: Array) -> State:
         """Draw the first cases of B environments, and return their state.
 
-        `rng` are B random keys (B, 2). Only the first key is used. B must be a multiple of the
-        number of suites.
+        `rng` are B random keys (B, 2), as Brax passes them; all cases are drawn with the first key.
+        B must be a multiple of the number of suites.
         """
         num = rng.shape[0]
         if num % len(self.suites):
@@ -95,7 +95,8 @@ class CatchEnv(Env):
     def step(self, state: Any, action: Array) -> State:
         """Plan the cases from the policy's actions, compute the rewards, and draw new cases.
 
-        `action` has one row for each case, with `PER_TARGET` components for each of `size` targets.
+        `action` is (B, 2 N) for B cases, two components for each of N targets, where N is the
+        greatest number of targets in any suite. Surplus components are ignored.
         """
         key, own = jax.random.split(state.info["key"])
         num = action.shape[0]
@@ -164,16 +165,17 @@ class CatchEnv(Env):
 def evaluate_actions(cases: CatchCase, actions: Array, iterations: int) -> dict[str, Array]:
     """Return the unweighted reward terms (B,) of the actions for B cases, by name.
 
-    The terms compare with `Greedy`, the decision that always catches next the target that can be
+    Two terms compare with `Greedy`, the decision that always catches next the target that can be
     caught earliest.
 
     Args:
         cases: batch of B cases with N targets each.
-        actions: (B, N, 2), a handicap and a stretch for each target, from -1 to 1.
+        actions: (B, N, 2), from -1 to 1 for each target: a handicap, which delays the target in the
+            order of catches, and a stretch, the scaled logarithm of a factor on its catch time.
         iterations: number of planner iterations; for zero an estimate is used, not the planner.
 
     Returns:
-        solved: 1 if the plan meets all limits, else 0.
+        solved: 1 if the plan meets all limits of the case (thrust, body rate, height), else 0.
         last: (t_greedy - t) / t_greedy, where t is the time of the last catch, and t_greedy its
             estimate for the decision `Greedy`; zero in suites with optional targets.
         caught: (n - n_greedy) / n_greedy, where n is the number of targets that the decision
@@ -217,11 +219,6 @@ def evaluate_actions(cases: CatchCase, actions: Array, iterations: int) -> dict[
 
 
 def _plan(cases: CatchCase, choices: CatchChoice, iterations: int) -> tuple[CatchChoice, Any]:
-    """Plan a batch of decisions on catches; return the planned decisions, and their plans.
-
-    If targets are optional, each decision is also planned without its last few catches. The solved
-    decision with most catches is returned.
-    """
     if not cases.optional:
         return choices, solve_batch(ExactCatch(), _attempt(iterations), cases.with_choice(choices))
     several = jax.vmap(in_several_lengths)(cases, jax.tree.map(lambda x: x[:, None], choices))
@@ -230,7 +227,8 @@ def _plan(cases: CatchCase, choices: CatchChoice, iterations: int) -> tuple[Catc
     tried = jax.tree.map(lambda leaf: jnp.repeat(leaf, num, axis=0), cases).with_choice(flat)
     found = solve_batch(ExactCatch(), _attempt(iterations), tried)
     each = jax.tree.map(lambda leaf: leaf.reshape(-1, num, *leaf.shape[1:]), (flat, found))
-    # The versions of a decision are sorted by falling number of catches.
+    # Each decision was also planned without its last catches. These variants are sorted by falling
+    # number of catches, so that the first solved variant has the most catches.
     best = jnp.argmax(is_solved(each[1].status), axis=1)
     return jax.tree.map(lambda leaf: leaf[jnp.arange(len(best)), best], each)
 

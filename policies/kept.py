@@ -19,7 +19,7 @@ from planner_jax.runs.manifest import JsonError, parse_written, to_write
 
 
 class KeptParts:
-    """The stored parameters of a training: for each part a folder, and a file with their digest.
+    """The stored parameters of a training: for each PPO run a folder, and a file with a digest.
 
     Args:
         folder: folder of the storage; it is created if it does not exist.

@@ -21,14 +21,13 @@ _FIRST_STD = 0.15  # standard deviation of actions before tanh at the start of t
 
 
 def _head(features: Array) -> Array:
-    """Apply the last layer; untrained, it gives the mean 0 and the deviation `_FIRST_STD`."""
     raw = float(np.log(np.expm1(_FIRST_STD - LEAST_STD)))
     first = lambda *_: jnp.repeat(jnp.array([0.0, raw]), PER_TARGET)  # noqa: E731
     return nn.Dense(2 * PER_TARGET, kernel_init=nn.initializers.zeros, bias_init=first)(features)
 
 
 class Mlp(nn.Module):
-    """A policy network of two hidden layers with ReLU [Yu2023catch, Section IV-B]."""
+    """A policy network of dense layers, for at most `size` targets [Yu2023catch, Section IV-B]."""
 
     size: int = 6  # greatest number of targets
     width: int = 64  # number of units in each hidden layer
@@ -74,7 +73,7 @@ class Value(nn.Module):
 
     @nn.compact
     def __call__(self, seen: Array) -> Array:
-        """Return the expected reward of each case, from F features of each of its N targets."""
+        """Return the expected reward (...) of each case, from features (..., N, F) of N targets."""
         present = seen[..., -1:]
         num = jnp.maximum(jnp.sum(present, axis=-2), 1.0)
         mean = jnp.sum(present * _apply_attention(self, seen), axis=-2) / num

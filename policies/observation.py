@@ -32,8 +32,9 @@ PER_TARGET = 2  # number of action components per target
 def observe(case: CatchCase, table: Timetable) -> Array:
     """Return the features (N, FEATURES) of the N targets of one case; zero for absent targets.
 
-    Lengths are divided by 4 m, speeds by 4 m/s and times by 5 s. The last feature of a present
-    target is 1. `table` has possible times and positions at which each target can be caught.
+    They are the target's position, velocity, deadline, predicted path and earliest catch, the
+    robot's velocity, the number of other targets, and 1. Lengths are divided by 4 m, speeds by
+    4 m/s and times by 5 s. `table` has possible times and positions of catches.
     """
     num = case.num_targets
     place, velocity = case.head_state[0], case.head_state[1]
@@ -62,7 +63,9 @@ def choice_of(case: CatchCase, table: Timetable, action: Array) -> CatchChoice:
     Args:
         case: one case with N targets.
         table: possible times and positions of catches, from `timetable`.
-        action: (N, PER_TARGET), a handicap and a stretch for each target, from -1 to 1.
+        action: (N, 2), from -1 to 1 for each target: a handicap, in units of 4 s, which is added to
+            its earliest catch time to order the targets; and a stretch, twice the logarithm of a
+            factor on its estimated catch time.
     """
     action = jnp.where(case.present[:, None], action, 0.0)
     choice = earliest_next(case, table, HANDICAP * action[:, 0])

@@ -1,4 +1,4 @@
-"""A learned policy that decides the order and times of catches: `decide="policy"`."""
+"""A learned policy for the order and times of catches: option `decide="policy"` of planners."""
 
 import functools
 import os
@@ -62,8 +62,8 @@ class Policy(CatchDecision):
     def propose(self, case: CatchCase) -> CatchChoice:
         """Return proposals for the order and times of the catches in one case with N targets.
 
-        The arrays are (K, N) for K proposals. If targets are optional, further proposals are the
-        same without the last few catches.
+        Order and times are arrays (K, N) for K proposals. If targets are optional, each proposal of
+        the network also gives variants that omit its last catches, which are the least certain.
         """
         table = timetable(case)
         numbers = self.network.apply(self.params, observe(case, table))
@@ -84,10 +84,10 @@ def policy(file: str | os.PathLike = "catch", **options: Any) -> Policy:
 
     Args:
         file: path of a file written by `planner-jax train`, or the name of a policy that is part of
-            the package: "catch", trained on suites with one to twelve targets, or "rush6", trained
-            on the suite `rush6` alone.
-        **options: `proposals`, `spread` and `stretch` of `Policy`. The default of `stretch` is
-            0.95; 1 leaves the times of the network unchanged.
+            the package: "catch", trained on cases of one to twelve targets, or "rush6", trained on
+            cases of six targets with deadlines.
+        **options: `proposals`, number of proposals for a case (default 1); `spread`, factor on the
+            standard deviations of drawn proposals (1); `stretch`, factor on catch times (0.95).
 
     Raises:
         TypeError: an option has the wrong type.

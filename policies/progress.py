@@ -144,7 +144,7 @@ class Progress:
             yield tell
 
     def add_evaluation(self, number: int, decisions: int, suites: Mapping[str, Any]) -> None:
-        """Add a row with the results of `training.evaluate_policy`, which are stored by suite."""
+        """Add the results of `training.evaluate_policy` after part `number`, by suite, as a row."""
         self.add(number, decisions, {"suites": suites})
 
     def add(self, number: int, decisions: int, row: Mapping[str, Any]) -> None:
@@ -154,7 +154,7 @@ class Progress:
 
 
 def to_text(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Return the text of `progress.jsonl`: first a line with the digest, then one for each row."""
+    """Return the text of `progress.jsonl`: a line with the rows' SHA-256, then a line per row."""
     text = "".join(json.dumps(row) + "\n" for row in rows)
     head = {"rows": len(rows), "sha256": hashlib.sha256(text.encode()).hexdigest()}
     return json.dumps(to_write(head)) + "\n" + text

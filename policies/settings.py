@@ -10,7 +10,7 @@ from planner_jax.task.catch.spec import SUITES
 _MOST_DECISIONS = 1e12  # greatest accepted number of decisions in one part of a training
 _CASE_BYTES = 20_000  # [bytes] estimated memory of one case in a batch
 NETWORK_NAMES = ("attention", "mlp")  # names of the policy networks that can be trained
-# Default weights of the terms of the reward, which `environment.evaluate_actions` defines.
+# Default weights of the terms of the reward; `environment.evaluate_actions` defines the terms.
 WEIGHTS = {"solved": 1.0, "last": 5.0, "ratio": -5.0, "caught": 5.0, "violation": -0.5}
 LEARNING_RATE = 1e-4  # default learning rate at the start of each part of a training
 _PAPER = ("parabola1", "parabola2", "harmonic2", "triangle3", "hexagon6")
@@ -21,7 +21,7 @@ class TrainSettings:
     """The options of `planner-jax train`, from which `training.train_from_settings` makes a run.
 
     Raises:
-        ArgumentError: a value breaks its rule.
+        ArgumentError: a value has the wrong type or is out of its range.
     """
 
     suite: str = option(",".join(_PAPER), "A,B", "suites to train on, one or more")
@@ -72,7 +72,8 @@ class TrainSettings:
 def usual_iterations(suite: str) -> int:
     """Return the number of planner iterations for rewards in training on a suite.
 
-    0 stands for an estimate instead of the planner, used for suites with optional targets.
+    The number is 0 for suites with optional targets, whose rewards come from an estimate of how far
+    the quadrotor misses the targets instead of from the planner.
     """
     if SUITES[suite].optional:
         return 0

@@ -70,9 +70,10 @@ class Part:
     """Settings of one part of a training, that is, of one call of Brax's PPO."""
 
     steps: int  # number of decisions
-    # Number of planner iterations for each suite. If empty, rewards come from a rough estimate.
+    # Number of planner iterations for each suite. If it is empty, rewards come from an estimate of
+    # how far the quadrotor misses the targets.
     iterations: tuple[int, ...] = ()
-    # Learning rate at the start. PPO adapts it to the KL divergence of the updates.
+    # Learning rate at the start of the part. PPO adapts it to the KL divergence of the updates.
     learning_rate: float = LEARNING_RATE
 
 
@@ -155,7 +156,7 @@ def train_from_settings(settings: TrainSettings, out: str | os.PathLike) -> Poli
     """Train a policy with the options of `planner-jax train`; calls `train`."""
     lanes = settings.num_envs or (510 if jax.default_backend() == "cpu" else 8190)
     minibatches = 6
-    # The number of cases must be divisible by the numbers of suites and of minibatches.
+    # The cases are divided evenly among the suites and among the minibatches.
     step = len(settings.suites) * minibatches
     iterations = tuple(map(usual_iterations, settings.suites))
     training = Training(
@@ -174,10 +175,10 @@ def train_from_settings(settings: TrainSettings, out: str | os.PathLike) -> Poli
 
 
 def evaluate_policy(training: Training, network: Any, params: Any) -> dict[str, Any]:
-    """Plan cases of each suite with a policy's decisions, and return the results by suite.
+    """Plan `eval_cases` cases of each suite from a policy's decisions; return results by suite.
 
-    The results are the success rate, and the means of the time [s] of the last catch, the optimal
-    time ratio and the iterations over solved cases.
+    The results are the success rate, and means over solved cases: the time [s] of the last catch,
+    the optimal time ratio (relative difference of decided and planned catch times), iterations.
     """
     decided = DecidedPlanner(ExactCatch(), Policy(params=params, network=network))
     figures = {}
@@ -253,7 +254,6 @@ def _environment(training: Training, part: Part) -> CatchEnv:
 
 
 def _rows_and_updates(part: Part, lanes: int) -> tuple[int, int]:
-    """Return numbers of rows in a part's learning curve and of batches (`lanes` cases) per row."""
     wanted = math.ceil(part.steps / lanes)
     each = math.ceil(wanted / _ROWS)
     return math.ceil(wanted / each), each

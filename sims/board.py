@@ -77,10 +77,10 @@ def show_board(
 def calibrate_camera(
     arm: Arm, camera: Camera, noise: StereoNoise, num: int = 20, *, seed: int = 0
 ) -> tuple[Camera, Calibration]:
-    """Calibrate a camera by `num` simulated views of a board on the arm.
+    """Calibrate a camera by `num` simulated views of a board on the arm; see `show_board`.
 
     Returns:
-        The camera at its calibrated pose, and the calibration itself.
+        The camera at its calibrated pose, and the poses and residuals of the calibration.
     """
     found = calibrate(*show_board(arm, camera, noise, num, seed=seed))
     return move_camera(camera, found.camera), found

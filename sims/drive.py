@@ -95,7 +95,7 @@ def _car(world: World) -> Car:
 
 
 def dead_reckon(pose: Array, speed: Array, curvature: Array, span: Any) -> Array:
-    """Return the pose (3,) after `span` [s] at constant speed [m/s] and path curvature [1/m]."""
+    """Return the pose (x, y, heading) after `span` [s] at constant speed and path curvature."""
     turned = speed * curvature * span
     middle = pose[2] + 0.5 * turned
     way = speed * span
@@ -132,14 +132,13 @@ def start_drives(loop: DriveLoop, plans: CarPlan, keys: Array) -> DriveState:
 
 
 def estimate_state(loop: DriveLoop, drive: DriveState) -> tuple[Array, Array, Array]:
-    """Return a car's estimated pose (3,), and its true speed [m/s] and path curvature [1/m]."""
+    """Return a car's estimated pose (3,), and its exact speed [m/s] and path curvature [1/m]."""
     state = loop.car.state(drive.physics)
     curvature = jnp.tan(state.steering) / loop.car.vehicle.wheelbase
     return drive.believed[-1], state.speed, curvature
 
 
 def _one_frame(world: World, drive: DriveState, until: Array) -> tuple[DriveState, Frame]:
-    """Simulate a drive for one frame; sum tracking errors and saturation up to time `until`."""
     car, dtype, span = _car(world), drive.time.dtype, world.timestep
     steps = CONTROL_RATE // FRAME_RATE
     key, noise_key = jax.random.split(drive.key)
@@ -158,7 +157,8 @@ def _one_frame(world: World, drive: DriveState, until: Array) -> tuple[DriveStat
         over = car.saturation(physics, command)
         physics = step(world, physics, command, jnp.zeros(0, dtype))
         after = car.state(physics)
-        # A measured pose is one latency old, and is compared with the estimate for that time.
+        # A measured pose is one latency old. Its difference from the pose that is estimated for the
+        # same time corrects all later estimates.
         seen = car.sense(dataclasses.replace(true, pose=shown[0]), noise, drive.pose_stds)
         correction = _TRUST * (seen.pose - believed[0])
         next_pose = _advance_estimate(car, believed[-1], true, after, span) + correction
@@ -196,7 +196,6 @@ def _one_frame(world: World, drive: DriveState, until: Array) -> tuple[DriveStat
 def _advance_estimate(
     car: Car, pose: Array, before: CarState, after: CarState, span: float
 ) -> Array:
-    """Integrate an estimated pose over one step, by the car's own speed and steering angle."""
     steering = 0.5 * (before.steering + after.steering)
     curvature = jnp.tan(steering) / car.vehicle.wheelbase
     return dead_reckon(pose, after.speed, curvature, span)
@@ -211,7 +210,8 @@ def drive_on(
     Args:
         world: a world with a car.
         drives: states of the drives, leaves (B, ...).
-        until: (B,) [s], time up to which tracking errors and saturation are summed.
+        until: (B,) [s], end of the planned drive. Tracking errors and saturation are summed only
+            up to this time, since they do not matter afterwards.
         num_frames: number of frames (static).
 
     Returns:

@@ -125,11 +125,6 @@ class Scene:
         self.axes.legend(loc="upper left", fontsize=9, frameon=False)
 
     def _within(self, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-        """Return positions (K, N, 3) [m] of N balls at K samples, NaN outside the axes' bounds.
-
-        The bounds `low` and `high` are (3,) [m]. Positions in `self.balls` and `self.back` outside
-        of the bounds are replaced by NaN, too.
-        """
         balls = self.recording.balls[self.flight]
         inside = ((balls >= low) & (balls <= high)).all(axis=2, keepdims=True)
         self.balls = np.where(inside, self.balls, np.nan)
@@ -137,13 +132,11 @@ class Scene:
         return np.where(inside, balls, np.nan)
 
     def _fill(self, prism: Prism, time: float) -> list[Any]:
-        """Draw a prism's top as a filled polygon at a time [s]; return matplotlib's artists."""
         top = prism.outlines(time)[1]
         style = {"facecolor": prism.colour, "edgecolor": GREY, "linewidth": 0.5, "alpha": 0.6}
         return [self.axes.add_collection3d(Poly3DCollection([top], **style))]
 
     def _add_solid(self, solid: Solid, colour: str, opacity: float, shade: bool = False) -> Any:
-        """Draw the faces of a solid in the world frame; return the drawn artist."""
         faces = solid.corners[solid.triangles]
         style = {"facecolors": colour, "edgecolors": colour, "linewidth": 0.0}
         style |= {"alpha": opacity, "shade": shade}
@@ -198,7 +191,10 @@ class Scene:
                 self.axes.plot(*ball[:, None], ".", ms=7, color=trail.get_color())
 
     def contacts(self, label: str) -> None:
-        """Draw a star at each contact of ball and tool, and a cross at the target of the flight."""
+        """Draw a star at each contact of ball and tool, and a cross at the ball's target point.
+
+        `label` is the name of a contact in the legend, such as "hit".
+        """
         target = self.recording.target[self.flight]
         if np.isfinite(target).all():
             self.axes.plot(*target[:, None], "X", ms=10, color=INK, label="target")
@@ -212,7 +208,8 @@ class Scene:
     def show(self, at: int, back: int | None = None) -> None:
         """Draw robot, balls and moving obstacles at the sample with index `at`.
 
-        The drawn path of the returned ball ends at the sample `back`, by default at `at`.
+        The drawn path of a ball that the racket has returned ends at the sample `back`, by default
+        at `at`; a picture shows the whole path up to the ground.
         """
         for trail, path in zip(self.trails, np.moveaxis(self.balls[: at + 1], 1, 0), strict=True):
             trail.set_data_3d(*path.T)
@@ -294,7 +291,6 @@ def film_flights(path: Path, task: FlightTask, recording: Recording, num: int) -
 
 
 def _write(path: Path, write: Any) -> None:
-    """Let `write` fill a temporary file, and move it to `path` once it is complete."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as scratch:
         write(scratch)

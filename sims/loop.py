@@ -87,7 +87,6 @@ def _fly_to_observation(loop: Loop, pilot: Pilot, flight: FlightState, drag: Arr
 
 
 def _update_estimates(loop: Loop, estimates: Estimate, seen: Array) -> Estimate:
-    """Update the estimates of N balls with one observed position of each ball, (N, 3) [m]."""
     gravity = jnp.asarray(loop.world.gravity, seen.dtype)
 
     def one(estimate: Estimate, at: Array) -> Estimate:
@@ -110,10 +109,6 @@ def predict_balls(loop: Loop, estimates: Estimate, ahead: Any) -> BallState:
 def _pose_problems(
     loop: Loop, pilot: Pilot, flights: FlightState, cases: Any
 ) -> tuple[Outlook, Any]:
-    """Return the situations of B flights at the end of this period, and their planning problems.
-
-    The first axis of every array in both results is B.
-    """
 
     def one(flight: FlightState, case: Any) -> tuple[Outlook, Any]:
         when = flight.time + loop.period
@@ -165,7 +160,6 @@ def _fly(
 def _with_plans(
     pilot: Pilot, flights: FlightState, outlook: Outlook, asked: Any, found: tuple[Any, ...]
 ) -> FlightState:
-    """Replace plans of flights by newly found plans, where the task's `Pilot` accepts them."""
 
     def one(flight: FlightState, outlook: Outlook, asked: Any, found: tuple) -> FlightState:
         plan, good = pilot.choose(asked, outlook, found)
@@ -203,7 +197,10 @@ def _record(loop: Loop, pilot: Pilot, flight: FlightState, drag: Array) -> Recor
 
 
 def in_parts(flights: FlightState) -> bool:
-    """Return whether planning and flying are separate programs: for few flights on a GPU."""
+    """Return whether planning and flying are compiled as separate programs.
+
+    They are for up to 1024 flights on a GPU, where compiling takes longer than the flights do.
+    """
     (device,) = flights.time.devices()
     return device.platform != "cpu" and len(flights.time) <= _FEW
 
@@ -241,10 +238,6 @@ def _fly_and_plan(
     num_periods: Array,
     most_periods: int,
 ) -> tuple[FlightState, Record | None]:
-    """Simulate B flights with replanning in one program; return final states and records.
-
-    The records have the same length for any number of periods, so that all legs share a program.
-    """
     begin = lambda part, *given: lambda: part(*given)  # noqa: E731
 
     def next_period(k: Array, carry: tuple) -> tuple[FlightState, Record | None]:
@@ -274,7 +267,7 @@ def fly_leg(
     num_periods: int,
     most_periods: int | None = None,
 ) -> tuple[FlightState, list[Record]]:
-    """Simulate a batch of B flights of N balls for some planning periods.
+    """Simulate one leg, that is, some planning periods, of a batch of B flights of N balls.
 
     A large batch runs in one program. For a small batch on a GPU, planning and flying of a period
     are separate programs, which are compiled concurrently. Compiling then takes half as long, and
@@ -287,8 +280,8 @@ def fly_leg(
         cases: cases of the task, leaves (B, ...); times count from the start of the first plan.
         drag: (B, N), true drag coefficients K_D [1/m].
         num_periods: number of planning periods.
-        most_periods: greatest number of planning periods of all legs; by default `num_periods`.
-            Legs with the same greatest number share their program.
+        most_periods: greatest number of planning periods in any leg of the flights; by default
+            `num_periods`. Legs with equal greatest numbers share one compiled program.
 
     Returns:
         The flights at the end, and with `loop.record` the records of all observations in order.

@@ -87,8 +87,8 @@ class Loop:
     """The settings that determine a flight's compiled program; static under `jax.jit`.
 
     Raises:
-        ValueError: the planning period is no multiple of the period of observations, or this period
-            no multiple of the time step, or the latency no multiple of the period of observations.
+        ValueError: the planning period or the latency is not a multiple of the observation period,
+            or the observation period is not a multiple of the time step.
     """
 
     world: World

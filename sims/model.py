@@ -163,7 +163,7 @@ def _drag_force(world: World, qvel: Array, drag: Array) -> Array:
 
 
 def at_rest(world: World, place: Array) -> Physics:
-    """Return the state of a robot at standstill at a position (3,) [m]; balls are 100 m away."""
+    """Return the state of a world: robot at standstill at `place` (3,) [m], balls 100 m away."""
     place = jnp.asarray(place)
     qpos, qvel, act = world.robot.at_rest(place, world.gravity)
     away = jnp.tile(jnp.array([100.0, 0.0, 0.0], place.dtype), world.num_balls)

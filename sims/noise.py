@@ -9,7 +9,10 @@ from planner_jax.core.errors import ArgumentError
 
 
 def require_whole(ratio: float, name: str, rule: str, value: float) -> None:
-    """Raise `ValueError`, "NAME must be RULE, got VALUE", unless a ratio is a whole number."""
+    """Raise `ValueError`, "NAME must be RULE, got VALUE", unless `ratio` is a whole number.
+
+    `value` is the argument called `name` from which the caller has computed the ratio.
+    """
     if abs(ratio - round(ratio)) > 1e-6 or (ratio > 0.0 and round(ratio) == 0):
         raise ArgumentError(name, rule, value)
 
@@ -107,7 +110,7 @@ class PlaneSensing:
         require_whole(self.latency * CONTROL_RATE, "latency", rule, self.latency)
 
     def frames_per_plan(self, replan: float) -> int:
-        """Return the number of 20 ms frames from one plan to the next; 50 without replanning.
+        """Return the number of 20 ms frames per plan; without replanning 50, that is, one second.
 
         Args:
             replan: [Hz], rate of replanning; 0 for never.

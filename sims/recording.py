@@ -79,7 +79,10 @@ class Frame(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Launches:
-    """States of N balls of F flights, to compute the parts of flights that are not simulated."""
+    """States of N balls of F flights, from which their flight before and after it is computed.
+
+    MuJoCo simulates a ball only from the plan for it to its contact with the robot.
+    """
 
     balls: BallState  # leaves (F, N, 3), each at the start of the plan for it
     drag: Any  # (F, N), true drag coefficient K_D [1/m]
@@ -157,7 +160,6 @@ def make_recording(
         return whole
 
     def flight_of(ball: BallState, span: np.ndarray, drag: np.ndarray) -> np.ndarray:
-        """Return ball positions (F, K, ..., 3) [m] in F flights after K times (F, K, ...) [s]."""
         pos, vel = (np.asarray(leaf, float)[:, None] for leaf in (ball.pos, ball.vel))
         return fly(pos, vel, span, drag[:, None], np.full(span.shape, world.gravity))[0]
 

@@ -79,9 +79,10 @@ class Robot(Protocol):
         ...
 
     def drive(self, physics: Physics, command: Array, timestep: float) -> tuple[Array, Array]:
-        """Return MuJoCo's controls for A actuators, and extra forces for R' joint velocities.
+        """Convert a command to MuJoCo's controls (A,) and to extra generalised forces (R',).
 
-        The extra forces are forces for which the model has no actuators, such as tyre forces.
+        R' is the number of the robot's joint velocities. The extra forces are those for which the
+        model has no actuators, such as tyre forces. `timestep` [s] is MuJoCo's.
         """
         ...
 
@@ -144,6 +145,6 @@ class ToolRobot(Robot, Protocol):
     def head_state(self, plan: Any, time: Array) -> Array:
         """Return the robot's planned state at a time () [s] since the start of a plan.
 
-        The first row is the position. A new plan may start from this state.
+        Its rows are position, velocity and higher derivatives, (4, 3) for a quadrotor.
         """
         ...

@@ -74,7 +74,8 @@ def start_flights(
         record: number of flights that are recorded, from the first flight on.
 
     Raises:
-        ArgumentError: an argument breaks a rule; no files remain.
+        ArgumentError: `record` or `video` is invalid, the folder is not empty, or this machine
+            cannot run the simulation; no files remain.
     """
     folder = RunFolder(out)
     require(1 <= record <= _RECORDED, "record", f">= 1 and <= {_RECORDED}", record)
@@ -121,7 +122,6 @@ def _discard_unfinished(folder: RunFolder) -> str:
 def _fly_into(
     folder: RunFolder, manifest: dict[str, Any], flight: FlightTask, cases: Any, kept: int
 ) -> dict[str, Any]:
-    """Simulate all flights, record the first `kept` ones, write all files; return the manifest."""
     print(f"Writing {folder.path}; the simulation compiles first.", file=sys.stderr, flush=True)
     rows, times, flights = _fly_all(flight, cases, kept)
     folder.plans.write_rows(rows)
@@ -174,11 +174,6 @@ def require_sound(folder: RunFolder) -> None:
 
 
 def _fly_all(flight: FlightTask, cases: Any, shown: int) -> tuple[pa.Table, dict[str, Any], Any]:
-    """Simulate all flights; return the table of results, the times [s], and recorded flights.
-
-    Batches of up to 256 flights are recorded completely, so that only one program is compiled. In
-    larger batches nothing is recorded; then the first `shown` flights are simulated once more.
-    """
     num = flight.settings.num
     size = min(flight.settings.batch or 4096, num)
     record = shown <= size <= _RECORDED
@@ -203,6 +198,7 @@ def _fly_all(flight: FlightTask, cases: Any, shown: int) -> tuple[pa.Table, dict
         "warm_flights": warm_flights,
         "wall_seconds": round(watch.lap(), 3),
     }
+    # Batches of more than 256 flights record nothing, to save memory.
     if recorded is None:
         recorded = flight.fly(cases[np.arange(shown)], record=True)
     return pa.concat_tables(parts), times, recorded

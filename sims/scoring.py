@@ -78,15 +78,14 @@ def passage(
         before: tool and balls at `time`.
         after: tool and balls one step later.
         time: () [s], start of the step.
-        planned: (N,) [s], planned contact times of the balls.
-        reference: (3,) [m], planned position of the robot at `time`.
+        planned: (N,) [s], planned contact times of the balls, which are copied to the result.
+        reference: (3,) [m], planned position of the robot at `time`, for its tracking error.
 
     Returns:
-        (N,) bool, whether each ball passes, and the passages of all balls, leaves (N, ...).
+        (N,) bool, whether each ball passes, and the passages, leaves (N, ...), valid where it does.
     """
 
     def gap(at: Moment) -> Array:
-        """Return the height (N,) [m] of N balls over the disc's plane."""
         height = jnp.sum((at.ball_pos - at.robot_pos[None]) * at.normal[None], axis=1)
         return height - world.carrier.tool.height
 

@@ -44,6 +44,9 @@ def ball_thresholds(
 ) -> BallThresholds:
     """Return thresholds for a ball as float32 NumPy arrays; the default colour is orange.
 
+    `lower` and `upper` bound hue, saturation and value; `radius` [m] is the ball's radius. A pixel
+    needs the `confidence` and a depth up to `reach` [m], and a ball needs `pixels` such pixels.
+
     Raises:
         ValueError: a colour is not between 0 and 1, or the radius is not positive.
     """
@@ -214,7 +217,6 @@ def noisy_depth(
 
 
 def _middle(counts: Array) -> Array:
-    """Return the index () at which the cumulative sum of the counts reaches half of its total."""
     until = jnp.cumsum(counts)
     return jnp.searchsorted(until, 0.5 * until[-1])
 

@@ -142,7 +142,6 @@ def anchor_energy(estimate: Estimate, gravity: Array) -> Estimate:
 
 
 def _energy(belief: EkfState, gravity: Array) -> tuple[Array, Array]:
-    """Return a ball's energy per unit mass, and the variance of this energy to first order."""
     slope = jnp.concatenate([jnp.stack([0.0 * gravity, 0.0 * gravity, gravity]), belief.ball.vel])
     variance = jnp.sum(slope[:, None] * belief.covariance * slope[None])
     return specific_energy(belief.ball, gravity), variance

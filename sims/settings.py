@@ -49,7 +49,7 @@ def fly_settings(task: str) -> type["FlySettings"]:
 
 
 def require_interval(sensing: Sensing, replan: float) -> None:
-    """Raise `ValueError` unless a whole number of planning periods fits between two balls.
+    """Raise `ValueError` unless the 0.8 s between two throws are a multiple of the planning period.
 
     Args:
         sensing: settings of the observations.
@@ -65,7 +65,8 @@ class FlySettings:
     """The settings that the flights of all tasks share; a task's subclass adds more.
 
     Raises:
-        ArgumentError: a value breaks its rule; the message is one line that begins with its name.
+        ArgumentError: a value is out of its range; the message is one line that begins with the
+            setting's name.
     """
 
     num: int = option(64, "N", "number of flights")
@@ -99,7 +100,10 @@ class FlySettings:
 
     @property
     def rate(self) -> float:
-        """The rate of replanning [Hz]; by default only the task's first planner replans."""
+        """The rate of replanning [Hz]; by default the task's own rate, or 0 if it cannot replan.
+
+        Only the first of a task's planners can replan.
+        """
         if self.replan is not None:
             return self.replan
         return self.RATE if self._is_first else 0.0
@@ -172,7 +176,7 @@ class CatchFly(BallFly):
 
     @property
     def redecide_rate(self) -> float:
-        """The rate [Hz] at which order and times of the catches are decided again."""
+        """The rate [Hz] of new decisions on the catches' order and times; by default `rate`."""
         return self.rate if self.redecide is None else self.redecide
 
     def flight(self) -> Any:
@@ -187,7 +191,10 @@ class CatchFly(BallFly):
         return super().flight()
 
     def check_rate(self) -> None:
-        """Raise `ValueError` unless throws and new decisions coincide with starts of plans."""
+        """Raise `ValueError` unless throws and new decisions happen only when a plan starts.
+
+        The loop can change its balls and its order of catches only at those times.
+        """
         super().check_rate()
         if self.balls > 1:
             require_interval(NOISES[self.noise], self.rate)

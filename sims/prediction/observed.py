@@ -1,8 +1,8 @@
 """Noisy observations of a target in the plane, centred at their means for a fit.
 
 World frame, SI units, one target. An observation that is not finite, or has weight zero, counts as
-absent, so that array shapes do not depend on the number of observations. In the fits of this
-package a point (or a complex number) is a pair (x, y) of arrays.
+absent, so that array shapes do not depend on the number of observations. In this package, points
+of the plane are pairs (x, y) of arrays, also where formulas treat them as complex numbers x + i y.
 """
 
 from typing import NamedTuple

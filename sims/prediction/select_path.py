@@ -18,7 +18,8 @@ from planner_jax.plane.target import TurningPath, arc
 from planner_jax.sims.prediction.observed import centre, safe_sqrt
 from planner_jax.sims.prediction.turn_fit import best_turn, fit_rate, path_of, tangent
 
-_REACH = 5.0  # half width of the evaluated interval of turn rates, in standard deviations
+# Half width of the interval of evaluated turn rates, in standard deviations of the turn rate.
+_REACH = 5.0
 _OFFSETS = np.linspace(-1.0, 1.0, 49)  # evaluated turn rates, relative to that half width
 # Nodes and weights of a Gauss-Legendre quadrature on (-1, 1).
 _NODE, _WEIGHT = np.polynomial.legendre.leggauss(24)
@@ -151,7 +152,6 @@ def select(
         variance = error_variance = jnp.square(jnp.asarray(noise, dtype))
 
     def gain(squares: Array) -> Array:
-        """Return 2 log(likelihood of the best turn / of a fit with residual sum `squares`)."""
         excess = (squares - best.squares) / variance
         return excess if noise is not None else (freedom + 1.0) * jnp.log1p(excess / freedom)
 
@@ -193,10 +193,6 @@ def select(
 
 
 def _median(rates: Array, step: Array, chance: Array, of_zero: Array) -> Array:
-    """Return the median turn rate, for the probabilities `chance` of `rates` and `of_zero` of 0.
-
-    The rates are `step` apart; each stands for the interval of this width around it.
-    """
     below = jnp.cumsum(chance) - chance
     right = jnp.sum(jnp.where(rates < 0.0, chance, 0.0)) <= 0.5  # whether the median is >= 0
     level = jnp.where(right, 0.5 - of_zero, 0.5)
@@ -242,9 +238,9 @@ def chance_within(prediction: Prediction, time: ArrayLike, radius: ArrayLike) ->
 
 
 def _errors(prediction: Prediction, time: ArrayLike) -> tuple[Array, Array]:
-    """Return offsets (K, 2) [m] of K alternative paths from the selected path, and variances.
+    """Return offsets (K, 2) [m] of K alternative paths from the selected path at a time () [s].
 
-    The position variances (K,) [m^2] are without `centre_variance`, which is equal for all paths.
+    Also return the part (K,) [m^2] of their position variances that `velocity_variance` causes.
     """
     among = prediction.alternatives
     time = jnp.asarray(time, among.middle.dtype)

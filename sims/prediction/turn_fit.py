@@ -98,7 +98,11 @@ def tangent(seen: Centred, fit: TurnFit) -> tuple[Callable[[Array], Pair], Array
 
 
 def best_turn(seen: Centred, fastest: ArrayLike) -> TurnFit:
-    """Fit position, velocity and turn rate; derivatives of the fit are exact at the optimum."""
+    """Fit position, velocity and turn rate to observations.
+
+    JAX can differentiate the result by the observations. Its derivatives are those of the optimum,
+    not of the iterations that find it.
+    """
 
     def downhill(rate: Array) -> Array:
         fit = fit_rate(seen, rate)
@@ -161,6 +165,5 @@ def _mean(seen: Centred, a: Pair) -> Pair:
 
 
 def _share(seen: Centred, arm: Pair, power: Array, a: Pair) -> Pair:
-    """Return the complex c with the least weighted sum of |a - c arm|^2, `power` for |arm|^2."""
     safe = jnp.where(power > 0.0, power, 1.0)
     return _sum(seen, arm, a) / safe, _sum(seen, (-arm[1], arm[0]), a) / safe

@@ -49,7 +49,7 @@ _KEPT = 5  # number of simulated frames from one recorded sample to the next
 
 
 class BlockFlight(FlightTask):
-    """Methods by which `run.py` flies, scores and draws the task `block`, and its settings."""
+    """The task `block` with settings: how `sims/run.py` simulates, scores and draws its flights."""
 
     settings: BlockFly
 
@@ -280,7 +280,6 @@ def _part(batch: Any, name: str) -> np.ndarray:
 
 
 def _balls(cases: BlockCase, flights: BlockFlights, lanes: np.ndarray) -> np.ndarray:
-    """Return positions (F, S, 3) [m] of F balls at S frames, in flight and after their block."""
     case, flown = referee_leaves(cases), flights.flown
     times, met = flown.times, flights.contact[lanes]
     free = np.moveaxis(ball_places(case, times), 0, 2)

@@ -1,12 +1,11 @@
 """Blocks in closed loop: an arm with a shield executes plans against thrown balls [Natarajan2024].
 
-A ball's flight is known after a time of observation. Then a plan is made, and the wall time of
-planning is measured. The arm starts when the planning budget is over, or later if its plan is not
-ready by then. Only the limited torques of the joints move the arm. The score depends on the motion
-of the simulated arm; it is computed in float64 with the referee's geometry. Balls follow their
-parabola and need no simulation. Times count from the moment at which the ball is first seen.
-Positions are in the robot's base frame; recordings are in the world frame, with the floor at height
-0.
+A ball's flight is known after a time of observation. Then the arm's motion is planned, and the wall
+time of planning is measured. The arm starts when the planning budget is over, or later if its plan
+is not ready by then. Only the limited torques of the joints move the arm. The score depends on the
+motion of the simulated arm, and is computed in float64 by the package `referee`, which also checks
+plans. Balls follow their parabola and need no simulation. Times count from the moment at which the
+ball is first seen. Positions are in the robot's base frame; in recordings, in the world frame.
 """
 
 import dataclasses
@@ -84,7 +83,7 @@ class BlockFlights(Flights):
     blocked: np.ndarray  # (B,) bool: the shield's face met the ball before the inner box
     contact: np.ndarray  # (B,) [s], time of contact between ball and shield; NaN without contact
     contact_pos: np.ndarray  # (B, 3) [m], ball's centre at the contact; NaN without contact
-    # (B,) [m], distance of the ball from the shield's centre, in the shield's plane.
+    # (B,) [m], distance from the shield's centre at which the ball crosses the shield's plane.
     miss: np.ndarray
     # (B,) bool, whether the ball touched the arm's base or links 1 to 3 before the contact.
     struck: np.ndarray
@@ -93,9 +92,10 @@ class BlockFlights(Flights):
     clearance_after: np.ndarray  # (B,) [m], least clearance after the contact, while the arm brakes
     planned: np.ndarray  # (B,) bool, whether there was a plan
     motions: np.ndarray  # (B,) int, number of motions that the arm started
-    # (B,) [m], error of the first fitted ball flight; NaN if the flight is known without a fit.
+    # (B,) [m], error of the ball's position by the first and the last fit of its flight, halfway
+    # through the time for blocking; NaN if the flight is known without a fit.
     fit_error: np.ndarray
-    last_fit_error: np.ndarray  # (B,) [m], error of the last fit of the ball's flight
+    last_fit_error: np.ndarray
 
     @property
     def touched(self) -> np.ndarray:
@@ -119,8 +119,9 @@ def throws(
 ) -> Throws:
     """Draw throws of a suite by `pj.block.draw`.
 
-    `regime` names the joint limits of plans, `wide` allows contacts 0.1 m from the shield's centre,
-    and `delay` [s] is the time from the first sight of a ball until the arm starts.
+    `regime` names the joint limits of plans: "R1", "R2" or "R3" of `robot.arm.REGIMES`. `wide`
+    allows contacts up to 0.1 m from the shield's centre. `delay` [s] is the time from the first
+    sight of a ball until the arm starts.
     """
     cases = draw_throws(num, suite, seed, regime=regime, wide=wide, delay=delay)
     return Throws(index=np.arange(num), cases=jax.tree.map(np.asarray, cases))
@@ -129,8 +130,8 @@ def throws(
 def courses_of(cases: BlockCase, plans: BlockPlan) -> Course:
     """Return the courses of arms: joint motion, start time, and braking after the motion.
 
-    The motion of a plan starts at the time `cases.delay`. An arm without a plan stands still.
-    Joints brake with the acceleration limit of the plans.
+    A planned motion starts `cases.delay` [s] after the first sight of the ball. An arm without a
+    plan stands still. Joints brake with the acceleration limit of the plans.
     """
     coeffs = np.asarray(plans.motion.coeffs)
     solved = np.asarray(is_solved(plans.status))
@@ -164,12 +165,13 @@ def fly_blocks(
         seed: random seed of the encoders' noise, >= 0.
         drives: limits and errors of the drives.
         planner: planner of all plans, by default the planner named `online`.
-        planning_budget: [s], time for planning, the last part of the cases' field `delay`. A plan
-            that takes longer starts late by the excess. If it is None, planning takes no time.
+        planning_budget: [s], time for planning. It is the last part of `delay`, the cases' time
+            from the first sight of a ball until the arm starts. An arm whose plan takes longer
+            starts late by the excess. If it is None, planning takes no time.
         plan: plans of the cases; by default plans are made here.
         seconds: (B,) [s], wall times of the passed plans.
-        decided: motions that were planned from observations of the balls, used instead of plans;
-            the cases must have the same `delay`.
+        decided: motions that were planned from observations of the balls; they are used instead of
+            `plan`, and must start at the cases' `delay`.
 
     Raises:
         ValueError: the arm of the cases is not the simulated arm, or the planning budget exceeds
@@ -229,7 +231,7 @@ def require_arm(world: World, cases: BlockCase) -> None:
     for (path, value), planned in zip(own, jax.tree.leaves(cases.arm), strict=True):
         name = path[-1].name
         same = np.shape(planned)[1:] == np.shape(value)
-        # The field `home` may differ: each case has its own joint angles at the start.
+        # The field `home` may differ, since each case has its own joint angles at the start.
         if name != "home" and not (same and np.allclose(planned, value, rtol=1e-5, atol=1e-6)):
             raise ArgumentError(name, "the same in plan and simulated arm", shown="")
 
@@ -247,7 +249,7 @@ def entry_times(cases: BlockCase) -> np.ndarray:
 
 
 def ball_places(case: dict[str, np.ndarray], times: np.ndarray) -> np.ndarray:
-    """Return positions (3, B, S) [m] of B balls at S times, (S,) or (B, S) [s]."""
+    """Return positions (3, B, S) [m] of the balls of B cases, `referee_leaves`, at S times [s]."""
     pos, vel = case["ball.pos"].T[..., None], case["ball.vel"].T[..., None]
     fall = np.multiply.outer(FALL, case["gravity"])[..., None]
     return pos + vel * times - 0.5 * fall * times**2
@@ -320,14 +322,10 @@ def score(cases: BlockCase, plans: BlockPlan, flown: Executed, budget: Budget) -
 def _strikes(
     case: dict[str, np.ndarray], links: Sequence[int], turns: list, places: list, ball: np.ndarray
 ) -> np.ndarray:
-    """Return whether B balls touch the arm's base or links 1 to 3 in S frames, (B, S) bool.
-
-    `turns` and `places` have the rotation and the position [m] of each link's frame. `links` has
-    each capsule's link, from 0, and -1 for the base. `ball` (3, B, S) [m] has the balls' centres.
-    The wrist is left out: its capsules protrude through the shield's face, the real links do not.
-    """
     found = np.zeros(ball.shape[1:], bool)
     for k, link in enumerate(links):
+        # Only the base and links 1 to 3 are tested. The wrist's capsules protrude through the
+        # shield's face, which the real links do not.
         if link > 2:
             continue
         first, second = case["arm.capsule_ends"][:, k].transpose(1, 2, 0)[..., None]
@@ -341,11 +339,6 @@ def _strikes(
 def _least(
     case: dict[str, np.ndarray], links: Sequence[int], angles: np.ndarray, included: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the least clearances (B,) [m] of B arms from obstacles in the frames of a mask.
-
-    The mask is `included` (B, S) bool, and `angles` has the joint angles in S frames. Names of the
-    nearest link and obstacle are returned, too. The clearance is inf if the mask has no frame.
-    """
     least, names = [], []
     for begin in range(0, len(included), _LANES):
         some = slice(begin, begin + _LANES)

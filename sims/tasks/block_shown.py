@@ -24,7 +24,6 @@ BUDGET = {
 
 
 def _make_box_part(box: Box, colour: str, opacity: float) -> Part:
-    """Convert a box of the scene to a part for drawing, in the world frame."""
     lower, upper = np.asarray(box.lower, float), np.asarray(box.upper, float)
     (x, y, z), (length, width, height) = 0.5 * (lower + upper), upper - lower
     return Part("box", (length, width, height), (x, y, z - FLOOR), colour, opacity=opacity)

@@ -60,7 +60,6 @@ _AFTER = 0.05  # [s], simulated time after the end of the last ball's horizon
 def _steadier(
     planner: Planner[CatchCase, CatchPlan],
 ) -> Planner[CatchCase, CatchPlan]:
-    """Return a planner whose initial guesses have more thrust at catches, if it is `exact`."""
     if isinstance(planner, DecidedPlanner) and isinstance(planner.planner, ExactCatch):
         own = dataclasses.replace(planner.planner, lift=LIFT)
         return dataclasses.replace(planner, planner=own)
@@ -228,7 +227,7 @@ def fly_catches(
 
 
 class CatchFlight(BallFlightTask):
-    """Methods by which `run.py` flies, scores and draws the task `catch`, and its settings."""
+    """The task `catch` with settings: how `sims/run.py` simulates, scores and draws its flights."""
 
     settings: CatchFly
 

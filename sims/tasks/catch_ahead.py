@@ -96,8 +96,8 @@ def until_last_catch(flight: FlightState, new: Array) -> Array:
 def with_catch(flights: FlightState, found: CatchPlan, new: Array) -> FlightState:
     """Return B flights whose plans continue with catches of newly seen balls.
 
-    If an earlier ball is still to be caught, the new plan is appended to the current plan, after
-    the last catch of an earlier ball. Otherwise the new plan replaces the current plan from now on.
+    If an earlier ball is still to be caught, its catch is kept, and `found` is flown after it.
+    Otherwise `found` replaces the flight's current plan at once.
 
     Args:
         flights: the flights that were passed to `predict_case`.
@@ -151,7 +151,7 @@ def with_catch(flights: FlightState, found: CatchPlan, new: Array) -> FlightStat
 class _EveryAttempt(Driver):
     """A planning driver that runs all attempts (settings to try) of a planner concurrently."""
 
-    # With the time limit of 0 s, one call starts no second attempt.
+    # Every thread calls the driver with one attempt. The time limit of 0 s prevents further ones.
     watch: Watch = dataclasses.field(default_factory=lambda: Watch(0.0))
 
     def __call__(
@@ -184,10 +184,10 @@ def plan_ahead(
 ) -> tuple[CatchCase, CatchPlan]:
     """Plan to catch a ball and, if possible, also the next ball, without an earlier plan.
 
-    Cases without a solved plan for both balls are first planned for both balls with wider limits: a
-    plan for the first ball alone may end where the quadrotor cannot reach the next ball. If a plan
-    still violates a limit by more than 10 %, the first ball is planned alone. If no plan for it is
-    solved, the plan with the least violation is returned.
+    If no plan for both balls is solved, both balls are planned again with wider limits of thrust
+    and body rate, since after a plan for the first ball alone the next ball may be out of reach. If
+    a plan still violates a limit by more than 10 %, the first ball is planned alone. If no plan for
+    this ball is solved, the plan with the least violation is returned.
 
     Args:
         planner: planner of catches, which also decides their order.
@@ -231,7 +231,7 @@ def plan_ahead(
 
 
 def within(cases: CatchCase, limits: dict[str, Any] | None) -> CatchCase:
-    """Replace limits of cases by `limits`, a result of `bounds`; do nothing if it is None."""
+    """Replace the cases' limits of least thrust and body rate by `limits`, unless it is None."""
     if limits is None:
         return cases
     leaves = {
@@ -241,7 +241,11 @@ def within(cases: CatchCase, limits: dict[str, Any] | None) -> CatchCase:
 
 
 def bounds(loop: Loop, distance: tuple[float, float]) -> dict[str, Any]:
-    """Convert fractions, an entry of `LIMITS`, to least thrust [m/s^2] and body rate [rad/s]."""
+    """Return limits of least thrust [m/s^2] and body rate [rad/s] by name, for use in plans.
+
+    `distance` is an entry of `LIMITS`. Its numbers are the margin of the thrust above the robot's
+    least thrust, as a fraction of the range up to hover, and a fraction of the body rate limit.
+    """
     model, gravity = loop.world.carrier.model, loop.world.gravity
     least, _ = model.thrust_bounds
     above, share = distance

@@ -93,13 +93,13 @@ class CatchPilot:
     ) -> tuple[CatchPlan, Array]:
         """Return one of the found plans, and whether it replaces the current plan.
 
-        A plan from scratch is returned if it exceeds the limits less than the other plan, or if it
-        is feasible at a clearly lower cost.
+        A plan from scratch is returned at the times of new decisions if `is_worth_flying` prefers
+        it to the plan that continues the current plan.
         """
         plan, left = found[0], asked.case
         if self.redecide > 0.0:
             fresh = found[1]
-            # [s], time since the last multiple of the period of decisions.
+            # [s], time since the last new decision was due. `_INSTANT` absorbs rounding errors.
             since = jnp.mod(outlook.time + _INSTANT, 1.0 / self.redecide)
             take = (since < 2.0 * _INSTANT) & (fresh.times[0] >= self.planner.shortest)
             take &= is_worth_flying(fresh, plan)
@@ -117,7 +117,10 @@ class CatchPilot:
 
 
 def is_worth_flying(fresh: CatchPlan, warm: CatchPlan) -> Array:
-    """Return whether the plan `fresh`, from scratch, is preferred to the warm-started plan."""
+    """Return whether the plan `fresh`, from scratch, is preferred to the warm-started plan.
+
+    It is if it violates the limits less, or is feasible at a cost at least 5 % lower.
+    """
     return jnp.isfinite(fresh.cost) & is_better(fresh, warm, tolerance=_KEPT, share=_CHEAPER)
 
 

@@ -105,9 +105,10 @@ class HitPilot:
     """The part of the closed loop that replans a hit from the current plan, every period."""
 
     planner: ReplanHit = ReplanHit(ExactHit(drag_after_impact=True))
-    # [s], least time to an impact at which the hit is replanned, since the racket must settle.
+    # [s], least time before an impact at which the hit is replanned. After later changes of the plan
+    # there would be too little time for the tracking error to decay.
     shortest: float = 0.3
-    # Greatest relative violation of a limit at which a new plan is flown.
+    # Greatest relative violation of a limit by a new plan that replaces the current plan.
     excess: float = 0.1
     passage = staticmethod(passage)
 
@@ -137,7 +138,11 @@ class HitPilot:
     def choose(
         self, asked: Replanning[HitCase, HitPlan], outlook: Outlook, found: tuple[HitPlan, ...]
     ) -> tuple[HitPlan, Array]:
-        """Return the found plan, and whether it replaces the current plan."""
+        """Return the found plan, and whether it replaces the current plan.
+
+        It does if the impact is at least `shortest` [s] ahead and no limit is violated by more than
+        the fraction `excess`.
+        """
         (plan,) = found
         left = asked.previous.stroke.time - outlook.elapsed
         good = outlook.present[0] & (left >= self.shortest)
@@ -145,7 +150,7 @@ class HitPilot:
 
 
 def replace_ball(case: HitCase, balls: BallState, drag: Array, head: Array) -> HitCase:
-    """Return a case with the ball `balls` (1, 3), its `drag` (1,), and the robot's state `head`."""
+    """Return a case with the ball `balls` (1, 3), its `drag` (1,), and the start state `head`."""
     ball = jax.tree.map(lambda leaf: leaf[0], balls)
     return dataclasses.replace(case, ball=ball, drag=drag[0], head_state=head)
 
@@ -205,7 +210,6 @@ def reflect_ball(contact: Contact, restitution: Array) -> BallState:
 
 @functools.partial(jax.jit, static_argnames="loop")
 def _predict_cases(loop: Loop, flights: FlightState, truth: HitCase) -> HitCase:
-    """Return cases with estimated instead of true balls, predicted for the plan's start."""
 
     def one(flight: FlightState, case: HitCase) -> HitCase:
         balls = predict_balls(loop, flight.earlier, loop.period)
@@ -215,7 +219,6 @@ def _predict_cases(loop: Loop, flights: FlightState, truth: HitCase) -> HitCase:
 
 
 def _reflect_balls(contact: Contact, truth: HitCase) -> BallState:
-    """Return B balls just after their impacts, arrays (B, 3); NaN for balls that were missed."""
     one = jax.tree.map(lambda leaf: leaf[:, 0], contact)
     balls = jax.device_get(jax.vmap(reflect_ball)(one, truth.restitution))
     return jax.tree.map(lambda leaf: np.where(np.asarray(one.met)[:, None], leaf, np.nan), balls)
@@ -275,7 +278,7 @@ def fly_hits(
 
 
 class HitFlight(BallFlightTask):
-    """Methods by which `run.py` flies, scores and draws the task `hit`, and its settings."""
+    """The task `hit` with settings: how `sims/run.py` simulates, scores and draws its flights."""
 
     settings: HitFly
 

@@ -168,7 +168,7 @@ def remaining(
     speed: Array,
     curvature: Array,
 ) -> InterceptCase:
-    """Return the cases of B drives that remain to be planned after a part of the drives.
+    """Return the cases of B drives that start at the cars' current poses, for replanning.
 
     Args:
         cases: the cases at their start.
@@ -329,11 +329,6 @@ def plan_again(
 def _replace_plans(
     good: Array, old: tuple, found: InterceptPlan, left: InterceptCase, drive: DriveState
 ) -> tuple[DriveState, InterceptCase]:
-    """Replace the plans of the drives in the mask `good` (B,) by `found`; return drives and cases.
-
-    `old` has the current plans, their start times [s] and their cases. `left` has the cases of the
-    new plans.
-    """
 
     def pick(new: Array, before: Array) -> Array:
         return jnp.where(good.reshape(good.shape + (1,) * (new.ndim - 1)), new, before)
@@ -344,7 +339,6 @@ def _replace_plans(
 
 @jax.jit
 def _sample_paths(path: TurningPath, span: Array) -> Array:
-    """Return points (paths, points, 2) [m], equally spaced in time from now to `span` [s]."""
     shares = jnp.linspace(0.0, 1.0, _POINTS)
     of_one = lambda path, span: jax.vmap(lambda share: path.at(share * span).pos)(shares)  # noqa: E731
     return jax.vmap(of_one)(path, span)
@@ -357,11 +351,6 @@ def _collect_drives(
     seen: list[tuple[Array, int]],
     number: np.ndarray,
 ) -> Driven:
-    """Collect the results of finished drives in NumPy arrays.
-
-    `parts` has the simulated frames of each planning period. An entry of `seen` is (target paths
-    as predicted in a period, number of its frames), and `number` (B,) counts executed plans.
-    """
     drive, parts, seen = jax.device_get((dataclasses.replace(drive, key=None), parts, seen))
     frames = jax.tree.map(lambda *leaves: np.concatenate(leaves, axis=1), *parts)
     start = np.asarray(truth.start)[:, None]
@@ -423,7 +412,6 @@ def score(
 
 
 def _group(obstacles: Obstacles) -> dict[str, np.ndarray]:
-    """Return obstacles as arrays for the referee's `clearances`; absent obstacles become zero."""
     present = np.asarray(obstacles.present)
     leaves = {name: np.asarray(getattr(obstacles, name), float) for name in ("centre", "velocity")}
     leaves["corners"] = np.asarray(obstacles.corners, float)

@@ -40,7 +40,7 @@ _WALL_HEIGHT, _MOVER_HEIGHT, _TARGET_HEIGHT = 0.25, 0.2, 0.08  # [m], heights in
 
 
 class InterceptFlight(FlightTask):
-    """Methods by which `run.py` drives, scores and draws the task `intercept`, and its settings."""
+    """The task `intercept` with settings: how `sims/run.py` simulates, scores and draws drives."""
 
     settings: InterceptFly
 
@@ -221,7 +221,10 @@ def _add_height(points: np.ndarray, height: float) -> np.ndarray:
 
 
 def reach_layers(case: InterceptCase) -> list[tuple[float, np.ndarray]]:
-    """Return pairs (time [s], grid points (P, 2) [m] at which the car could be at this time)."""
+    """Return pairs: a time [s], and the grid points (P, 2) [m] where the car could be at that time.
+
+    The car starts as in `case`, keeps its limits and avoids the obstacles; see `search_reach`.
+    """
     search = SEARCHES["given"][0]
     found = jax.device_get(
         jax.jit(lambda case: search_reach(case, search, is_time_free=False))(case)

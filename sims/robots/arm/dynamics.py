@@ -29,7 +29,6 @@ def inverse_dynamics(
     spin_rate = jnp.cumsum(axes * acceleration[:, None] + jnp.cross(spin - added, added), axis=0)
 
     def accelerate_points(arm_to: Array, spin: Array, spin_rate: Array) -> Array:
-        """Return accelerations of points that rotation causes; `arm_to` [m] points to them."""
         return jnp.cross(spin_rate, arm_to) + jnp.cross(spin, jnp.cross(spin, arm_to))
 
     between = positions[1:] - positions[:-1]

@@ -43,7 +43,10 @@ def _arm(xml: str) -> Any:
 
 
 def lanes_of(arm: Arm) -> dict[str, np.ndarray]:
-    """Return an arm's geometry as a batch of one, by names that the referee's kinematics needs."""
+    """Return an arm's geometry as float64 arrays with a batch axis of length one.
+
+    The names, such as "arm.origin", are those that `referee.arm_clearance.links_of` reads.
+    """
     names = ("origin", "turn", "axis", "shield_centre")
     return {f"arm.{name}": np.asarray(getattr(arm, name), float)[None] for name in names}
 
@@ -99,7 +102,6 @@ class ShieldArm:
         return base + "".join(solids[-1]) + chain + 7 * "</body>", motors
 
     def _link(self, k: int) -> str:
-        """Return the opening MJCF tag of link k + 1, with its joint and its inertia."""
         arm = self.arm
         inertia = arm.inertia[k]
         full = [*np.diag(inertia), inertia[0, 1], inertia[0, 2], inertia[1, 2]]
@@ -112,7 +114,7 @@ class ShieldArm:
         )
 
     def at_rest(self, place: Array, gravity: float) -> tuple[Array, Array, Array]:
-        """Return the state at standstill at the joint angles `arm.home`; `place` is ignored."""
+        """Return joint angles `arm.home`, zero rates, and no actuator states; ignore `place`."""
         home = jnp.asarray(self.arm.home, place.dtype)
         return home, jnp.zeros_like(home), jnp.zeros(0, place.dtype)
 
@@ -138,9 +140,9 @@ class ShieldArm:
     def references(self, plan: Course, times: Array, world: World) -> JointReference:
         """Return the references (planned joint states) at K times (K,) [s]; leaves (K, ...).
 
-        MuJoCo's stored rates belong to half a step before the angles, and a torque acts during the
-        next step. Reference rates are shifted by half a step back, accelerations by half a step
-        ahead.
+        MuJoCo's stored rates belong to half a step before the angles, so that the reference rates
+        are taken half a step earlier. A torque acts during the next step, so that the reference
+        accelerations are taken half a step later.
         """
         half = 0.5 * world.timestep
 
@@ -154,7 +156,10 @@ class ShieldArm:
     def command(
         self, state: JointState, reference: JointReference, world: World, mass_error: Any = 0.0
     ) -> Array:
-        """Return the torques (6,) [N m] of the controller, whose masses have a relative error."""
+        """Return the torques (6,) [N m] that track a reference (a planned joint state).
+
+        The controller's masses and inertias are the true ones times 1 + `mass_error`.
+        """
         dtype = state.angles.dtype
         arm = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), self.arm)
         factor = 1.0 + mass_error

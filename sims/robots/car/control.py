@@ -45,7 +45,10 @@ class CarState:
 
 @struct.dataclass
 class Reference:
-    """The car's planned state at one instant, and the planned inputs one actuator lag later."""
+    """The car's planned state at one instant, and inputs planned for one actuator lag later.
+
+    The inputs are acceleration and curvature. They are taken ahead because the actuators lag.
+    """
 
     pos: Array  # (2,) [m], position of the rear axle's centre
     heading: Array  # () [rad]
@@ -58,8 +61,8 @@ class Reference:
 def reference_at(plan: CarPlan, time: Array, vehicle: Vehicle) -> Reference:
     """Return the planned state at a time [s] after the plan's start, and inputs for one lag later.
 
-    A first-order lag delays a ramp by exactly its time constant. Inputs that are taken from one lag
-    ahead therefore arrive in time, as long as they change slowly.
+    The inputs are acceleration and curvature. A first-order lag delays a ramp by exactly its time
+    constant. Inputs from one lag ahead therefore arrive in time, as long as they change slowly.
     """
     knots = plan.time, plan.speed, plan.curvature
     pose = pose_at(plan.start, *knots, time)

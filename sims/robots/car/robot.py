@@ -70,14 +70,13 @@ class Car:
         return text, actuators
 
     def _wheels(self) -> np.ndarray:
-        """Return the centres of the rear wheels and then of the front wheels, (4, 3) [m]."""
         vehicle = self.vehicle
         aside = 0.5 * vehicle.width - 0.015
         ends = [(x, y) for x in (0.0, vehicle.wheelbase) for y in (-aside, aside)]
         return np.array([(x, y, vehicle.wheel_radius) for x, y in ends])
 
     def at_rest(self, place: Array, gravity: float) -> tuple[Array, Array, Array]:
-        """Return pose (3,), rates (3,) and controls (2,) of a car at rest at `place` [m]."""
+        """Return pose (3,), rates (3,) and actuator states (2,) of a car at rest at `place` [m]."""
         none = jnp.zeros(3, place.dtype)
         return none.at[:2].set(place[:2]), none, none[:2]
 

@@ -69,7 +69,10 @@ def with_rest(trajectory: PiecewisePolynomial) -> PiecewisePolynomial:
 def reference_at(
     trajectory: PiecewisePolynomial, time: Array, lag: float, world: World
 ) -> Reference:
-    """Return the planned motion at a time, with command additions that compensate rotor lag."""
+    """Return the planned motion at a time () [s], with additions to the planned commands.
+
+    The additions compensate a first-order lag of the rotors with the time constant `lag` [s].
+    """
     gravity = jnp.asarray(world.gravity, time.dtype)
     order = lambda k, at: evaluate(trajectory, at, k)  # noqa: E731
     pos, vel, acc, jerk = (order(k, time) for k in range(4))

@@ -138,7 +138,8 @@ class Quadrotor:
     def references(self, plan: Any, times: Array, world: World) -> Reference:
         """Return the references (planned states) at K times [s] since the start of a plan.
 
-        A braking piece follows the plan; later times are replaced by a time just before its end.
+        A braking piece follows the plan. Later times are replaced by a time two rotor lags before
+        the end of this piece, because the references look ahead in time.
         """
         path = with_rest(plan.trajectory)
         lag = self.model.rotors.lag
@@ -173,6 +174,5 @@ class Quadrotor:
 
 
 def _circle(centre: np.ndarray, radius: float, segments: int) -> np.ndarray:
-    """Return a closed polygon (segments + 1, 3) [m] around a centre (3,), normal to the z axis."""
     turn = 2.0 * np.pi * np.arange(segments + 1) / segments
     return centre + radius * np.stack([np.cos(turn), np.sin(turn), 0.0 * turn], axis=1)
