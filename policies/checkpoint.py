@@ -2,7 +2,8 @@
 
 A checkpoint is a NumPy archive (`.npz`). It has one array for each weight, named by the weight's
 path in the network. Its entry `about` is a line of JSON with the version number of the format, the
-network and its sizes, the number of features, and the suites and seed of the training.
+network and its sizes, the number of features, and the suites (families of cases) and seed of the
+training.
 """
 
 import dataclasses
@@ -46,7 +47,7 @@ def save_checkpoint(
         path: path of the file.
         params: weights of the network, a pytree of arrays.
         network: a Flax module from `networks`.
-        about: suites and seed of the training, as values that JSON can represent.
+        about: suites (families of cases) and seed of the training, as JSON values.
     """
     name, sizes = name_and_sizes(network)
     head = {"format": FORMAT, "features": FEATURES, "network": name, "sizes": sizes, **about}

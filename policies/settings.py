@@ -70,7 +70,7 @@ class TrainSettings:
 
 
 def usual_iterations(suite: str) -> int:
-    """Return the number of planner iterations for rewards in training on a suite.
+    """Return the number of planner iterations for rewards in training on a suite of cases.
 
     The number is 0 for suites with optional targets, whose rewards come from an estimate of how far
     the quadrotor misses the targets instead of from the planner.

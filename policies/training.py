@@ -90,7 +90,7 @@ class Training:
     minibatches: int = 6  # number of minibatches into which a pass divides the batch
     divergence: float = 0.01  # desired KL divergence of an update, which adapts the learning rate
     entropy: float = 1e-4  # weight of the entropy bonus in the loss of PPO
-    # Weights of the reward terms by name. A weight is one number, or one number for each suite.
+    # Weights of the reward terms by name: one number, or one number for each entry of `suites`.
     weights: tuple[tuple[str, float | tuple[float, ...]], ...] = tuple(WEIGHTS.items())
     init_from: str | None = None  # file or name of a policy with the initial weights
     eval_cases: int = 256  # number of cases of each suite in an evaluation; 0 for no evaluation

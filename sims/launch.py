@@ -204,7 +204,7 @@ def require_world(loop: Loop, kind: str, num_balls: int, **planned: Any) -> None
 
     Args:
         loop: settings of the loop, with the world.
-        kind: required kind of the tool, net or racket.
+        kind: required tool, "net" or "racket".
         num_balls: required number of balls of a flight.
         planned: values, one per case of the plans, of `gravity`, `net_height`, `net_radius`,
             `racket_height` or `racket_radius`; only the passed values are compared.

@@ -33,7 +33,7 @@ class Recording:
     The robot has R joint positions. For a quadrotor these are the position of the propeller plane's
     centre [m] and the quaternion w x y z. A target that drives counts as a ball. Times count from
     the start of the first plan. A value is NaN if a ball is not in flight or never met, if the
-    robot is no longer simulated, or if the flight has no target.
+    robot's simulation has ended, or if the flight has no target.
     """
 
     index: np.ndarray  # (F,), index of the flight in the run
@@ -79,9 +79,9 @@ class Frame(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Launches:
-    """States of N balls of F flights, from which their flight before and after it is computed.
+    """States of N balls of F flights, to compute the parts of their paths outside the simulation.
 
-    MuJoCo simulates a ball only from the plan for it to its contact with the robot.
+    MuJoCo simulates a ball only from the start of the plan for it to its contact with the robot.
     """
 
     balls: BallState  # leaves (F, N, 3), each at the start of the plan for it

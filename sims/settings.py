@@ -29,7 +29,7 @@ _AT_ONCE = 4096  # greatest default number of flights per batch
 # Estimated memory [bytes] of a flight during its simulation, and of its results afterwards.
 _FLIGHT_BYTES, _FLOWN_BYTES = 1_000_000, 4_000
 _FASTEST = 10_000.0  # [Hz], greatest replanning rate
-# Greatest number of balls of a flight, as in the largest suite. Compile time grows with every ball.
+# Greatest number of balls of a flight, chosen because compile time grows with every ball.
 _MOST_BALLS = 12
 INTERVAL = 0.8  # [s], time between two throws [Yu2023catch, Fig. 1]
 

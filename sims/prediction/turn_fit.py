@@ -100,8 +100,8 @@ def tangent(seen: Centred, fit: TurnFit) -> tuple[Callable[[Array], Pair], Array
 def best_turn(seen: Centred, fastest: ArrayLike) -> TurnFit:
     """Fit position, velocity and turn rate to observations.
 
-    JAX can differentiate the result by the observations. Its derivatives are those of the optimum,
-    not of the iterations that find it.
+    JAX can differentiate the result by the observations. The derivatives are exact at the optimum,
+    since the search for the turn rate is not differentiated.
     """
 
     def downhill(rate: Array) -> Array:

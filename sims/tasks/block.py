@@ -172,7 +172,7 @@ class BlockFlight(FlightTask):
 
     @property
     def suite(self) -> str:
-        """The name of the suite of throws."""
+        """The name of the suite, the family of random throws, for the report."""
         return self.settings.suite
 
     @property

@@ -117,7 +117,7 @@ def throws(
     wide: bool = False,
     delay: float = 0.0,
 ) -> Throws:
-    """Draw throws of a suite by `pj.block.draw`.
+    """Draw throws of a suite, "pole", "open" or "short", by `pj.block.draw`.
 
     `regime` names the joint limits of plans: "R1", "R2" or "R3" of `robot.arm.REGIMES`. `wide`
     allows contacts up to 0.1 m from the shield's centre. `delay` [s] is the time from the first

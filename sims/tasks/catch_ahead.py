@@ -157,7 +157,7 @@ class _EveryAttempt(Driver):
     def __call__(
         self, planner: Planner, cases: Any, attempts: Sequence[Attempt] | None = None
     ) -> tuple[Any, Any]:
-        """Run all attempts concurrently, and return the plans of the first attempt."""
+        """Run a planner's attempts concurrently, and return the plans of the first attempt."""
         if planner.kind is not Kind.COMPILED:
             return super().__call__(planner, cases, attempts)
         make = functools.partial(super().__call__, planner, cases)
@@ -170,8 +170,9 @@ class _EveryAttempt(Driver):
 def compile_attempts(planner: Planner, cases: Any) -> None:
     """Compile the programs of all attempts of a planner concurrently, one thread per attempt.
 
-    `plan` compiles an attempt only when the previous attempt has left cases unsolved. Some throws
-    need all attempts, and compiling one after another would take several times as long.
+    An attempt is a search with settings of its own. `plan` compiles it only when the previous
+    attempt has left cases unsolved. Some throws need all attempts, and compiling one after another
+    would take several times as long.
     """
     _EveryAttempt()(planner, cases)
 

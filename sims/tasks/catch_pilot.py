@@ -32,7 +32,7 @@ LIFT = 0.1  # thrust at every catch in initial guesses: 0 is hover, 1 the greate
 
 @dataclasses.dataclass(frozen=True)
 class CatchPilot:
-    """The part of the closed loop that replans catches, with the same or a new order."""
+    """The part of the closed loop that replans catches, and may decide their order again."""
 
     # In the last 0.2 s before a catch the plan is not changed. A change would cost more accuracy
     # than new observations of the ball gain.
@@ -119,7 +119,8 @@ class CatchPilot:
 def is_worth_flying(fresh: CatchPlan, warm: CatchPlan) -> Array:
     """Return whether the plan `fresh`, from scratch, is preferred to the warm-started plan.
 
-    It is if it violates the limits less, or is feasible at a cost at least 5 % lower.
+    If the warm-started plan is feasible, `fresh` must be feasible at a cost that is 5 % lower.
+    Otherwise it is enough that `fresh` violates the limits less.
     """
     return jnp.isfinite(fresh.cost) & is_better(fresh, warm, tolerance=_KEPT, share=_CHEAPER)
 

@@ -105,7 +105,7 @@ class HitPilot:
     """The part of the closed loop that replans a hit from the current plan, every period."""
 
     planner: ReplanHit = ReplanHit(ExactHit(drag_after_impact=True))
-    # [s], least time before an impact at which the hit is replanned. After later changes of the plan
+    # [s], least time before an impact at which the hit is replanned. After later changes of a plan
     # there would be too little time for the tracking error to decay.
     shortest: float = 0.3
     # Greatest relative violation of a limit by a new plan that replaces the current plan.
@@ -329,7 +329,7 @@ class HitFlight(BallFlightTask):
 
     @property
     def suite(self) -> str:
-        """The name of the suite of serves."""
+        """The name of the suite, the family of random serves, for the report."""
         return self.settings.suite
 
     def counts(self, rows: Any) -> dict[str, int]:

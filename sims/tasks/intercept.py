@@ -74,7 +74,7 @@ def meetings(
     """Draw interceptions of a suite, with observations before the start and during the drive.
 
     Args:
-        suite: name of a suite of `pj.intercept.draw`.
+        suite: name of a suite (family of random cases) of `pj.intercept.draw`.
         num: B >= 1, number of interceptions.
         seed: >= 0, of cases and noise.
         noise: [m], standard deviation of an observed coordinate.

@@ -132,7 +132,7 @@ class InterceptFlight(FlightTask):
 
     @property
     def suite(self) -> str:
-        """The name of the suite of interceptions."""
+        """The name of the suite, the family of random interceptions, for the report."""
         return self.settings.suite
 
     @property

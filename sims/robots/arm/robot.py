@@ -188,7 +188,10 @@ class ShieldArm:
         ]
 
     def places(self, pose: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Return positions [m] and quaternions w x y z of base, links and shield at a pose."""
+        """Return positions [m] and quaternions w x y z of base, links and shield.
+
+        `pose` are the joint angles (6,) [rad]; positions are in the world frame.
+        """
         turns, places = links_of(lanes_of(self.arm), np.reshape(pose, (6, 1, 1)))
         base = np.array([0.0, 0.0, self.base_height])
         found = [(base, np.array([1.0, 0.0, 0.0, 0.0]))]

@@ -50,7 +50,7 @@ def tyre_forces(
     own = jnp.stack([along, cos * vel[1] - sin * vel[0], vel[2]])
     pull = jnp.stack([drive + coupling * vel[2] ** 2, jnp.zeros((), dtype), jnp.zeros((), dtype)])
     free = own + timestep * jnp.sum(inverse * pull[None], axis=1)
-    # Directions along both axles in the middle of the step, in the car's frame at its beginning.
+    # Directions along both axles in the middle of the step, in the car's frame before the step.
     half = 0.5 * timestep * vel[2]
     zero, one = jnp.zeros((), dtype), jnp.ones((), dtype)
     front, wheelbase = steering + half, vehicle.wheelbase
