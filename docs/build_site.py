@@ -27,7 +27,11 @@ CODE = re.compile(r"(^```.*?^```)", re.MULTILINE | re.DOTALL)
 
 
 def rewrite_links(text: str, source: str, problems: list[str]) -> str:
-    """Return the page at the path `source` of the repository with the site's links."""
+    """Return the text of a page with links that are relative to its place in the site.
+
+    Links to files that are no pages become plain text. `source` is the path of the page in the
+    repository; messages about links to missing files are appended to `problems`.
+    """
     home = posixpath.dirname(PAGES.get(source) or source.removeprefix("docs/"))
 
     def rewrite(link: re.Match[str]) -> str:
@@ -46,7 +50,7 @@ def rewrite_links(text: str, source: str, problems: list[str]) -> str:
 
 
 def stage_pages() -> list[str]:
-    """Write all pages and pictures into build/pages, and return what is wrong with their links."""
+    """Write all pages and pictures into build/pages; return messages about wrong links or menus."""
     problems: list[str] = []
     menu = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
     shutil.rmtree(STAGE, ignore_errors=True)
@@ -64,7 +68,8 @@ def stage_pages() -> list[str]:
 def public_names(package: str) -> list[str]:
     """Return the full names of the public functions and classes of a package.
 
-    If a module has the name of a function, such as `case`, the function's full name has the module.
+    A function that has the name of a submodule, such as `case`, is named by the module that defines
+    it, because its name in the package would find the submodule.
     """
     module = importlib.import_module(package)
     names = []
@@ -77,7 +82,7 @@ def public_names(package: str) -> list[str]:
 
 
 def write_api() -> None:
-    """Write the API page: every `::: PACKAGE` of docs/api.md with the package's public names."""
+    """Add entries for the public names of each package below its line in the API page."""
     page = STAGE / "api.md"
     lines = []
     for line in page.read_text(encoding="utf-8").splitlines():

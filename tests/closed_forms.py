@@ -6,7 +6,7 @@ from planner_jax.task.hit import court
 
 
 def region_of(x, y):
-    """Return the court region (...) of points: 1 near, 2 far, 3 left, 4 right, 0 none of them."""
+    """Return the court region (...) at x, y [m]: 1 near, 2 far, 3 left, 4 right, or 0 outside."""
     depth, aside = np.abs(x), np.abs(y)
     inside = (depth >= court.DEAD_ZONE) & (depth <= court.HALF_LENGTH) & (aside <= court.HALF_WIDTH)
     middle = np.where(depth < court.NEAR_LINE, 1, 2)

@@ -34,7 +34,7 @@ MOST_MAPPINGS = 40_000
 
 
 def pytest_runtest_teardown(item, nextitem):
-    """Release all compiled programs after a module or slow test, if they use many mappings."""
+    """Release compiled programs after a module or slow test if they use many memory mappings."""
     ends_module = nextitem is None or nextitem.path != item.path
     mappings = Path("/proc/self/maps")
     if (ends_module or item.get_closest_marker("slow")) and mappings.exists():
@@ -90,7 +90,8 @@ SLOW = (
     "cluster",
     *("bench", "benchmark_ipopt", "intercept_oracle"),
 )
-# Test modules beside `test_sims_*` whose code, mostly MJX, Brax or optax, converts array types.
+# Besides `test_sims_*`, modules in which JAX may convert types, because code of MJX, Brax or optax
+# relies on conversions (see `strict_arrays`).
 MIXED = (
     *("policy", "training", "stack", "speed", "bench", "live_loop", "perception"),
     *("plane_prediction", "cli", "snippets", "notebooks"),

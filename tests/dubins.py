@@ -40,7 +40,7 @@ def dubins(start: Array, goal: Array, curvature: Array) -> DubinsPath:
     def same_sense(side: float) -> tuple[Array, Array]:
         x, y = far + side * (sin_a - sin_b), cos_b - cos_a
         straight, heading = _root(x**2 + y**2), jnp.arctan2(y, x)
-        # If the straight line has length zero, its heading is undefined, and both arcs form one.
+        # A straight line of length zero has no heading; both arcs are then one arc (`first`).
         is_arc = straight < 8.0 * jnp.finfo(straight.dtype).eps
         first = jnp.where(is_arc, side * (b - a), heading - side * a)
         last = jnp.where(is_arc, 0.0, side * b - heading)

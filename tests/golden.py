@@ -74,7 +74,7 @@ def differentiate_hits() -> Row:
 
 
 def replan(name: str, suite: str | None, changed: str) -> Row:
-    """Return plans by `pj.replan` at time 0 of earlier plans, with `changed` passed as news."""
+    """Return what `pj.replan` at time 0 makes of plans if the field `changed` is passed again."""
     task = getattr(pj, name)
     cases, planner = task.draw(NUM, suite, seed=SEED), task.planner()
     news = {changed: getattr(cases, changed)}

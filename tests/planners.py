@@ -31,8 +31,6 @@ NUM = 6  # Number of cases in a batch, which fits into the smallest padded batch
 
 @struct.dataclass
 class Place:
-    """A case of the user's task."""
-
     goal: Array  # (2,), position of the goal
     reach: Array  # (), greatest permitted distance from the goal
 
@@ -43,8 +41,6 @@ class Place:
 
 @struct.dataclass
 class Stand(Plan):
-    """A plan of the user's task."""
-
     point: Array  # (2,), the point that is reached
 
 

@@ -8,7 +8,7 @@ from numpy.polynomial import Polynomial
 
 
 def tree(leaves, root="", **optional):
-    """Build nested objects from arrays with dotted names such as "limits.speed", below `root`."""
+    """Build nested objects from arrays by dotted names, "limits.speed", that start with `root`."""
     inside = {k.removeprefix(root): v for k, v in leaves.items() if k.startswith(root)}
     parts = {k.split(".")[0] for k in inside if "." in k}
     plain = {k: v for k, v in inside.items() if "." not in k}
@@ -27,7 +27,7 @@ def flight(leaves, **optional):
 
 
 def cut(path, durations, degree=7):
-    """Split x(t), y(t), z(t) into M pieces with own times; coefficients (M, degree + 1, 3)."""
+    """Return coefficients (M, degree + 1, 3) of a path x(t), y(t), z(t) cut into M pieces."""
     coeffs = np.zeros((len(durations), degree + 1, 3))
     for piece, start in enumerate(np.cumsum(durations) - durations):
         for axis, line in enumerate(path):
@@ -54,7 +54,7 @@ def add(value):
 
 
 def failure(leaves, excess=None, time=None, *accepted, **found):
-    """Return (arrays, expected failure, options of `judge` that accept the plan) of a bad plan."""
+    """Return a bad plan, the expected failure, and options of `judge` that accept the plan."""
     return leaves, {"excess": excess, "time": time, **found}, accepted
 
 

@@ -135,14 +135,13 @@ def test_worst_has_no_derivative():
 
 
 def reference(mode):
-    """Return a function that computes without a kernel what a kernel computes for one flight."""
+    """Return the JAX function that the kernel of a mode, such as "slopes", must agree with."""
 
     def value(*x):
         penalties, worst = integrate_along(ALONG, *x)
         return jnp.sum(penalties), (penalties, worst)
 
     def slopes(*x):
-        """Return the derivatives of each segment's penalties, also by gravity and limits."""
         num = range(3 if mode != "slopes" else 2)
 
         def segment(c, h, given):

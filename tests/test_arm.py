@@ -78,7 +78,7 @@ def everything(arm, angles, velocity=0.0, acceleration=0.0):
 
 @jax.jit
 def move_branches(arm, rotation, middle, velocity, spin):
-    """Return the inverse solutions of N moving poses, and their joint rates [rad/s]."""
+    """Return inverse solutions, and their joint rates [rad/s], of N shields that move and turn."""
 
     def move(rotation, middle, velocity, spin):
         solve = lambda rotation, middle: inverse_kinematics(arm, rotation, middle)  # noqa: E731
@@ -194,7 +194,8 @@ def test_inverse_kinematics_is_right_to_rounding_in_float32():
     angles = some_angles(arm, NUM)
     at = everything(arm, angles)
     assert at.branches.dtype == np.float32 and np.max(at.off[at.found]) < 2e-6
-    # Near a stretched arm or a straight wrist the angles are square roots of rounding errors.
+    # Where the arm is stretched or the wrist straight, joint angles depend on square roots of
+    # numbers near 0, which magnify rounding errors.
     assert np.max(from_the_nearest(at, angles)) < 1e-2
 
 

@@ -29,7 +29,6 @@ def scipy_curve(degree, points):
 
 @functools.partial(jax.jit, static_argnums=(0, 3))
 def sample(degree, points, duration, order):
-    """Evaluate a derivative of a B-spline, as a piecewise polynomial, at `SHARES` of its time."""
     trajectory = b_spline(degree, points, duration)
     times = jnp.asarray(SHARES, points.dtype) * duration
     return jax.vmap(lambda time: evaluate(trajectory, time, order))(times)

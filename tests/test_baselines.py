@@ -61,7 +61,7 @@ def serves_gone_wrong():
 
 
 def generic_hits():
-    """Draw 32 impacts: balls, targets, two components of racket velocity and of thrust."""
+    """Draw 32 impacts: ball, target, racket velocity in y, z [m/s], thrust in x, z [m/s^2]."""
     rng = np.random.default_rng(1)
     ball = BallState(
         pos=rng.uniform([-4.0, -2.0, 0.5], [-1.0, 2.0, 2.5], (32, 3)),
@@ -158,7 +158,6 @@ def test_a_ball_aimed_at_an_angle_leaves_at_it_and_arrives():
 
 
 def test_transition_point_of_an_example_by_hand():
-    """Compute the transition point by hand, from s_mid = (2, 0, 0) and p_alpha = (-3, 1.5, 0)."""
     points = jnp.array([[-4.0, 3.0, 0.0], [-2.0, 0.0, 0.0], [4.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
     point = transition_point(**dict(zip(("start", "hit", "origin", "target"), points, strict=True)))
     np.testing.assert_allclose(point, [-3.0, 1.0, 0.0], atol=1e-6)
@@ -177,7 +176,6 @@ def test_the_serve_comes_from_where_its_flight_began(cases):
 
 
 def first_guess(transition, case):
-    """Return the initial guess of `BatHit`: waypoints, impact, its residual, transition state."""
     bat = BatHit(transition=transition)
     context = bat.prepare(case)
     natural = bat.guesses(context, 1)[0] * jnp.asarray(bat.scale)

@@ -34,9 +34,10 @@ def setting(regime="R2", **scene):
 
 
 def make_library(layout=TINY, regime="R2", homes=1):
-    """Build a library without planning, whose motions turn joints by angles that encode the entry.
+    """Build a library of block motions without planning.
 
-    All shields face +x at x = 0.7 m. The last pair of cells has no motion.
+    Each motion turns all joints by its own small angle, so that tests recognise it. All shields
+    face +x at x = 0.7 m. The last pair of cells has no motion.
     """
     num = layout.num_pairs
     shape = profiles(PIECES, True)[0]
@@ -57,7 +58,7 @@ def tunnels_of(layout):
 
 
 def ball_through(outer, inner, speed=8.0, before=0.6):
-    """Return a ball that passes two points, the first of them `before` [s] later."""
+    """Return a ball that passes the points [m] `outer`, at the time `before` [s], and `inner`."""
     outer, inner = np.asarray(outer), np.asarray(inner)
     span = np.linalg.norm(inner - outer) / speed
     vel = (inner - outer) / span + (0.0, 0.0, 0.5 * GRAVITY * span)
@@ -69,7 +70,8 @@ def ball_through(outer, inner, speed=8.0, before=0.6):
 def test_a_point_of_a_cell_is_in_that_cell(name):
     layout, scene, tunnel = LAYOUTS[name], paper_scene(), tunnels_of(LAYOUTS[name])
     rng = np.random.default_rng(0)
-    # All cells of the outer box are in front of this inner box's face, so no tunnel is cut off.
+    # Every cell of the outer box lies on the outer side of this inner box's face, so that a ball
+    # can come through every whole cell.
     behind: Any = Box(np.array([3.0, 0.0, 0.0]), np.array([4.0, 1.0, 1.0]))
     whole = tunnels(dataclasses.replace(layout, inner=(Face(0, -1, (1, 1)),)), behind, scene.outer)
     sides = (
@@ -110,7 +112,8 @@ def test_tunnels_are_cut_off_where_no_ball_can_come_from():
         assert ahead.min() >= 0.4 - 1e-6 and here.any()
         behind = side * tunnel.outer[~tunnel.is_feasible & (face == place)][..., axis]
         assert behind.max() <= 0.4 + 1e-6
-    # For these shares of pairs, a ball from the middle of the outer cell can pass the inner cell.
+    # Share of pairs (cell of the outer box, cell of the inner box) for which a ball that starts in
+    # the middle of the outer cell can pass the inner cell.
     for name, share in (("A", 0.375), ("B", 11 / 24)):
         assert tunnels_of(LAYOUTS[name]).is_centred.mean() == pytest.approx(share)
 
@@ -179,8 +182,8 @@ def test_one_ball_gets_the_answer_of_a_batch():
 
 def test_statuses_name_the_reason_of_a_failure():
     library = make_library()
-    # The first ball passes the cells y, z > 0 of both boxes. The other balls have no stored motion,
-    # for the reasons in the comments.
+    # The first ball passes a pair of cells that has a motion. No motion fits the other balls, for
+    # the reasons in the comments.
     good = ball_through((1.0, 0.05, 1.2), (0.4, 0.05, 0.8))
     shots = [
         good,
@@ -270,7 +273,7 @@ def test_damaged_files_are_rejected_in_one_line(tmp_path, monkeypatch):
 
 @pytest.fixture
 def counted(monkeypatch):
-    """Let builds store indices of pairs and angles of homes instead of plans; list the pairs."""
+    """Replace the planning of motions by an invented row for each pair of cells; list the calls."""
     calls = []
 
     def plan_pairs(setting, home, tunnel, pairs, old=None):

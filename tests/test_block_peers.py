@@ -35,7 +35,10 @@ def require_peers(*packages):
 
 @jax.jit
 def quickest(turn, rate, stretch):
-    """Sample (400, 3, 6) the bang-bang motion of `stretch` times the least time of all joints."""
+    """Sample (400, 3, 6) a bang-bang motion from rates `rate`, and return the joints' least times.
+
+    The joints turn by the angles `turn` [rad] in `stretch` times the least time of all joints.
+    """
     times = least_times(turn, rate, LIMITS.velocity, LIMITS.acceleration)
     duration = stretch * jnp.max(times)
     motion = bang_bang(jnp.zeros(6), rate, turn, duration, jnp.asarray(LIMITS.acceleration))
@@ -44,7 +47,6 @@ def quickest(turn, rate, stretch):
 
 
 def test_joints_from_rest_take_the_times_of_closed_forms(float64):
-    """Check the least time for an angle d: 2 sqrt(d / a), or d / v + v / a if v is reached."""
     v, a = LIMITS.velocity.astype(float), LIMITS.acceleration.astype(float)
     turn = np.array([0.1, -0.2, 0.0, 1.5, -2.5, 4.0])
     times = quickest(turn, np.zeros(6), 1.0)[1]

@@ -30,7 +30,7 @@ LIKE_OTHERS = (
 
 
 def entries(*, only=ENTRIES, on_host=True, slow=()):
-    """Return a decorator that runs a test for every planner, for some in slow tests only."""
+    """Return a decorator that runs a test for planners by name; `slow` ones in slow tests only."""
     rows = [
         pytest.param(entry, id=name, marks=[pytest.mark.slow] if name in slow else [])
         for name, entry in ENTRIES.items()
@@ -152,7 +152,8 @@ def test_a_second_batch_of_the_same_bucket_is_not_traced_again(entry, traces):
 @pytest.mark.parametrize(
     ("planner", "case", "num"),
     [
-        # Searches with other variables or limits' margins have programs of their own.
+        # `num` is the number of compiled programs: attempts need different programs if they have
+        # other variables or keep another margin from the limits.
         (pj.hit.planner("exact"), pj.hit.draw(1), 3),
         (pj.catch.planner("exact").planner, pj.catch.draw(1), 2),
         (pj.intercept.planner("spacetime"), pj.intercept.draw(1), 1),

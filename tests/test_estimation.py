@@ -16,7 +16,6 @@ NUM = 121
 PERIOD = 0.01  # [s] Time between two observations.
 NOISE = 0.02  # [m] Standard deviation of each observed coordinate.
 
-# All tests with equal shapes and types share these compiled functions.
 predict_one = jax.jit(ekf_predict, static_argnames="flight")
 update_one = jax.jit(ekf_update)
 fly_one = jax.jit(fly, static_argnames="num_steps")

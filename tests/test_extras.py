@@ -122,8 +122,8 @@ def test_excess_and_cost_have_their_closed_forms():
     np.testing.assert_allclose(wall.excess(pos, vel, vel), [-2.0, 1.0, -2.0], atol=1e-12)
     found = pj.Geofence(np.array([-1.0, -1.0, 0.0]), np.full(3, 3.5)).excess(pos, vel, vel)
     np.testing.assert_allclose(found, [0.0, 0.5, -1.0], atol=1e-12)
-    # The positions are inside the zone, farther than 1.25 radii from its centre, and half way
-    # between, where u = 1/2 and the speed limit is doubled.
+    # The speed limit is 2.5 m/s at the first position, inside the zone. Beyond 1.25 radii, at the
+    # second, there is none. At the third, halfway between, it is 5 m/s.
     found = pj.SpeedZone(AT, 2.0, 2.5).excess(pos, vel, vel)
     np.testing.assert_allclose(found, [1.0, -1.0, 0.0], atol=1e-9)
     np.testing.assert_allclose(pj.Dislike(AT, 1.0, 2.0).cost(pos, vel, vel), [1.125, 0.0, 0.0])

@@ -16,7 +16,6 @@ from planner_jax.sims.sensing import specific_energy
 
 WEIGHT = np.array([0.0, 0.0, -GRAVITY])
 
-# All tests with equal shapes and types share these compiled functions.
 step_once = jax.jit(flight.rk4_step)
 fly_eight_steps = jax.jit(functools.partial(fly, num_steps=8))
 drag_free = jax.jit(flight.drag_free_flight)

@@ -42,7 +42,7 @@ lengths_of = jax.jit(jax.vmap(lambda start, goal: dubins(start, goal, CURVATURE)
 
 
 def dubins_from(starts, goals):
-    """Return the lengths (N,) of Dubins paths to poses (N, 3), from one pose or from as many."""
+    """Return the lengths (N,) [m] of Dubins paths to poses (N, 3), from poses (3,) or (N, 3)."""
     with jax.enable_x64(True):
         return np.asarray(lengths_of(np.broadcast_to(starts, goals.shape), goals))
 

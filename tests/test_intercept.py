@@ -102,7 +102,7 @@ def test_a_pose_is_the_integral_of_the_car_s_kinematics(knots, float64):
     np.testing.assert_allclose(found, expected, atol=1e-7)
 
 
-# "early" has the unknowns of "given", and the time.
+# With meet="early" the meeting time is a decision variable, too.
 @pytest.mark.parametrize("meet", [pytest.param("given", marks=pytest.mark.slow), "early"])
 def test_the_gradient_of_the_cost_matches_finite_differences(knots, float64, meet):
     case = double(pj.take(pj.intercept.draw(1, "hard", 5), 0))
@@ -119,7 +119,7 @@ def test_the_gradient_of_the_cost_matches_finite_differences(knots, float64, mee
     assert found.cost > 1.0 and found.violation > 0.0
     steps = 1e-6 * jnp.eye(point.size)
     slopes = [(model(point + step).cost - model(point - step).cost) / 2e-6 for step in steps]
-    # The model holds half the gradient, and neglects changes of the steering's gain.
+    # `gradient` is half the gradient of the cost, and approximate, hence the tolerances.
     scale = np.abs(found.gradient).max()
     np.testing.assert_allclose(2.0 * found.gradient, slopes, rtol=2e-3, atol=2e-3 * scale)
 
@@ -225,7 +225,8 @@ def test_absent_obstacles_and_repeated_corners_change_no_plan(planned, scenes):
     wide = cases.replace(**{name: widen(group, 16, 8) for name, group in groups.items()})
     found = pj.plan(PLANNER, wide)
     np.testing.assert_array_equal(found.status, plans.status)
-    # The order of sums differs. Rounding can lead least squares elsewhere (not so with float64).
+    # More obstacles change the order of sums; the rounding errors lead some searches in float32 to
+    # another optimum.
     assert np.isclose(found.cost, plans.cost, rtol=1e-3).mean() >= 0.8
     ours, theirs = (pj.intercept.judge(each, plans) for each in (wide, cases))
     for name in ("success", "wall_clearance", "mover_clearance"):
@@ -271,7 +272,7 @@ def test_an_early_meeting_is_little_later_than_a_straight_drive(early):
     cases, plans = early
     verdict = pj.intercept.judge(cases, plans)
     assert verdict.success[:2].all() and plans.status[2] == pj.Status.NO_PATH
-    # From 0.5 to 1.5 m/s in 1 s, on 1 m, then at the greatest speed.
+    # Least time: accelerate from 0.5 to 1.5 m/s in 1 s, on 1 m, and then drive at 1.5 m/s.
     distance = np.linalg.norm(plans.meeting - cases.start[:, :2] - [0.15, 0.0], axis=1)
     least = 1.0 + (distance - 0.05 - 1.0) / 1.5
     assert np.all(plans.time[:2] > least[:2])
@@ -294,7 +295,7 @@ def test_a_plan_stays_the_same_for_an_unchanged_target(planned):
     np.testing.assert_allclose(again.meeting, plans.meeting, atol=1e-3)
     before, after = plans.sample(10.0), again.sample(10.0)
     np.testing.assert_allclose(after.pos[:, 0], before.pos[:, 20], atol=1e-4)
-    # The new path is close to the remainder of the old path.
+    # A plan that is made again at 2 s stays near the part of the first plan after 2 s.
     apart = np.linalg.norm(after.pos - before.pos[:, 20:], axis=-1)
     assert np.median(apart) < 0.1
     movers = cases.movers.replace(centre=cases.movers.centre + elapsed * cases.movers.velocity)

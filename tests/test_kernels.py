@@ -1,4 +1,4 @@
-"""Programs for CUDA contain their kernels, unless a switch is off; visible without a GPU."""
+"""Programs that are lowered for CUDA contain the expected kernels; these tests need no GPU."""
 
 import re
 import sys
@@ -20,11 +20,11 @@ from planner_jax.task.catch.default_planner import ExactCatch
 from planner_jax.task.hit.default_planner import ExactHit
 
 LANES = 128
-# Kernels of one round: the table; penalties with slopes, of guesses and of trials; the greatest
-# excesses of a finished plan; and the direction.
+# Number of kernels in one round of the search: one predicts the ball's path, three integrate
+# penalties, one computes L-BFGS directions, one finds the finished plan's greatest excesses.
 ROUND = {"flight_table": 1, "integrate_along": 3, "lbfgs_turn": 1, "greatest_along": 1}
-# Kernels of a gradient: the table and its slopes; penalties' slopes, and their curvature along the
-# adjoint; the inverse of the block of end variables. Products with the Hessian have no kernel.
+# Number of kernels in a gradient: the ball's path and its derivative, first and second derivatives
+# of the penalties, and one inverse of the preconditioner.
 GRADIENT = {"flight_table": 2, "integrate_along": 2, "positive_inverse": 1}
 
 
@@ -66,7 +66,7 @@ def test_a_round_of_hits_contains_its_kernels(gpu):
 
 @pytest.mark.slow
 def test_a_round_of_catches_contains_its_kernels(gpu):
-    """The table has none: its kernel takes one ball a lane, not one for each target."""
+    """The kernel of the flight table computes one ball for each case, but a catch has several."""
     held = kernels_in(round_of(ExactCatch()), pj.catch.draw(LANES, "throws"))
     assert held | {"flight_table": 1} == ROUND and "flight_table" not in held
 
@@ -104,7 +104,6 @@ def test_without_triton_programs_have_no_kernels_and_the_doctor_reports_it(gpu, 
 def test_a_wrong_value_of_the_switch_raises_one_line(monkeypatch):
     monkeypatch.setenv(kernels.SWITCH, "no")
     line = "^PLANNER_JAX_KERNELS must be one of on, off, got 'no'$"
-    # The last one is called before a command does anything.
     for call in (lambda: small()(X), kernels.kernels, require_backend):
         with pytest.raises(ArgumentError, match=line):
             call()

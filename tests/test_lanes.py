@@ -1,4 +1,4 @@
-"""`over_lanes` equals `jax.vmap` with the lanes last, for any function."""
+"""`over_lanes` returns the same as `jax.vmap` with the batch axis last, for any function."""
 
 import functools
 

@@ -1,4 +1,4 @@
-"""L-BFGS: directions of the textbook, known minima, and the status of ended searches."""
+"""L-BFGS: search directions of a textbook, known minima, and statuses at the end of a search."""
 
 import functools
 
@@ -43,7 +43,7 @@ def test_known_minimum_is_found(float64, cost):
 
 
 def two_loop_by_the_book(steps, changes, grad):
-    """Return the direction of [Nocedal2006, algorithm 7.4]; pairs are listed oldest first."""
+    """Return the direction of [Nocedal2006, algorithm 7.4]; the oldest step is the first."""
     q, alphas = grad.copy(), []
     for s, y in zip(reversed(steps), reversed(changes), strict=True):
         alphas.append(s @ q / (y @ s))

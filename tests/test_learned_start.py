@@ -1,4 +1,4 @@
-"""Learned starts: their benefit, and the fallback without them."""
+"""First guesses by a neural network: their benefit, and searches without a network."""
 
 import dataclasses
 

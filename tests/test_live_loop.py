@@ -118,7 +118,7 @@ def test_a_throw_is_caught_along_a_smooth_course_and_nothing_is_compiled(warm, p
     at = np.argmin(np.abs(times - contact))
     pos, thrust = answers[at].column("pos")[0], answers[at].column("acc")[0] + [0, 0, 9.81]
     net = pos + 0.2 * thrust / np.linalg.norm(thrust)
-    # The net's radius, and the distance that the ball moves in STEP.
+    # Tolerance [m]: the radius of the net, and the distance of the ball's flight in one STEP.
     assert np.linalg.norm(net - ball) < 0.125 + 0.06
     positions, speeds = first_column(answers, "pos"), first_column(answers, "vel")
     jumps = np.diff(positions, axis=0) - 0.5 * STEP * (speeds[1:] + speeds[:-1])

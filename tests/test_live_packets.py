@@ -1,4 +1,4 @@
-"""Packets of a live loop, and their selection."""
+"""Packets between a live planning server and its client: format, order, and rejected packets."""
 
 import struct
 
@@ -97,7 +97,7 @@ def test_packets_in_order_count_and_others_do_not():
     found, arrivals = faults(marks)
     assert found == [0, 0, Fault.OUT_OF_ORDER, Fault.DUPLICATE, 0]
     assert arrivals.newest == 1.03
-    # A sender may start to count anew.
+    # The packet numbers of a sender may restart at 1, if its clock continues.
     found, _ = faults([(900, 1.0, 9.0), (1, 1.5, 9.5), (2, 1.6, 9.6)])
     assert found == [0, 0, 0]
 

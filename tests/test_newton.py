@@ -1,4 +1,4 @@
-"""Newton's method in a subspace: closed forms, limit cases, and a batch against its lanes."""
+"""Newton's method in a subspace: closed forms, limit cases, and batches against single cases."""
 
 import dataclasses
 import functools
@@ -166,8 +166,6 @@ def of_cost(cost):
 
 
 def test_the_search_does_not_end_just_before_a_limit():
-    """The Newton step on the flat side is a hundred times the distance to the optimum."""
-
     def cost(x):  # a steep penalty starts at x = 0.02, just before the optimum
         slope = 1e-6 * jnp.sum((x - 2.0) ** 2) + 1e-5
         return slope + 10.0 * jnp.sum(smooth_hinge(x - 0.02, 0.05))
@@ -180,13 +178,12 @@ def test_the_search_does_not_end_just_before_a_limit():
     assert found.stationary
     assert found.point[0] > 0.02
     assert abs(slope(found.point)[0]) < 0.1 * abs(slope(start)[0])
-    # The short steps alone would look like convergence.
     hasty = search(objective, start, dataclasses.replace(config, trusted=1e4), curved)
     assert hasty.stationary and hasty.point[0] < 0.02
 
 
 def test_steps_continue_by_the_slope_where_costs_are_equal():
-    """All costs are 1 in float32, their slopes are exact."""
+    """All costs round to 1 in float32, so only the slopes show where the minimum is."""
 
     def cost(x):
         return 1.0 + 1e-9 * jnp.sum((x - 3.0) ** 2)

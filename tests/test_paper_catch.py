@@ -48,7 +48,7 @@ def run_longer():  # the slowest of the 240 rows takes 181 to 217 steps, dependi
 
 
 def excess(planner):
-    """Return relative excess over the published optima, time errors, cases and plans."""
+    """Return excess costs over the published optima, errors of catch times [s], cases and plans."""
     (easy, published), (hard, of_hard) = map(rows, NAMES)
     cases = jax.tree.map(lambda *leaves: np.concatenate(leaves), easy, hard)
     plans = pj.plan(planner, cases)
@@ -82,7 +82,8 @@ def test_converged_costs_are_the_published_optima():
     first = np.append(np.arange(4), len(gap) // 2 + np.arange(4))  # rows of both files
     np.testing.assert_allclose(gap[first], 0.0, atol=1e-4)
     np.testing.assert_allclose(late[first], 0.0, atol=1e-3)
-    # The penalties are soft: the protocol's tolerance is 5 %, and its net is a ball.
+    # Like the published protocol, the referee permits an excess of 5 %, and accepts any ball within
+    # the net's radius of the net's centre.
     cases, plans = pj.take(cases, first), pj.take(plans, first)
     verdict = referee_catches(cases, plans, tolerance=0.05, net_test="ball")
     assert verdict.success.all(), [verdict.sentence(k) for k in np.flatnonzero(~verdict.success)]

@@ -1,4 +1,4 @@
-"""Smoothing of paths: gradients, a decreasing cost, fixed ends, and paths returned unchanged."""
+"""Smoothing of paths: gradients, a lower cost, fixed ends, and paths that are not changed."""
 
 import functools
 
@@ -94,13 +94,13 @@ def test_terms_have_their_closed_forms(float64):
     nothing, settings = walls_of([]), path_smoothing.Smoothing()
     line = np.stack([np.arange(9.0), np.zeros(9)], axis=1)
     assert cost(line, 1.0, nothing) == 0.0
-    # A right angle between steps of 0.5 m: two displacements of one unit that differ by sqrt(2).
+    # A right angle between steps of 0.5 m. The two unit vectors along the path differ by sqrt(2).
     steps = 0.5 * np.arange(-4.0, 5.0)
     corner = np.stack([np.minimum(steps, 0.0), np.maximum(steps, 0.0)], axis=1)
     excess = np.pi / 2 - CURVATURE * 0.5
     expected = settings.curvature * excess**2 + settings.smoothness * 2.0
     assert cost(corner, 0.5, nothing) == pytest.approx(expected)
-    # 0.2 m above an edge of a wall, in units of 0.1 m.
+    # The line is 0.2 m from a wall; `cost` measures distances in units of 0.1 m.
     wall = walls_of([[(-9.0, -1.0), (9.0, -1.0), (9.0, 0.0), (-9.0, 0.0)]])
     found = cost(line + [0.0, 0.2], 0.1, wall)
     assert found == pytest.approx(settings.obstacle * 9 * (5.0 - 2.0) ** 2)

@@ -72,7 +72,7 @@ def test_the_covariance_is_that_of_many_fits():
 
 
 def test_the_estimate_is_that_of_polynomials():
-    """With equal weights, x, y and z plus the fall are lines in time [Natarajan2024, eq. 8]."""
+    """With equal weights, lines in time fit x, y and z + g t^2 / 2 [Natarajan2024, eq. 8]."""
     places = draw_positions(1, np.random.default_rng(1))[0]
     fit = fit_one(TIMES, places, 1.0, GRAVITY)
     assert fit.status == flight_fit.Sight.SEEN and fit.num == NUM

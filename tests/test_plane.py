@@ -103,8 +103,6 @@ def test_a_turning_path_is_a_circle_and_a_line_without_turning(float64):
         np.testing.assert_allclose((ahead - behind) / 2e-6, path.at(1.0).vel, rtol=1e-7)
 
 
-# A reach set of a map of 8 m by 8 m.
-
 LATTICE = reach.Lattice(layers=20)
 STEP = 10.0 / 19.5  # [s], from layer to layer
 
@@ -136,7 +134,7 @@ def upright(low, high):
 def test_a_reach_set_meets_a_target_ahead_no_sooner_than_the_greatest_speed_allows():
     is_met = find_layers((5.3, 4.0))
     first = np.argmax(is_met)
-    # 4.5 m at no more than 1.5 m/s, from 0.5 m/s.
+    # The car drives 4.5 m, starts at 0.5 m/s and may drive at 1.5 m/s, so 3 s are a lower bound.
     assert is_met.any() and 3.0 <= (first + 0.5) * STEP <= 4.2
     assert is_met[first:20].all()  # it may arrive later, too
 
@@ -153,7 +151,8 @@ def test_a_mover_blocks_a_goal_while_it_covers_it():
     goal = (4.0, 4.0)
     assert not find_layers(goal, movers=[lid]).any()
     leaving = find_layers(goal, movers=[lid], velocities=(0.0, 0.5))
-    # Its edge, with the car's half width, is past the goal after (1 + 0.16) / 0.5 s.
+    # The obstacle extends 1 m beyond the goal. At 0.5 m/s it frees a car of 0.16 m half width after
+    # (1 + 0.16) / 0.5 s.
     assert leaving.any() and (np.argmax(leaving) + 0.5) * STEP >= 2.0
     coming = find_layers(goal, movers=[np.array(lid) + [0.0, 3.0]], velocities=(0.0, -0.5))
     times = (np.arange(21) + 0.5) * STEP
@@ -174,7 +173,7 @@ def test_a_distance_field_interpolates_distances_and_returns_its_own_derivatives
     np.testing.assert_allclose(far[outside], exact[outside], atol=0.0625**2 / (4.0 * 0.1))
     assert np.all(far >= exact - 1e-3) and np.all(far[exact < -0.1] < 0.0)
     step = 1e-6
-    # Inside a cell, so that both points are on one bilinear piece.
+    # Use points inside of cells, because the interpolation has kinks at the borders of cells.
     inner = np.all(np.abs(np.mod([x / spacing, y / spacing], 1.0) - 0.5) < 0.49, axis=0)
     for slope, (right, up) in zip(slopes, step * np.eye(2), strict=True):
         change = near(x + right, y + up)[0] - near(x - right, y - up)[0]

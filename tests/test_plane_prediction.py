@@ -1,4 +1,4 @@
-"""Predictions of targets in the plane: fits, the choice among them, their covariance, the bound."""
+"""Predicted target positions: fits, selection of a model, covariance, and Cramer-Rao bound."""
 
 import functools
 
@@ -57,7 +57,6 @@ def draw_targets():
     return positions[:, -1], positions[:, :-1] + rng.normal(0.0, NOISE, (NUM, 15, 2))
 
 
-# Compiled once for all tests of equal shapes and dtype.
 @jax.jit
 def fits(times, seen, weights):
     return [fit_polynomial(times, seen, degree, weights) for degree in (1, 2, 3)]
@@ -125,7 +124,7 @@ def test_absent_observations_have_no_effect():
     cubic = fits(times, seen, weights)[2]
     expected = np.polyfit(TIMES[present], seen[present], 3)
     np.testing.assert_allclose(at(cubic, AHEAD), expected.T @ AHEAD ** np.arange(3, -1, -1.0))
-    # Neither the order of the others nor the values of these observations matter.
+    # Another order of observations, and other values of the absent ones, give the same prediction.
     other = np.isin(TIMES, TIMES[present]).astype(float)
     wild, order = noisy(TURN), np.random.default_rng(3).permutation(15)
     wild[other == 0.0] = 9.0
@@ -162,12 +161,13 @@ def test_half_and_nine_tenths_of_the_targets_are_within_the_predicted_radii():
     found = [predict_one(TIMES, seen, truth=truth) for truth, seen in targets]
     nearer = np.array([chances[1] for _, _, chances, _, _ in found])
     for half in np.split(nearer, 2):
-        # Three standard errors of a share of 150.
+        # Tolerances are three standard errors of a share of 150 targets.
         assert np.mean(half <= 0.5) == pytest.approx(0.5, abs=0.12)
         assert np.mean(half <= 0.9) == pytest.approx(0.9, abs=0.075)
     straight, turning = np.split(np.array([chosen.is_turning for chosen, *_ in found]), 2)
     assert straight.mean() < 0.05 and turning.mean() > 0.9
-    # The mean over all turn rates errs by less in the square than the path of the median.
+    # The mean of the predicted positions over all turn rates has a smaller mean squared error than
+    # the position at the median turn rate.
     off = np.linalg.norm(np.array([mean for *_, mean, _ in found]) - draw_targets()[0], axis=1)
     assert np.mean(off**2) < np.mean(np.square([error for *_, error in found]))
 

@@ -17,7 +17,7 @@ from planner_jax.ball.prediction_kernel import table_kernel
 HORIZON, NUM_NODES = 1.5, 13  # ten intervals of 0.15 s between time 0 and the horizon
 RESOLUTION = 0.15
 
-# Compiled once for all tests of equal shapes and dtype; "many" have a row of times.
+# Compiled functions that tests share. `many_targets` takes an array of times (T,).
 predict = jax.jit(functools.partial(prediction.predict_path, num_nodes=NUM_NODES))
 many_targets = jax.jit(jax.vmap(prediction.target_at, in_axes=(None, 0)))
 step_once = jax.jit(rk4_step)

@@ -1,4 +1,4 @@
-"""Cores, threads and kind of the processor; rows do not depend on the number of cores."""
+"""Number of cores and threads that commands use, on which the rows of a run must not depend."""
 
 import os
 import sys

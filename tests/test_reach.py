@@ -1,4 +1,4 @@
-"""What limits rule out: a bound that no plan can beat, and cases that are given up at once."""
+"""Bounds on how far a robot can move under its limits, and cases that these bounds exclude."""
 
 import dataclasses
 

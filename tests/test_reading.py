@@ -1,4 +1,4 @@
-"""Batches: `pj.take`, `pj.are_solved`, verdicts on single cases, and draws that continue."""
+"""Parts of batches: `pj.take`, `pj.are_solved`, single verdicts, and draws from a later case on."""
 
 import jax
 import jax.numpy as jnp
@@ -48,7 +48,7 @@ def test_solved_is_read_from_the_status():
     resident = pj.are_solved(jax.tree.map(jnp.asarray, plans))
     assert isinstance(resident, np.ndarray) and resident.tolist() == good.tolist()
     assert pj.are_solved(pj.take(plans, 1)) and not pj.are_solved(pj.take(plans, 4))
-    # Broken, blocked, unreachable or too distant cases are unsolved, but need no further attempt.
+    # `is_unsolved` is true for INFEASIBLE, MAX_STEPS and OUT_OF_REACH: another attempt may help.
     assert is_unsolved(status).tolist() == [False, False, True, True, False, True, *5 * [False]]
 
 
@@ -101,7 +101,7 @@ def test_without_a_name_the_first_suite_is_drawn(task):
 
 
 def test_a_real_scenario_has_its_two_of_the_court_in_equal_shares():
-    """Balls of scenario S.1 start in region F and land in N or F; their targets are in N."""
+    """Scenario S.1 serves from the far region F to N (near) or F, and has its targets in N."""
     cases = jax.tree.map(np.asarray, pj.hit.draw(200, "S.1"))
     assert REAL_SCENARIOS["S.1"] == ("FNN", "FFN")
     _, point = landing(cases.ball.pos, cases.ball.vel, cases.drag, cases.gravity)

@@ -23,7 +23,8 @@ PIECES = (0.3, 0.6)
 ARM = jax.tree.map(lambda leaf: np.asarray(leaf, float), irb1600())
 HOME, THICKNESS = ARM.home, 0.01
 COEFFS, DURATIONS = "plan.motion.coeffs", "plan.motion.durations"
-# Coefficients of the fifth-order polynomial from 0 to 1 that begins and ends at rest.
+# Coefficients of polynomials from 0 to 1 in time / duration: with standstill at both ends, and with
+# standstill at the start only.
 REST_TO_REST, FROM_REST = (0.0, 0.0, 0.0, 10.0, -15.0, 6.0), (0.0, 0.0, 1.0)
 
 
@@ -44,7 +45,7 @@ def shield(angles):
 
 
 def angles_for(middle, normal):
-    """Solve for the angles of a shield's pose, with the last joint near its home angle."""
+    """Return joint angles of a shield pose, with the last joint within 45 degrees of home."""
 
     def off(angles):
         rotation, place = shield(angles)
@@ -238,7 +239,8 @@ def test_an_arm_may_move_at_the_contact_if_the_case_does_not_require_rest():
         assert_good(leaves, contact_tolerance=1e-7)
     leaves["ends_at_rest"][:] = True
     assert_fails(leaves, "rest", part=STEEP)
-    # An arm at rest may wait for the ball, whether the case requires rest or not.
+    # An arm that arrives early may wait, whether the limits require standstill at the contact (R3)
+    # or not (R1).
     for regime in ("R1", "R3"):
         assert_good(good(regime=regime, durations=(0.2, 0.4)))
 
@@ -333,14 +335,15 @@ def solids_of(angles):
 
 
 def brute_clearances(angles, scene):
-    """Return the least clearance of each kind, from the distances of all pairs of solids."""
+    """Return the least distances [m] from floor, pole, rig, base and itself, over all solids."""
     arm = solids_of(angles)
     pole = (np.array([*scene.pole[0], 0.0]), [np.array([0.0, 0.0, 5.0])], scene.pole_radius[0])
     rods = zip(scene.beam_ends[0], scene.beam_radius[0], strict=True)
     beams = [segment(*ends, radius) for ends, radius in rods]
     low, high = ARM.base_box
     base = (0.5 * (low + high), list(0.5 * np.diag(high - low)), 0.0)
-    # The radius of link 4 at which it touches the shield while the wrist is straight.
+    # With a straight wrist the capsule of link 4 would touch the shield, so that the check of the
+    # arm with itself uses a radius at which they just touch.
     wrist, plate = solids_of(np.zeros(6))[5], solids_of(np.zeros(6))[8]
     thin = min(wrist[3], gap((*wrist[1:3], 0.0), plate[1:]))
     found = {
@@ -432,7 +435,6 @@ def unequal_lanes():
     return [good(), *failed, good(durations=(0.05, 0.06)), good(durations=(0.1, 0.3)), good()]
 
 
-# Arguments of the tests in `test_referees`.
 FAILED = ["", "tilt", "time", "self", "velocity", "velocity", ""]
 UNREAD = {"arm.home", "arm.mass", "arm.centre", "arm.inertia"}  # for dynamics, and the home pose
 UNKNOWN = ("miss", "pole_clearance")

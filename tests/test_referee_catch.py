@@ -366,7 +366,6 @@ def test_caught_targets_are_counted_and_none_is_caught_by_a_broken_plan():
 
 FALL = Polynomial([9.0, 0.0, -0.5 * GRAVITY])
 PERIOD = TIMES[1] / 4  # the two pieces that are not flown do not count
-# Arguments of the tests in `test_referees`.
 FAILURES = {
     **{
         f"head state: derivative {k}": failure(

@@ -193,7 +193,8 @@ def test_a_peak_between_samples_is_found_on_the_polynomial():
 
 @pytest.mark.parametrize("centre", [0.30321, 0.6004, 0.8999])
 def test_a_narrow_peak_of_the_body_rate_is_found_where_the_thrust_nearly_vanishes(centre):
-    # tau = (5 t, 0.3, 40 (t - centre)^2 + 0.5): the attitude turns fast near the centre.
+    # The thrust per unit mass is (5 t, 0.3, 40 (t - centre)^2 + 0.5). It is short near `centre`, so
+    # the attitude turns fast there.
     leaves = volley()
     rise = (40.0 * (TIME - centre) ** 2 + 0.5 - GRAVITY).integ(2) + 1.5
     path = cut([(5.0 * TIME).integ(2), Polynomial([0.3]).integ(2), rise], [IMPACT_TIME])
@@ -203,7 +204,8 @@ def test_a_narrow_peak_of_the_body_rate_is_found_where_the_thrust_nearly_vanishe
 
 
 def test_a_thrust_that_changes_sign_between_samples_turns_the_quadrotor_over():
-    # tau_z = 1 - 4 t with almost no horizontal component: the body rate is zero at every sample.
+    # The vertical thrust per unit mass is 1 - 4 t, and the horizontal one nearly zero. The body
+    # rate is therefore zero at all samples, and huge between two of them.
     leaves = volley()
     rise = (1.0 - 4.0 * TIME - GRAVITY).integ(2) + 3.0
     path = cut([Polynomial([2e-9]).integ(2), Polynomial([0.0]), rise], [0.33])
@@ -257,7 +259,6 @@ def spoil(edits, *found, **options):
     return failure(edit(volley(), edits), *found, **options)
 
 
-# Arguments of the tests in `test_referees`.
 good = volley
 FAILURES = {
     **{

@@ -126,7 +126,6 @@ def test_acceleration_is_that_of_the_steepest_piece_and_the_root_mean_square_of_
 
 
 def test_lateral_acceleration_peaks_inside_of_a_piece():
-    """Check v = v_0 (1 - u), kappa = kappa_0 u: max v^2 kappa = 4/27 v_0^2 kappa_0 at u = 1/3."""
     speed, curvature = np.zeros(KNOTS), np.zeros(KNOTS)
     speed[:4], curvature[4:] = 1.5, -2.0
     leaves = good(speed, curvature)
@@ -144,7 +143,6 @@ def test_lateral_acceleration_peaks_inside_of_a_piece():
     [(-0.5, 1.5, 0.0, 0.25), (0.4, 1.2, 0.4, 0.0), (-1.2, -0.4, 0.4, 1.0)],
 )
 def test_steering_is_fastest_where_the_curvature_is_least(first, second, least, place):
-    """Check the rate of delta = atan(L kappa), L kappa' / (1 + (L kappa)^2)."""
     curvature = np.array([first] * 3 + [second] * (KNOTS - 3))
     leaves = good(SPEED, curvature)
     for name in ("limits.lateral_acceleration", "tolerance"):
@@ -187,7 +185,8 @@ def test_a_mover_is_hit_at_its_position_and_time():
     assert assert_good(passing).mover_clearance[0] == pytest.approx(0.05)
     hit = good(**still, movers=([square(7.0, 1.0, 0.2), square(x, y - 0.05, 0.2)], way * 2))
     verdict = assert_fails(hit, "mover", excess=0.05, says="inside movers[1]")
-    # As soon as the overlap along the car exceeds 0.05 m, the depth is measured to the side.
+    # The depth is the shortest way out of the overlap. It is 0.05 m, to the side, once the overlap
+    # along the car is longer.
     assert verdict.failed_time[0] == pytest.approx(2.0 - 0.35 / 0.5, abs=0.02)
     convoy = good(movers=([square(START[0] + FRONT + 0.3, 4.0, 0.2)], [(SPEED, 0.0)]))
     assert assert_good(convoy).mover_clearance[0] == pytest.approx(0.1)
@@ -204,7 +203,7 @@ def random_polygon(random, most=6):
 
 
 def test_clearances_are_the_greatest_gap_in_any_direction():
-    """Check distance and depth of convex sets, max over unit u of (min u.b - max u.a)."""
+    """Compare with the greatest gap between the projections on 2,881 directions."""
     random = np.random.default_rng(0)
     lanes, samples, num = 40, 5, 3
     half = np.tile([0.2, 0.125], (lanes, 1))
@@ -315,7 +314,6 @@ def unequal_lanes():
     ]
 
 
-# Arguments of the tests in `test_referees`.
 FAILED = ["", "wall", "mover", "meeting", "time", ""]
 UNKNOWN = ("miss",)
 ABSURD = ("plan.speed", "plan.curvature", "plan.time", "plan.start", "target.vel", "walls.centre")

@@ -24,7 +24,7 @@ CURVED = np.array([[3.0, 1.0, 0.2], [1.0, 2.0, 0.0], [0.2, 0.0, 1.0]])
 
 @struct.dataclass
 class Bowl:
-    """cost = u^T A u / 2 - u^T b - k u_0, least at u = A^-1 (b + k e_0)."""
+    """A case with the cost u^T A u / 2 - u^T b - k u_0 of a plan u, A = `CURVED`."""
 
     b: jax.Array  # (3,)
     k: jax.Array  # ()
@@ -86,7 +86,7 @@ def test_gradient_of_a_quadratic_is_the_closed_form(bowls, options):
 
 
 def test_the_gradient_is_nan_where_the_hessian_is_not_positive(bowls):
-    """A maximum has no derivative as a minimum; the direct part alone would be zero."""
+    """Use a negative weight, so that the planner's point is a maximum of the cost."""
     planner = BowlPlanner(weight=-1.0, rounds=(pj.Round(1, pj.LbfgsConfig(max_steps=0)),))
     found = pj.gradient(planner, bowls, of=lambda plan: plan.point[0], by="b")
     assert np.isnan(found.by["b"]).all() and np.isnan(found.residual).all()
@@ -102,7 +102,6 @@ def test_gradient_of_the_cost_needs_no_adjoint(bowls):
 
 
 def test_an_optimal_plan_has_the_same_gradient_forward_and_backward(bowls):
-    """u = A^-1 (b + k e_0): du/db is A^-1, and du/dk its first column."""
     with pytest.raises(ValueError, match=r"must be one case, got batch shape \(5,\)"):
         optimal_plan(BowlPlanner(), bowls)
     bowl = jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), bowls)

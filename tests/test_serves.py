@@ -158,7 +158,8 @@ def test_the_published_serves_are_read_with_their_rates():
     assert len(serves) == 9000
     np.testing.assert_array_equal(np.bincount(serves.scenario), np.full(36, 250))
     np.testing.assert_allclose(serves.target, court.target_of(serves.scenario))
-    # 250 of the 1,000 trials of each scenario: the means are near, not equal.
+    # The serves are a quarter of all trials, so their success rates differ slightly from the rates
+    # of all trials.
     rates = 100.0 * serves.published.mean(axis=0)
     np.testing.assert_allclose(rates, read_published_rates().trials.mean(axis=0), atol=1.0)
 
@@ -214,7 +215,8 @@ def test_serves_start_and_land_in_their_regions():
     assert (x > 0.0).all() and (z == suites.SERVE_HEIGHT).all()
     np.testing.assert_array_equal(region_of(x, y), regions[:, 0])
     point = floor_points(serves.position, serves.velocity)
-    # A landing point within the error of the two integrations of a line may fall beyond it.
+    # `floor_points` and the generator integrate the flight with different errors, so a landing
+    # point near the border of a region may be up to 1 mm outside.
     shifts = 1e-3 * np.array([(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)])[:, None]
     near = region_of(*np.moveaxis(point[:, :2] + shifts, -1, 0))
     assert (near == regions[:, 1]).any(axis=0).all()
@@ -259,7 +261,7 @@ def test_generated_serves_are_distributed_as_the_published_ones():
     levels = [0.05, 0.25, 0.5, 0.75, 0.95]
     for name in np.unique(pair):
         a, b = ours[pair[generated.scenario] == name], theirs[pair[published.scenario] == name]
-        # The serves of one pair of regions stand in three or four files: 250 different ones.
+        # Scenarios with equal regions of serve and landing share their 250 different serves.
         share = np.stack([(b <= q).mean(axis=0) for q in np.quantile(a, levels, axis=0)])
         assert np.abs(share - np.array(levels)[:, None]).max() < 0.1, name
     np.testing.assert_allclose(ours.mean(axis=0), theirs.mean(axis=0), atol=0.035)

@@ -67,7 +67,7 @@ def test_the_error_of_a_flight_fitted_to_images_matches_its_estimated_error(scen
     cases = pj.block.draw(1, "short", seed=1)
     ball = jax.tree.map(lambda leaf: leaf[0], cases.ball)
     noise = stereo_noise()
-    # The last part of the flight, where this small image has enough pixels of the ball.
+    # Only late in the flight does the ball cover enough pixels of this small image.
     times = jnp.arange(10) / 30.0 + 0.4
     places = jax.vmap(drag_free_flight, (None, 0, None))(ball, times, GRAVITY).pos
     seen = measure_balls(scene, np.asarray(places), noise, ball_thresholds(), seed=3)

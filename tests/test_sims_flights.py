@@ -130,8 +130,8 @@ class Outcome:
 @pytest.mark.parametrize(
     ("pair", "alone", "chosen"),
     [
-        # Violations for each limit of the body rate, and the result: whether both balls are
-        # planned, and the limit.
+        # `pair`, `alone`: greatest body rate [rad/s] -> violation of a plan for both balls, or for
+        # one. `chosen`: whether both balls are planned, and the selected greatest body rate.
         ({3.0: 0.02, 4.5: -0.1}, {3.0: -0.1}, (True, 4.5)),
         ({3.0: 0.3, 4.5: 0.2, 5.0: 0.05}, {3.0: -0.1}, (True, 5.0)),
         ({3.0: 0.3, 4.5: 0.2, 5.0: 0.15}, {3.0: -0.1}, (False, 3.0)),
@@ -156,7 +156,7 @@ def test_the_next_ball_is_given_up_only_where_no_limits_admit_both(
 
 
 def in_lab(num_balls):
-    """Return a loop with the noise and latency of a lab, which replans the catches of balls."""
+    """Return a closed loop with the noise and latency `lab`, which plans again at 100 Hz."""
     world = dataclasses.replace(CATCH_WORLD, num_balls=num_balls)
     return Loop(world, NOISES["lab"], replan=100.0)
 

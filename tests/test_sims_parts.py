@@ -106,7 +106,6 @@ def test_the_flat_body_rate_is_the_rate_of_the_flat_attitude():
 
     @jax.jit
     def compare_rates(t, step):
-        """Return the rotation per time in a step, and the mean of the body rates at its ends."""
         now, then = (
             flat_attitude(acc(t), jax.jacfwd(acc)(t), jnp.asarray(9.81)) for t in (t, t + step)
         )
@@ -212,7 +211,7 @@ def test_court_and_machine_are_visible_and_touch_nothing(world):
 
 
 def moments(gap_before, gap_after, aside):
-    """Return a level tool at rest at the origin, and one ball over it before and after a step."""
+    """Return the states before and after a step: a tool at the origin, a ball above or below it."""
     tool = [jnp.zeros(3)] * 3 + [jnp.array([0.0, 0.0, 1.0])]
     vel = jnp.array([[0.0, 0.0, -5.0]])
     places = (jnp.array([[aside, 0.0, NET.height + gap]]) for gap in (gap_before, gap_after))

@@ -1,4 +1,4 @@
-"""`plan` with a toy planner without physics: rounds, packing, padding and statuses."""
+"""`pj.plan` with a toy planner: later rounds for unsolved cases, padded batches and statuses."""
 
 import dataclasses
 

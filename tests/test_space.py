@@ -23,7 +23,7 @@ every_distance = pytest.mark.parametrize("name", DISTANCES)
 
 
 def gap_of(name, bodies):
-    """Return the gap of two bodies as first + columns @ shares, for shares from 0 to 1."""
+    """Return the vector between points of two bodies, first + columns @ x with x in [0, 1]."""
     if name == "segments":
         (a, a_end), (b, b_end) = bodies
         return a - b, [a_end - a, b - b_end]
@@ -102,7 +102,8 @@ def test_a_distance_is_the_least_over_all_points_in_float32(name, kind):
     bodies = pairs(name, kind)
     value, slopes = measure(name)(*bodies)
     np.testing.assert_allclose(value, least_distances(name, bodies), atol=2e-6)
-    # A distance changes by no more than the bodies move, also if they touch or are parallel.
+    # The gradient with respect to all coordinates has at most the length sqrt(2), also if bodies
+    # touch or are parallel.
     for slope in slopes:
         assert np.isfinite(slope).all()
         assert (np.linalg.norm(slope.reshape(NUM, -1), axis=1) <= np.sqrt(2.0) + 1e-5).all()
@@ -178,7 +179,6 @@ def test_crossing_bodies_have_exactly_zero_distance_and_gradient(name):
 
 
 def test_a_segment_nearly_along_an_edge_of_a_box_is_exact_in_float32_too():
-    """A kink that rounding misses would shift the nearest point by a tenth of the segment."""
     rng = np.random.default_rng(0)
     ends = rng.uniform(-1.0, 1.0, (1000, 2, 3)) * [0.9, 4e-4, 4e-4] + [0.0, 0.3, 0.1]
     upper = np.broadcast_to(np.asarray([0.6, 0.3, 0.1], np.float32), (1000, 3))
@@ -187,7 +187,6 @@ def test_a_segment_nearly_along_an_edge_of_a_box_is_exact_in_float32_too():
 
 
 def test_an_upright_rectangle_does_not_reach_a_line_beyond_its_end():
-    """The projection has no area, so that areas cannot decide whether the line is outside."""
     rng = np.random.default_rng(0)
     angle, roll = rng.uniform(0.0, 6.0, 1000), rng.uniform(0.0, 1.5, (1000, 1))
     along = np.stack([np.cos(angle), np.sin(angle), np.zeros(1000)], axis=1)

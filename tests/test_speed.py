@@ -97,7 +97,6 @@ def test_problems_without_a_solution_have_a_status_and_do_not_change_others(plan
 @pytest.mark.slow
 @pytest.mark.usefixtures("float64")
 def test_the_gradient_of_the_cost_matches_finite_differences():
-    """Dynamic programming decides the side of each polygon, which has no derivative."""
     case = jax.tree.map(lambda leaf: leaf[1], speed_problems(4, dtype=np.float64))
     plan = jax.tree.map(np.asarray, jax.jit(plan_speed)(case))
     assert plan.status == Status.CONVERGED and plan.iterations >= 1

@@ -1,4 +1,4 @@
-"""The graph of station and time: the line through it, and corridors beside it."""
+"""Search in a graph of time and station (distance along a path), and corridors beside obstacles."""
 
 import itertools
 
@@ -79,7 +79,7 @@ def depth(problems, k, times, station):
 
 
 def best_by_trying(problems, k):
-    """Return the least cost of all allowed sequences of jumps, checked every millisecond."""
+    """Return the least cost of all sequences of grid stations that are free and keep limits."""
     limits = problems.speed_limit[k]
     times = np.linspace(0.0, 10.0, 10001)
     least = np.inf
@@ -113,7 +113,7 @@ def test_an_empty_graph_has_the_straight_line_and_a_full_one_has_none():
     wall = problem([(3.0, 4.0, (-1.0, -1.0), (7.0, 7.0))])
     fast = problem(speed_limit=(9.0, 0.2, 9.0))
     cases = pad(free, wall, fast)
-    # This grid, 6 stations in 5 steps, lacks the straight line; a finer grid has it.
+    # `GRID`, with 6 stations and 5 steps, does not contain the straight line; this finer grid does.
     straight = jax.jit(lambda p: reference_line(p, StationTimeGrid(10, 5, 3)))(free)
     np.testing.assert_allclose(straight.station, np.linspace(0.0, 6.0, 6), atol=1e-12)
     np.testing.assert_allclose(straight.cost, 0.0, atol=1e-12)
@@ -128,7 +128,7 @@ SHARES = np.linspace(0.0, 1.0, 9)
 @jax.jit
 @jax.vmap
 def around(problem, station):
-    """Return, by kind, corridors of five pieces and bounds (5, 9) at nine shares of each piece."""
+    """Return corridors of five pieces by kind, and their bounds (5, 9) at `SHARES` of a piece."""
     kinds = {kind: corridor(problem, station, 5, kind) for kind in ("tilted", "edges", "flat")}
     return {kind: (found, found.bounds(SHARES)) for kind, found in kinds.items()}
 

@@ -27,7 +27,7 @@ from planner_jax.task.hit.spec import REAL_SCENARIOS
 TASK = pj.task_named("hit")
 open_source = HitSweep(TASK).open_source
 NUM, BATCH = 84, 13  # chunks and single cases are planned by one program, for up to 16
-# Half of these fail: late, and with one short round.
+# Half of these cases fail, because planning starts late and makes one short round of search.
 SETTINGS = HitSettings(num=NUM, batch=BATCH, delay=0.8, seed=3)
 FAILED = "failed,failed,failed"
 
@@ -132,7 +132,7 @@ def test_resuming_with_another_setting_names_it(finished):
 
 
 def test_a_serve_drawn_late_that_breaks_a_rule_leaves_nothing_behind(tmp_path):
-    # The first chunk holds no ball that is down by then; a later one does.
+    # All balls of the first chunk fly for longer than `delay`, but not all balls of later chunks.
     settings = HitSettings(num=40, batch=4, delay=1.56, seed=0)
     open_source(settings.of(TASK), batch=4).check()
     with pytest.raises(pj.ArgumentError, match="delay must be shorter than each serve's flight"):

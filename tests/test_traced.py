@@ -1,4 +1,4 @@
-"""Traced programs are stored on the disk, and read only where nothing that made them changed."""
+"""Traced programs are stored on the disk, and used until something they depend on changes."""
 
 import dataclasses
 import json
@@ -44,7 +44,7 @@ NUMBERS = jnp.ones(3)
 
 
 def call(static=None, numbers=NUMBERS, pair=PAIR, function=scale):
-    """Call the function as a new process would, with no program in memory."""
+    """Call the function through a new `Stored`, which holds no program in memory."""
     return traced.Stored(function)("cpu", static, numbers, pair)
 
 

@@ -12,7 +12,7 @@ from planner_jax.host import signals
 
 @contextlib.contextmanager
 def quick_sweeps(is_reported: bool = False) -> Iterator[None]:
-    """Let sweeps plan in one round, with a second planner and a figure only if `is_reported`."""
+    """Let sweeps use quick planners, without figures and a second planner unless `is_reported`."""
     import pytest
 
     from planner_jax.sweep.catch.sweep import CatchSweep

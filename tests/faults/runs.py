@@ -76,9 +76,10 @@ def make_training(out: Path) -> None:
 
 
 def verdict(place: Path, target: str, name: str, random: Any, scratch: Path) -> str:
-    """Damage a file, named by a pattern, in a copy of the run of `target`, "RUN:READER".
+    """Damage one file in a copy of a run folder, and return what a reader of the folder does.
 
-    Return the reader's outcome, IDENTICAL, REFUSED or MENDED; otherwise raise `AssertionError`.
+    `target` is "RUN:READER" and `name` a pattern of files in the folder. The outcome is IDENTICAL,
+    REFUSED or MENDED; any other behaviour raises `AssertionError`.
     """
     which, _, reader = target.partition(":")
     shutil.copytree(place / which, scratch)
@@ -161,7 +162,8 @@ def _load(place: Path, out: Path) -> str | None:
 
 
 _READERS = {"report": _report, "resume": _resume, "view": _view, "curves": _curves, "load": _load}
-# Name of the damaged files -> pairs of "RUN:READER" and a pattern of files in the run's folder.
+# Name of a group of files -> pairs of "RUN:READER" (a small run, and the program that reads it) and
+# a pattern of the files in the run's folder that are damaged.
 TARGETS = {
     "manifest": [("whole:report", "manifest.json"), ("whole:resume", "manifest.json")],
     "manifest of an interrupted run": [("begun:resume", "manifest.json")],

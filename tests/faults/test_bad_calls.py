@@ -27,12 +27,10 @@ def zeros(*shape):
 
 
 def pieces(num, degree, dimensions):
-    """Return motions with pieces of a tenth of a second that stay in place."""
     return pj.PiecewisePolynomial(zeros(num, degree + 1, dimensions), zeros(num) + np.float32(0.1))
 
 
 def make_plans():
-    """Return two plans of every task."""
     whole = np.zeros(2, np.int32)
     of_all = {"cost": zeros(), "violation": zeros(), "iterations": whole, "status": whole}
     flown = {**of_all, "gravity": zeros() + np.float32(9.8)}
@@ -49,7 +47,7 @@ def make_plans():
 
 
 def having(tree, name, value):
-    """Replace a leaf, named with dots, of a case."""
+    """Return a copy of a case in which the leaf `name`, such as "limits.speed", is `value`."""
     first, _, rest = name.partition(".")
     inner = having(getattr(tree, first), rest, value) if rest else value
     return dataclasses.replace(tree, **{first: inner})
@@ -113,7 +111,7 @@ def given(tmp_path_factory):
 
 
 def refuse(given, call):
-    """Return the line with which the library itself rejects a call."""
+    """Return the one-line error of a call, raised by the library's own argument checks."""
     folder, names = given
     before = os.getcwd()
     os.chdir(folder)

@@ -1,4 +1,4 @@
-"""Absurd cases in a batch are marked, and the plans of other cases are unchanged bit for bit."""
+"""Cases of a batch that break a rule are recognised, and change no plan of another case."""
 
 import dataclasses
 

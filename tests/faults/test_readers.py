@@ -1,4 +1,4 @@
-"""Damaged files are rejected with one line, mended, or read as if they were whole."""
+"""Damaged run files are rejected with one line, planned again, or read without any difference."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""Signals end a command with their own code and a line, whatever its threads do."""
+"""A signal ends a command with its own exit code and one line, even if other threads are busy."""
 
 import signal
 import subprocess
@@ -15,7 +15,6 @@ import os, signal, sys, time
 from planner_jax.host import signals as stopping
 stopping.listen()
 """
-# Scripts of commands that are ready for a signal.
 READY = 'print("ready", flush=True)'
 NOTHING_UNDER_WAY = f"{READY}\ntime.sleep(30.0)"
 CHECKING = f"""
@@ -40,7 +39,7 @@ NUMBERS = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
 
 def stop_script(script, *numbers, ignored=()):
     """Send signals to a script when it is ready; return its exit code and output."""
-    # Under `nohup` the children of the tests inherit that SIGHUP is ignored.
+    # Set every handler, because the script would inherit from `nohup` that SIGHUP is ignored.
     heard = {number: "SIG_IGN" if number in ignored else "SIG_DFL" for number in NUMBERS}
     before = "".join(
         f"import signal; signal.signal({int(n)}, signal.{how})\n" for n, how in heard.items()

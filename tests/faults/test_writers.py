@@ -27,7 +27,7 @@ class Killed(BaseException):
 
 
 def failing(monkeypatch, number, error):
-    """Let the write with this number fail before its file is renamed; return a count of writes."""
+    """Let the write number `number` fail before its file is renamed; return a counter of writes."""
     real, count = os.replace, [0]
 
     def replace(*names):
@@ -84,7 +84,7 @@ def test_a_failed_write_names_file_option_and_how_to_resume(runs, tmp_path, monk
 
 
 def test_files_that_may_not_grow_are_told_of(runs, tmp_path):
-    """Limit the size of files to a value between the smallest part of a run and the others."""
+    """Limit the size of files such that only the smallest file of `plans/` can be written."""
     out, before = tmp_path / "run", resource.getrlimit(resource.RLIMIT_FSIZE)
     small, other, *_ = sorted(path.stat().st_size for path in (runs / "whole/plans").iterdir())
     resource.setrlimit(resource.RLIMIT_FSIZE, ((small + other) // 2, before[1]))
