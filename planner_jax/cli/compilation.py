@@ -17,7 +17,7 @@ BATCH = 64  # number of cases of the batch whose programs are listed
 # Tasks whose default planners are examined, with a suite if it is not the task's default suite.
 _EXAMINED = ("hit", "catch throws", "catch triangle3", "intercept hard", "block")
 _SMALL = 0.05  # [s] programs that compile faster have no row, and only count in the sums
-# Fields of `Program` that hold the durations of JAX's events /jax/core/compile/NAME_duration.
+# NAME of JAX's event /jax/core/compile/NAME_duration -> field of `Program` that sums its durations.
 _EVENTS = dict(jaxpr_trace="tracing", jaxpr_to_mlir_module="lowering", backend_compile="compiling")
 _HEAD = (
     "| planner | cases | program | versions | equations | tracing [s] | lowering [s] "
@@ -69,7 +69,11 @@ def record_programs() -> Iterator[dict[str, Program]]:
 
 
 def format_rows(planner: str, num: int, seconds: float, programs: dict[str, Program]) -> list[str]:
-    """Format a planner's rows of the table of compile times, the slowest first, the sums last."""
+    """Format the table rows of one planner: a row for each slow program, then a row of sums.
+
+    `num` is the number of cases that were planned together, and `seconds` how long the first plan
+    took. A program that compiles in less than 0.05 s has no row of its own.
+    """
     columns = zip(*map(dataclasses.astuple, programs.values()), strict=True)
     shown = [row for row in programs.items() if row[1].compiling >= _SMALL]
     shown.sort(key=lambda row: -row[1].compiling)

@@ -1,7 +1,7 @@
 """Parsers of the command line; a command's options are the fields of its dataclass of settings.
 
-The metadata of a field have `help`, the text on the option, and `metavar`, the word that stands for
-its value. `planner_jax.runs.settings.option` makes such fields.
+In the metadata of a field, `help` is the help text of its option, and `metavar` the word that
+stands for the option's value. `planner_jax.runs.settings.option` makes such fields.
 """
 
 import argparse
@@ -44,8 +44,8 @@ class Parser(argparse.ArgumentParser):
     """An argument parser that reports a bad argument in one line.
 
     Args:
-        fill: function that adds the parser's options; it is called when the parser is used. Options
-            that the user leaves out are then missing in the result, instead of None.
+        fill: function that adds the parser's options; it is called when the parser is used. With
+            it, options that the user omits are missing in the result; without it they are None.
         **look: further arguments of `argparse.ArgumentParser`.
     """
 

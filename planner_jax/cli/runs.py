@@ -1,4 +1,4 @@
-"""Commands that write or read run folders: `sweep`, `fly`, `train`, `report`, `compare`, ..."""
+"""Commands on folders of sweeps, flights or trained policies: `sweep`, `fly`, `report`, ..."""
 
 import contextlib
 import datetime

@@ -66,7 +66,7 @@ def _write_answer(single: "Single", answer: "Answer", out: Path, rate: float | N
     written = [out / "plan.npz"]
     answer.plan.save(written[0])
     if answer.success:
-        # A plan that has a recovery trajectory already is exported unchanged with "brake".
+        # "brake" exports the stop at the end, too: the plan's own recovery trajectory, unchanged.
         how = {"rate": rate, "recovery": None if answer.plan.recovery is None else "brake"}
         written.append(export(answer.plan, to="csv", out=out / "setpoints.csv", **how))
     written += write_pictures(single.task, str(single.settings.planner), answer, out)

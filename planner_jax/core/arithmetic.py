@@ -14,7 +14,7 @@ from numpy.typing import DTypeLike
 
 
 def host_leaf(value: object, dtype: DTypeLike | None = None) -> Array:
-    """Return a value as a NumPy array, with the declared type of array fields, a jax array."""
+    """Return a value as a NumPy array, which type checkers take for a jax `Array`."""
     return np.asarray(value, dtype)  # type: ignore[return-value]
 
 

@@ -28,7 +28,7 @@ def format_shapes(tree: PyTree) -> str:
 
 
 def require_number(name: str, value: object, rule: Rule = FINITE) -> None:
-    """Raise unless an argument is one finite number that keeps a rule; jax scalars always pass."""
+    """Raise unless `value` is a finite number that keeps `rule`; jax scalars are not tested."""
     number = require_scalar(name, value)
     if not isinstance(number, jax.Array) and not all(r.holds(number, None) for r in (FINITE, rule)):
         words = rule.words if rule is FINITE else f"{FINITE.words} and {rule.words}"
@@ -180,11 +180,7 @@ def require_path(
 
 @functools.lru_cache(maxsize=256)
 def _shape_of_positions(tree: PyTree, layout: tuple, axes: tuple[int, ...]) -> tuple[int, ...]:
-    """Return the shape of the positions that the method `at` of paths returns.
-
-    `tree` is the tree structure of the paths, `layout` the shape and type of each leaf, and `axes`
-    their batch shape. The result is cached, because tracing `at` is slow.
-    """
+    """Return the shape of the positions that `at` returns; cached, because tracing `at` is slow."""
 
     def at(path: _Path, time: Numbers) -> PyTree:
         state = path.at(time)

@@ -69,7 +69,7 @@ class ArgumentTypeError(ArgumentError, TypeError):
 
 
 class CaseError(ArgumentError):
-    """A number of a case breaks a rule; `index` is the first such case of the batch."""
+    """A number of a case breaks its field's rule, such as "> 0"; `index` is the first such case."""
 
     _where = "in lane"
 

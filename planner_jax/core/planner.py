@@ -27,7 +27,7 @@ PlanT = TypeVar("PlanT", bound=Plan)
 
 
 class Kind(enum.Enum):
-    """The method by which a planner makes its plans."""
+    """How a planner makes plans: by a compiled function, on the host, or by other planners."""
 
     COMPILED = "compiled"  # `solve`, a pure function of one case
     HOST = "host"  # `solve_on_host`, a function of a batch of NumPy arrays
@@ -35,7 +35,7 @@ class Kind(enum.Enum):
 
 
 class Drive(Protocol):
-    """The function with which the method `plan_by` of a planner runs other planners."""
+    """Function with which the method `plan_by` of a composite planner calls other planners."""
 
     @property
     def is_pure(self) -> bool:
@@ -44,16 +44,16 @@ class Drive(Protocol):
 
     @property
     def is_over(self) -> bool:
-        """True if the caller's time limit has passed, after which no attempt may start."""
+        """True if the caller's time limit has passed, after which no search may start."""
         ...
 
     def __call__(
         self, planner: "Planner", cases: PyTree, attempts: Sequence[Attempt] | None = None
     ) -> tuple[PyTree, PyTree]:
-        """Plan a batch by the listed attempts of a planner, or by default by all its attempts.
+        """Plan a batch by the listed attempts (searches) of a planner, by default by all of them.
 
         Returns:
-            The plans, and an array or a number that is zero everywhere if all cases are solved.
+            The plans, and either a count of unsolved cases or a bool array of which are unsolved.
         """
         ...
 
@@ -71,8 +71,8 @@ class Drive(Protocol):
 class Planner(Generic[CaseT, PlanT]):
     """A planner of one class of cases.
 
-    A subclass implements one of `solve`, `solve_on_host` and `plan_by`, which determines its
-    `kind`. The other methods are optional; methods without a default raise an error.
+    A subclass implements one of the methods of `Kind`: `solve`, `solve_on_host` or `plan_by`. The
+    other methods are optional; methods without a default raise an error.
     """
 
     kind: ClassVar[Kind | None] = None
@@ -93,11 +93,11 @@ class Planner(Generic[CaseT, PlanT]):
 
     @property
     def attempts(self) -> Sequence[Attempt]:
-        """The attempts, in order; each is made at the cases that are still unsolved."""
+        """The attempts (settings of a search), in order; each is for cases still unsolved."""
         return (Attempt(),)
 
     def load_attempt(self, attempt: PyTree, cases: CaseT, /) -> PyTree:
-        """Convert an attempt to the pytree that the compiled `solve` takes as its second argument.
+        """Convert an attempt (settings of a search) to the second argument of the compiled `solve`.
 
         By default each attempt is static, and compiles a program of its own. Attempts that are
         pytrees of the same structure share one program; see the module `core.compiled`. The method
@@ -106,16 +106,17 @@ class Planner(Generic[CaseT, PlanT]):
         return Fixed(attempt)
 
     def divides(self, attempt: PyTree, /) -> bool:
-        """Return whether `pj.plan` runs each search of an attempt as a separate problem.
+        """Return whether `pj.plan` runs an attempt's search from each start as its own problem.
 
         Only an `OptimisedPlanner` has such attempts.
         """
         return False
 
     def compiles_quickly(self, attempt: PyTree, /) -> bool:
-        """Return whether the program of an attempt at one case is compiled in less time on a CPU.
+        """Return whether a CPU compiles an attempt's program for one case with `QUICK_OPTIONS`.
 
-        The program may then run slower. By default only a sequential planner compiles slowly.
+        These options save compile time, but the program may run slower. By default all planners use
+        them except those with `is_sequential`.
         """
         return not self.is_sequential
 
@@ -125,11 +126,11 @@ class Planner(Generic[CaseT, PlanT]):
         return self
 
     def solve(self, case: CaseT, attempt: PyTree, /) -> PlanT:
-        """Return the plan that one attempt makes for one case; pure."""
+        """Return the plan of one case by the search that `attempt` specifies; pure."""
         raise NotImplementedError
 
     def solve_lanes(self, cases: CaseT, attempt: PyTree, /) -> PlanT:
-        """Return the plans that one attempt makes for a batch; pure."""
+        """Return a batch's plans by one attempt (search), in turn on CPUs if `is_sequential`."""
         if not self.is_sequential:
             return self.solve_at_once(cases, attempt)
         in_turn = functools.partial(solve_in_turn, lambda case: self.solve(case, attempt))
@@ -140,11 +141,11 @@ class Planner(Generic[CaseT, PlanT]):
         return in_turn(cases) if platform == "cpu" else at_once(cases)
 
     def solve_at_once(self, cases: CaseT, attempt: PyTree, /) -> PlanT:
-        """Return the plans that one attempt makes for a batch, all cases together; pure."""
+        """Return the plans of a batch by one attempt (search), by default with `jax.vmap`; pure."""
         return jax.vmap(lambda case: self.solve(case, attempt))(cases)
 
     def solve_on_host(self, cases: CaseT, attempt: PyTree, /) -> PlanT:
-        """Return the plans that one attempt makes for a batch; cases and plans in NumPy arrays."""
+        """Return a batch's plans by one attempt (search); cases and plans are in NumPy arrays."""
         raise NotImplementedError
 
     def plan_by(self, drive: Drive, cases: CaseT, /) -> PlanT:
@@ -152,7 +153,7 @@ class Planner(Generic[CaseT, PlanT]):
         raise NotImplementedError
 
     def starts_long(self, cases: CaseT) -> bool:
-        """Return whether the first attempt at these cases is already a long search."""
+        """Return whether the first attempt (search) takes long, as `DecidedPlanner` must know."""
         return False
 
     def replanner(self) -> "Planner":
@@ -178,11 +179,11 @@ class Planner(Generic[CaseT, PlanT]):
     def settle(
         self, cases: CaseT, plan_of: Callable[["Planner", PyTree], PyTree] | None = None
     ) -> "tuple[PyTree, PyTree]":
-        """Return an `OptimisedPlanner`, and the cases with decisions such as an order of targets.
+        """Return a planner that minimises a cost, and the cases with all open decisions taken.
 
-        The decisions are taken from plans that `plan_of` makes of cases by a planner. By default
-        they are the first proposals of the planner. The function is then pure and makes no plan,
-        and derivatives treat the decisions as constants.
+        An open decision is, for example, the order of targets. `plan_of(planner, cases)` makes
+        plans, from which the decisions are taken. Without it the planner's first proposals are
+        taken; the method is then pure and makes no plan. Derivatives treat decisions as constants.
 
         Raises:
             TypeError: the planner does not minimise a cost.
@@ -238,7 +239,7 @@ def require_planner(planner: object) -> None:
 
 
 def require_fit(planner: Planner, cases: object) -> None:
-    """Raise unless a planner is a pytree with attempts, and the cases are of its `case_type`."""
+    """Raise unless `planner` is a pytree with at least one attempt, for cases of this class."""
     require_planner(planner)
     if jax.tree_util.all_leaves([planner]) and planner.kind is not Kind.HOST:
         rule = "a pytree: put @jax.tree_util.register_static over its frozen dataclass, or make it "

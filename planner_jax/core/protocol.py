@@ -79,7 +79,12 @@ FEASIBILITY_TOLERANCE = 5e-4
 
 
 def status_of(cost: Array, violation: Array, stationary: Array | bool) -> Array:
-    """Return the `Status` of a plan from its cost, violation and stationarity, () int32."""
+    """Return the `Status` of a plan from its cost, violation and stationarity, () int32.
+
+    The status is NON_FINITE if cost or violation is not finite. A plan whose violation is at most
+    `FEASIBILITY_TOLERANCE` is CONVERGED if stationary, else FEASIBLE. Any other plan is INFEASIBLE
+    if stationary, else MAX_STEPS.
+    """
     feasible = violation <= FEASIBILITY_TOLERANCE
     status = jnp.where(
         feasible,
@@ -170,7 +175,7 @@ def require_attempts(name: str, value: object, kind: type) -> None:
 
 @dataclasses.dataclass(frozen=True)
 class Attempt:
-    """One try of a planner at the cases that earlier attempts left unsolved; static under jit."""
+    """Settings of one search for cases that earlier attempts left unsolved; static under jit."""
 
     starts: int = 1  # number of starting points from which each case is solved
     # Greatest violation of a case's plan with which the attempt is made; None means no bound.
@@ -182,7 +187,7 @@ class Attempt:
             require_number("within", self.within, POSITIVE)
 
     def is_due(self, plans: "Plan") -> Array:
-        """Return for which of the existing plans this attempt should be made, bool."""
+        """Return which plans need this attempt, bool: unsolved, and violation <= `within`."""
         unsolved = is_unsolved(plans.status)
         return unsolved if self.within is None else unsolved & (plans.violation <= self.within)
 
@@ -199,7 +204,7 @@ class Decision(Protocol):
     """
 
     def check(self, cases: PyTree, /) -> None:
-        """Raise `ArgumentError` for a batch that the rule cannot decide; called on the host."""
+        """Raise `ArgumentError` on the host if the rule does not apply to these cases."""
 
     def propose(self, case: PyTree, /) -> PyTree:
         """Return F choices for a case, best first; each array of the pytree is (F, ...); pure."""
@@ -252,7 +257,7 @@ def are_solved(plans: Plan) -> np.ndarray:
 
 
 def mark_bad_input(plans: PlanT, cases: PyTree) -> PlanT:
-    """Return plans with the status `BAD_INPUT` where a number of the case breaks a rule; pure."""
+    """Return plans with status `BAD_INPUT` for cases with NaN or out-of-range numbers; pure."""
     if not has_rules(cases):
         return plans
     status = numpy_of(plans.status).where(is_sound(cases), plans.status, Status.BAD_INPUT)

@@ -144,7 +144,11 @@ def suite_named(name: object, default: str) -> str:
 def split_name(
     known: Collection[str], kind: str, name: object, from_file: Collection[str] = ()
 ) -> tuple[str, str]:
-    """Split a name such as "policy:FILE" into the known name and file, or raise `UnknownName`."""
+    """Split a name such as "policy:FILE" into ("policy", "FILE"), or raise `UnknownName`.
+
+    The first part must be in `known`; only a name in `from_file` may have a file. `kind`, such as
+    "planner", stands in the error message.
+    """
     own, _, file = name.partition(":") if isinstance(name, str) else (name, "", "")
     own = require_name(known, kind, own)
     if own != name and own not in from_file:
@@ -187,7 +191,8 @@ def all_tasks() -> dict[str, Task]:
 def _other_entries(kind: str, task: str, own: Collection[str]) -> dict[str, metadata.EntryPoint]:
     """Return the entry points by which other packages add planners or suites to a task, by name.
 
-    `kind` is "planners" or "suites". A name in `own`, the task's own names, gives a warning.
+    `kind` is "planners" or "suites". An entry with a name in `own`, the task's own names, is left
+    out with a warning.
     """
     found = {}
     for entry in metadata.entry_points(group=f"{_GROUP}.{kind}"):

@@ -152,7 +152,7 @@ def require_sound(cases: object, names: Mapping[str, str] | None = None) -> None
 def require_rule(
     name: str, value: Numbers, holds: Numbers, words: str, batch: tuple[int, ...], other: str = ""
 ) -> None:
-    """Raise `CaseError` for the first case whose number `value` breaks a rule.
+    """Raise `CaseError` for the first case with a number `value` at which `holds` is false.
 
     `value` and `holds` have the shape batch + shape. `words` states the rule, and `other` names the
     array with which the value is compared.

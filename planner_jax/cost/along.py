@@ -21,7 +21,7 @@ from planner_jax.lanes import with_kernel
 from planner_jax.trajectory.polynomial import Motion
 from planner_jax.trajectory.proportional_minco import ProportionalMinco, sample_motion
 
-BETWEEN_NODES = 0.004  # typical difference of the excess at a peak and at the nearest sample
+BETWEEN_NODES = 0.004  # typical excess at a peak minus the excess at the nearest sample
 
 # An `Excess` is a function of samples of a motion and of a pytree of numbers. It returns an array
 # for each of E limits, with the shape of the motion's height, positive where the limit is exceeded.
@@ -35,9 +35,10 @@ class Along:
     """Constants of a planner that define its penalties: the integrand and the quadrature.
 
     The penalty of a trajectory's segment is the integral, by the trapezoid rule, of the weighted
-    smoothed hinges of excess + margin, plus the integral of the rate if there is one. There are E
-    limits and K samples of a segment. C columns (scaled states at both ends, and whitened waypoint
-    offsets) and h, the mean duration of a piece, define the segment.
+    smoothed hinges of excess + margin, plus the integral of `rate`, if given. E is the number of
+    limits, K the number of samples of a segment, and h the mean duration of its pieces. A segment
+    is given by h and C columns: scaled states at both ends, and whitened waypoint offsets (scaled
+    deviations of waypoints from the smoothest trajectory).
     """
 
     maps: ProportionalMinco
@@ -70,7 +71,10 @@ class Along:
         return f"Along{(*shape, *code, *hinges, self.rate is None, self.orders)}"
 
     def matrices(self) -> np.ndarray:
-        """Return matrices (K, orders, C) from C columns to the motion at K samples, for h = 1 s."""
+        """Return matrices (K, orders, C) from C columns to position, velocity, ... at K samples.
+
+        The mean duration of a piece is h = 1 s.
+        """
         each = [self.maps.sample_matrix(self.nodes, d) for d in range(self.orders)]
         return np.stack(each, axis=1)
 

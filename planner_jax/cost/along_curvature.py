@@ -134,7 +134,7 @@ def block_and_diagonal(
 
     Returns:
         block: (E, 3, E, 3), all second derivatives by the first E variable columns.
-        diagonal: (C - E, 3), second derivatives by each component of the other columns, twice.
+        diagonal: (C - E, 3), d^2/dx^2 by each component x of the other columns.
     """
     among = [(c, f) for c in range(num) for f in range(num)]
     alone = [(c, c) for c in range(num, _constants(along, given).num_moving)]
@@ -147,11 +147,6 @@ def block_and_diagonal(
 def _at_samples(
     along: Along, motion: Array, parameters: PyTree
 ) -> tuple[Array, Array, Array, dict[tuple[Slot, Slot], Array]]:
-    """Return penalties (K,), the greatest excess (), and derivatives of the penalties at K samples.
-
-    `motion` (orders, K, 3) has position, velocity, ... of the samples. First derivatives by its
-    entries have its shape, and second derivatives (K,) are listed by pairs of its entries.
-    """
     margins, factors = (
         jnp.asarray(np.array(each)[:, None], motion.dtype)
         for each in (along.margins, along.hinge_weights)
@@ -226,17 +221,14 @@ def _square(entries: dict[tuple[int, int], Array], num: int) -> Array:
 
 @dataclasses.dataclass(frozen=True)
 class _Constants:
-    """Constant matrices of `curvature_along`; they are cached for each `Along`."""
-
-    # Three stacked matrices from a segment's end states and waypoint offsets (G fixed, C variable
-    # columns) to all derivatives at K samples, (3 * orders * K, G + C). For derivatives by log h,
-    # fixed column d, which is proportional to h^d, is multiplied by d in the second and by d^2 in
-    # the third matrix.
+    # (3 * orders * K, G + C) Three stacked matrices from G fixed and C variable columns to all
+    # derivatives at K samples. The second and third are for derivatives by log h: fixed column d
+    # is proportional to h^d, so it has the factor d in the second and d^2 in the third matrix.
     samples: np.ndarray
     moving_samples: np.ndarray  # (orders, K, C)
     groups: tuple[tuple[Slot, ...], ...]
-    # Groups of pairs of axes such as (x, y). With each group, pairs of orders such as (1, 2), for
-    # velocity and acceleration, by which second derivatives of the penalty are not zero.
+    # (pairs of axes, pairs of orders): for each pair of axes such as (x, y), the pairs of orders
+    # such as (1, 2) (velocity, acceleration) by which the penalty has second derivatives.
     pairs: tuple[tuple[tuple[tuple[int, int], ...], tuple[tuple[int, int], ...]], ...]
 
     @property

@@ -59,17 +59,17 @@ class Grid:
         return min(max(_ENOUGH // (self.trajectories * self.blocks), 1), 8)
 
     def flatten(self, leaf: Array, lead: tuple[int, ...], *own: int) -> Array:
-        """Broadcast an array to (*lead, *own, lanes), and join the axes `lead` into one axis."""
+        """Broadcast an array to (*lead, *own, lanes), and join all axes `lead` into one axis."""
         return jnp.broadcast_to(leaf, (*lead, *own, self.lanes)).reshape(-1, *own, self.lanes)
 
 
 def grid_of(
     along: Along, leaves: Sequence[Array], points: Sequence[tuple[Array, Array, PyTree]]
 ) -> tuple[Grid, tuple[int, ...]] | None:
-    """Return the grid for a kernel's arguments, and the axes that `vmap` has put in front of them.
+    """Return the grid for a kernel's arguments, and the leading axes that `vmap` has added to them.
 
-    `points` has the arguments of `integrate_along` at a point and, for the mode "curvature", in a
-    direction; `leaves` are their leaves. If the kernel does not support them, the result is None.
+    `points` has the arguments of `integrate_along`; the mode "curvature" adds a second tuple, their
+    tangents. `leaves` are all arrays in `points`. None: the kernel does not support the arguments.
     """
     *_, num_columns, _, lanes = points[0][0].shape
     threads = block_width(lanes, _THREADS)
@@ -136,7 +136,7 @@ def call_on_grid(
 def along_kernel(
     along: Along, mode: str, *, interpret: bool = False
 ) -> Callable[[Treedef, Sequence[Array]], Sequence[Array] | None]:
-    """Make the CUDA kernel for one of `MODES`, which name its results; `interpret` needs no GPU.
+    """Make the CUDA kernel that computes the results listed at `MODES`; `interpret` needs no GPU.
 
     The mode "curvature" takes a point and a direction. The direction's parameters may be None.
     """
@@ -208,7 +208,7 @@ def _result_shapes(mode: str, treedef: Treedef, num_columns: int) -> list[tuple[
 
 
 def load_numbers(ref: Ref) -> PyTree:
-    """Load a number, or from three axes a list of C columns (3), for each lane (problem)."""
+    """Load one number for each lane (problem), or C columns (3) for each lane from a 3-D array."""
     if len(ref.shape) != 3:
         return ref[...]
     return [[ref[c, axis] for axis in range(3)] for c in range(ref.shape[0])]
@@ -231,7 +231,7 @@ def _store(refs: Sequence[Ref], values: Iterable[Array]) -> None:
 
 
 def unit_motion(row: Vectors, columns: Vectors) -> Vectors:
-    """Return height, velocity, acceleration, jerk of a sample, for pieces of 1 s mean duration."""
+    """Return a sample's height, velocity, acceleration, jerk from C columns, if pieces last 1 s."""
     return [
         [_total(row[d][c] * columns[c][axis] for c in range(len(columns))) for axis in axes]
         for d, axes in enumerate(_AXES)
@@ -246,7 +246,6 @@ class _Sample:
     weight: Array
 
     def slope_by_columns(self, slope: Vectors) -> Vectors:
-        """Convert derivatives by a sample's motion to derivatives by end states and offsets."""
         return [
             [
                 _total(

@@ -231,7 +231,7 @@ def greatest_extras(
 
 
 def extra_rate(motion: Motion, given: tuple) -> PyTree:
-    """Return the total cost per second (N,) of the user's terms `given[-1]` at N samples."""
+    """Return the total cost per second (N,) at N samples; the user's terms are `given[-1]`."""
     samples = motion.pos, motion.vel, motion.acc
     rates = (extra.cost(*samples) for extra in given[-1] if isinstance(extra, ExtraCost))
     return sum(rates, jnp.zeros_like(motion.height))

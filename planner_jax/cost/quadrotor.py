@@ -108,7 +108,7 @@ class QuadrotorCase(Protocol):
 
 
 class Measure(enum.Enum):
-    """The formula of an excess: how far a limited quantity q, such as speed, exceeds its limit."""
+    """Formula of an excess: how far a limited quantity q, such as speed, exceeds its limit."""
 
     ABOVE = "q^2 / most^2 - 1"
     BELOW = "1 - q^2 / least^2"
@@ -116,7 +116,7 @@ class Measure(enum.Enum):
 
     @property
     def factor(self) -> float:
-        """Ratio of the excess to the relative excess q / limit - 1, if both are small."""
+        """Ratio of a small excess by this formula to q / limit - 1: 2 for squares, else 1."""
         return 1.0 if self is Measure.PLAIN else 2.0
 
     def relative(self, excess: Array) -> Array:
@@ -140,8 +140,6 @@ def _rotor_excess(motion: Motion, gravity: Array, limits: QuadrotorLimits) -> tu
 
 @dataclasses.dataclass(frozen=True)
 class _Kind:
-    """The excess over the limits in one field of `QuadrotorLimits`, such as the greatest speed."""
-
     field: str  # field of `QuadrotorLimits` that is None for a quadrotor without these limits
     measures: tuple[Measure, ...]  # one for each excess
     excess: Callable[[Motion, Array, QuadrotorLimits], tuple[Array, ...]]  # takes motion, gravity
@@ -206,7 +204,11 @@ def relative_excess(limits: QuadrotorLimits, excess: Sequence[Array]) -> list[Ar
 def flight_along(
     maps: ProportionalMinco, nodes: int, case: QuadrotorCase, margin: float, hinge_width: float
 ) -> Along:
-    """Return the definition of the penalties along a flight, for `integrate_along`."""
+    """Return the penalties along a flight, for `integrate_along`.
+
+    They start at a relative distance `margin` before each limit, are smoothed over `hinge_width`,
+    and are sampled at `nodes` intervals of each piece.
+    """
     factors = [measure.factor for measure in flight_measures(case.limits)]
     factors += [1.0] * num_limits(case.extras)
     margins = tuple(margin * factor for factor in factors)

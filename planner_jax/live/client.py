@@ -46,7 +46,7 @@ class Client:
     ) -> Answer | None:
         """Send the robot's state in SI units; return the answer, or None after the timeout.
 
-        `measured` is the time of the observation, as in the method `ball`.
+        `measured` [s] is the time of the observation by `time.monotonic()`, by default now.
         """
         return self._send(ROBOT, measured, (*pos, *vel, *acc), 0)
 

@@ -29,7 +29,7 @@ class Course:
 
 
 def without_recovery(path: PiecewisePolynomial, gravity: Array) -> Course:
-    """Make a course of a plan alone; the pieces that lead to standstill have zero duration."""
+    """Make a course of a plan alone; its recovery trajectory has pieces of zero duration."""
     end = state_on(path, np.sum(path.durations))
     return Course(_join(path, _stand_still(_REST.num_pieces, end[0])), gravity)
 
@@ -37,7 +37,7 @@ def without_recovery(path: PiecewisePolynomial, gravity: Array) -> Course:
 def with_recovery(
     path: PiecewisePolynomial, gravity: Array, limits: QuadrotorLimits
 ) -> tuple[Course, bool]:
-    """Append a trajectory to standstill to a plan; return both, and whether the limits are kept."""
+    """Append a trajectory to standstill to a plan; return this course, and if it keeps limits."""
     state: Any = state_on(path, np.sum(path.durations))
     case = RecoveryCase(state, state[0], gravity, limits)
     rest: QuadrotorPlan = solve_one(_REST, case, _REST.rounds[0])

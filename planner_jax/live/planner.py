@@ -142,7 +142,7 @@ class LivePlanner(Generic[CaseT, PlanT]):
             report.counts["clocks"] += 1
             self._forget()
         report.stages["read"].add(time.perf_counter() - received)
-        # The answer's setpoints start at the latest sending time of all packets.
+        # The setpoints start at the sending time of the newest packet, on the client's clock.
         due = self._arrivals.newest
         if fault is Fault.NONE:
             use = self._use_ball if packet.kind == BALL else self._use_robot
@@ -257,7 +257,6 @@ class LivePlanner(Generic[CaseT, PlanT]):
             self._complete()
 
     def _complete(self) -> None:
-        """Append a trajectory to standstill to the plan; drop the plan if this exceeds a limit."""
         flight, before = self._flight, self._before
         if flight is None or flight.plan is None or before is None:
             return

@@ -47,7 +47,7 @@ _LONGEST = 4.0  # [s], latest time of a catch
 # Fraction of the robot's limits that a plan may use. From a plan that uses its limits fully there
 # is often no trajectory to standstill within the limits, so it could not be flown.
 _SHARE = 0.97
-# Settings of the optimiser for planning again: two steps of L-BFGS from the previous plan.
+# Settings for planning again: two steps of L-BFGS from the previous plan, which is close already.
 _AGAIN = Round(starts=1, solver=LbfgsConfig(max_steps=2, memory=2, trial_steps=(1.0, 0.2, 0.04)))
 
 CaseT = TypeVar("CaseT", HitCase, CatchCase)
@@ -82,7 +82,7 @@ class Stroke(abc.ABC, Generic[CaseT, PlanT]):
         return call_packed(self._solve_first, self._planner.rounds[1], self._planner, case)
 
     def again(self, plan: PlanT, elapsed: float, ball: BallState) -> PlanT:
-        """Improve `plan` for a newer estimate of the ball, from its state after `elapsed` [s]."""
+        """Improve a plan flown for `elapsed` [s], given a newer estimate of the ball."""
         since: Any = np.float32(elapsed)
         task = Replanning(self._with_ball(ball), plan, since)
         return call_packed(self._solve_again, _AGAIN, self._replanner, task)

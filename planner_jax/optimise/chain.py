@@ -69,8 +69,8 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
     shipped_name: ClassVar[str] = "exact"  # first part of the scales' names in the package
     num_end_variables: ClassVar[int]  # K, for each segment
     guess_table: ClassVar[np.ndarray]  # one row for each starting point, best first
-    # Numbers of intervals of a piece in the check of a finished plan: for one segment, for more
-    # segments. With a small thrust between two catches, the body rate can have narrow peaks.
+    # Numbers of intervals of a piece in the check of a finished plan: with one segment, with more.
+    # With a small thrust between two catches, the body rate can have narrow peaks.
     decode_nodes: ClassVar[tuple[int, int]] = (32, 48)
     proportions: tuple[float, ...] = (1.0,) * 6  # relative durations of a segment's pieces
     nodes: int = 8  # number of intervals of each piece, at whose ends penalties are evaluated
@@ -117,11 +117,11 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
         return jnp.ones(1, bool)
 
     def relative_excess(self, excess: Array) -> Array:
-        """Convert the excess that `meet` returns for a finished plan to fractions of the limits."""
+        """Convert the excess at a plan's ends, `ChainEnds.excess`, to fractions of the limits."""
         return excess
 
     def start_network(self, case: PyTree) -> StartNetwork | None:
-        """Return the network that improves the first starting point of a case, or None."""
+        """Return the network that corrects the first guess of a case, or None without a network."""
         return None
 
     def start_features(self, context: PyTree) -> Float[Array, " F"]:
@@ -133,12 +133,10 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
         return point
 
     def _fit_scale(self, scale: tuple[float, ...]) -> tuple[float, ...]:
-        """Return the units of a segment's variables; a subclass may append units to `scale`."""
         return scale
 
     @property
     def _usual_scale(self) -> tuple[float, ...]:
-        """Units of a segment's decision variables, measured, from `measured_scales.json`."""
         return load_scale(self.package, f"{self.shipped_name}-{self.num_pieces}")
 
     @property
@@ -148,7 +146,7 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
 
     @property
     def num_offsets(self) -> int:
-        """Number of waypoint variables of a segment."""
+        """Number of coordinates of a segment's waypoint offsets, three for each inner waypoint."""
         return 3 * (self.num_pieces - 1)
 
     @property
@@ -157,7 +155,7 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
         return proportional_minco(_ORDER, self.proportions)
 
     def guesses(self, context: PyTree, num: int) -> Float[Array, "num n"]:
-        """Return starting points (num, n), without waypoint offsets unless a network adds them."""
+        """Return starting points (num, n); waypoint offsets are zero, or predicted by a network."""
         if num > len(self.guess_table):
             raise ArgumentError("starts", f"<= {len(self.guess_table)}", num)
         natural = self.guess_ends(context, num)

@@ -91,8 +91,8 @@ def chain_curvature(
     unit = jnp.asarray(np.eye(natural.size), natural.dtype)
     tangent = lambda unit: jax.jvp(slope, (natural.ravel(),), (unit,))  # noqa: E731
     (by_natural, _), (within, turned) = jax.vmap(tangent, out_axes=((None, None), 0))(unit)
-    # `within` is the Hessian (N k, N k) of `pull_back` in the k end variables of N segments, and
-    # `turned` the Jacobian (N k, N, num_rows, 3) of the segments' boundary rows in these variables.
+    # `within` (N k, N k) is the Hessian, by the end variables, of the ends' cost and of penalties
+    # by way of the boundary rows. `turned` (N k, N, num_rows, 3) is the rows' Jacobian.
     dot = functools.partial(jnp.tensordot, precision=lax.Precision.HIGHEST)
     einsum = functools.partial(jnp.einsum, precision=lax.Precision.HIGHEST)
     theta_theta = of.theta_theta + power**2 * energies

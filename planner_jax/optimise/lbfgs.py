@@ -217,7 +217,7 @@ def _choose(
     progress = here.cost - there.cost > tolerance * jnp.abs(here.cost)
     after = LbfgsNumbers(
         best=jax.tree.map(lambda a, b: jnp.where(is_best, a, b), there, best),
-        # If no trial step lowers the cost, the trial steps of the next iteration are shorter.
+        # If no trial step lowers the cost, `reach` shortens the next iteration's trial steps.
         reach=jnp.where(decreased, 1.0, 0.05 * numbers.reach),
         iteration=numbers.iteration + 1,
         stalled=jnp.where(progress, 0, numbers.stalled + 1),

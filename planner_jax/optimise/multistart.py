@@ -159,7 +159,7 @@ def _optimum_at(point: Array, evaluation: Evaluation, config: Solver) -> Optimum
 
 
 def solve_round(planner: "OptimisedPlanner", attempt: Round, case: PyTree) -> PyTree:
-    """Return the plan of one case that all searches of one round (attempt) find in turn; pure."""
+    """Plan one case by the searches of a round (attempt), each from the end of the last; pure."""
     last = planner.with_settings(attempt.settings)
     context = last.prepare(case)
 
@@ -180,7 +180,7 @@ def solve_round(planner: "OptimisedPlanner", attempt: Round, case: PyTree) -> Py
 
 
 def solve_batch(planner: "OptimisedPlanner", attempt: Round, cases: PyTree) -> PyTree:
-    """Plan a batch of cases, each from one start by all searches of one round (attempt); pure."""
+    """Plan a batch by the searches of a round (attempt), each from the end of the last; pure."""
     last = planner.with_settings(attempt.settings)
     contexts = over_lanes(last.prepare)(_lanes_last(cases))
     first = planner.with_settings(attempt.all_stages[0].settings)
@@ -197,7 +197,7 @@ def solve_batch(planner: "OptimisedPlanner", attempt: Round, cases: PyTree) -> P
 
 @struct.dataclass
 class Searches:
-    """L searches of one stage, the lanes of a batch: their cases, and where they start."""
+    """L searches, each from one starting point, in one stage of a round (attempt) of a planner."""
 
     cases: PyTree  # leaves (L, ...)
     index: Array  # (L,) int32, index of the starting point among the guesses; -1: `point`
@@ -205,9 +205,10 @@ class Searches:
 
 
 def count_guesses(rounds: Sequence[Round], stage: Stage) -> int:
-    """Return how many starting points a program for one stage must compute.
+    """Return how many guessed starting points the program for one stage (search) must compute.
 
-    This is the greatest number that a round needs whose first search has the stage's settings.
+    It is the greatest number that a round uses whose first stage has these settings. Later stages
+    start where the stage before them ends.
     """
     begun = [each for each in rounds if each.all_stages[0].settings == stage.settings]
     return max((each.first + each.starts for each in begun if each.is_divided), default=0)
@@ -255,7 +256,7 @@ def divide_round(
     attempt: Round,
     cases: PyTree,
 ) -> PyTree:
-    """Return the best plan of every case of a batch that the searches of one round find.
+    """Return each case's best plan over all searches of one round (attempt), for a batch.
 
     The arrays may be NumPy's or JAX's. `search` runs one stage of L searches and returns the end
     points (L, n) and the plans at these points. It takes the stage and the three fields of

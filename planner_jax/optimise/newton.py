@@ -292,7 +292,8 @@ def _choose(
     factors = jnp.maximum(jnp.asarray(config.trial_dampings, costs.dtype), config.ease)
     damping = numbers.damping * jnp.where(moved, of_chosen(factors), config.tighten)
     predicted = decrease / jnp.maximum(jnp.abs(here.cost), 1e-30)
-    # A strongly damped step is short, so its predicted decrease is too small.
+    # A strongly damped step is short, and predicts a small decrease also far from the optimum. The
+    # greater of this and the last prediction is kept, so that the search does not stop there.
     is_short = numbers.damping > config.trusted
     expected = jnp.where(is_short, jnp.maximum(predicted, numbers.expected), predicted)
     is_nearer = (there.cost < here.cost - slack) | (moved & (expected < 0.5 * numbers.expected))

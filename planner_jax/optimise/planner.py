@@ -110,7 +110,7 @@ class OptimisedPlanner(Planner[CaseT, PlanT], abc.ABC):
 
     @property
     def held(self) -> np.ndarray | None:
-        """Which of the n variables a `frozen` stage holds at their starting values, (n,) bool."""
+        """Variables (n,) bool that a `frozen` stage (search) keeps constant, or None for none."""
         return None
 
     @property
@@ -119,7 +119,7 @@ class OptimisedPlanner(Planner[CaseT, PlanT], abc.ABC):
         return self.rounds
 
     def load_attempt(self, attempt: Round, cases: PyTree) -> PyTree:
-        """Return a round (attempt) whose L-BFGS settings are arguments of the compiled program."""
+        """Convert a round (attempt) so that rounds with other L-BFGS settings share a program."""
         return load_round(attempt, jax.default_backend() != "cpu")
 
     def solve(self, case: PyTree, attempt: Round) -> PyTree:
@@ -134,7 +134,7 @@ class OptimisedPlanner(Planner[CaseT, PlanT], abc.ABC):
         return (solve_divided if attempt.is_divided else solve_batch)(self, attempt, cases)
 
     def divides(self, attempt: Round) -> bool:
-        """Return whether `pj.plan` runs each search of a round as a separate problem."""
+        """Return whether `pj.plan` runs a round's search from each start as its own problem."""
         return attempt.is_divided
 
     def settle(
@@ -144,7 +144,7 @@ class OptimisedPlanner(Planner[CaseT, PlanT], abc.ABC):
         return self, cases
 
     def with_settings(self, settings: Settings) -> Self:
-        """Return a copy of the planner with other values of some fields."""
+        """Return a copy of the planner with the field values in `settings`, pairs (name, value)."""
         return dataclasses.replace(self, **dict(settings))  # type: ignore[type-var]
 
     def with_solver(self, solver: Solver = _LONG) -> Self:

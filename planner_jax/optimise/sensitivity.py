@@ -111,11 +111,11 @@ class Differentiated(OptimisedPlanner):
 
     @property
     def held(self) -> np.ndarray | None:
-        """The variables that the inner planner holds in a `frozen` stage."""
+        """Variables (n,) bool that a `frozen` stage (search) keeps constant, or None for none."""
         return self.planner.held
 
     def divides(self, attempt: Round) -> bool:
-        """Return false; the gradient would be computed for every search that is run separately."""
+        """Return false, so that the gradient is computed once for a plan, not for each search."""
         return False
 
     def objective(self, point: Array, context: _Context) -> Evaluation:

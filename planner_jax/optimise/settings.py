@@ -135,7 +135,7 @@ class Stage:
     solver: Solver
     settings: Settings = ()
     keep: int | None = None  # number of a case's cheapest starts that continue; None for all
-    # Whether L-BFGS holds the variables `OptimisedPlanner.held` at their values in the start.
+    # Whether L-BFGS leaves the variables unchanged that `OptimisedPlanner.held` marks.
     frozen: bool = False
 
     def __post_init__(self) -> None:
@@ -167,9 +167,9 @@ class Round(Attempt):
 
     @property
     def is_divided(self) -> bool:
-        """Whether each search of a case, from one starting point, is a problem of its own.
+        """Whether the search from each starting point of a case is a problem of its own.
 
-        This is so for several starting points, a `first` > 0, or own settings of the round. Rounds
+        This is so for several starting points, a `first` > 0, or `settings` of the round. Rounds
         with equal settings then share a compiled program, for any number of starting points.
         """
         return self.starts > 1 or self.first > 0 or bool(self.settings)
@@ -178,15 +178,15 @@ class Round(Attempt):
 @with_run_time_numbers("tolerance", "patience")
 @dataclasses.dataclass(frozen=True)
 class CountedLbfgs(LbfgsConfig):
-    """Settings of L-BFGS with a number of iterations that is known when the program is compiled."""
+    """Settings of L-BFGS whose number of iterations is a constant of the compiled program."""
 
 
 @cached_by_precision
 def load_round(attempt: Round, is_counted: bool) -> Round | Fixed:
-    """Convert a round (attempt) to an argument of compiled programs, static if a search is empty.
+    """Convert a round (attempt) to an argument of compiled programs.
 
-    A search is empty if it has 0 iterations. Rounds that differ only in L-BFGS's numbers of
-    iterations and tolerances share one program. If `is_counted`, up to `COUNTED` iterations are
+    Rounds that differ only in L-BFGS's numbers of iterations and tolerances then share one program.
+    A round with a search of 0 iterations is static. If `is_counted`, up to `COUNTED` iterations are
     static: a GPU then need not ask the host after every iteration whether the loop has ended.
     """
     if any(stage.solver.max_steps == 0 for stage in attempt.all_stages):
@@ -199,7 +199,7 @@ def load_round(attempt: Round, is_counted: bool) -> Round | Fixed:
 
 @cached_by_precision
 def load_stage(stage: Stage, is_counted: bool) -> Stage | Fixed:
-    """Convert one stage (a search) to an argument of compiled programs, as `load_round` does."""
+    """Convert a stage (search of a round) to an argument of compiled programs; see `load_round`."""
     stage = dataclasses.replace(stage, keep=None)
     if stage.solver.max_steps == 0:
         return Fixed(stage)

@@ -202,8 +202,6 @@ def _try_in_turn(
 
 @dataclasses.dataclass(frozen=True)
 class _Batch:
-    """A planner with the settings of one call of `plan`: chunk size, devices and watch."""
-
     planner: Planner
     chunk: int | None
     mesh: Mesh
@@ -243,7 +241,6 @@ class _Batch:
         return mark_out_of_time(plans, untried) if untried.any() else plans
 
     def _calls(self, attempt: Attempt, lanes: np.ndarray) -> list[_Call]:
-        """Split the indices `lanes` of cases into compiled calls, padded to an allowed size."""
         calls, devices = [], self.mesh.size
         for first, size in self.sizes(attempt).cuts(-(-lanes.size // devices)):
             part = lanes[first * devices :][: size * devices]
@@ -298,14 +295,16 @@ class _Batch:
         return divide_batch(self.planner, attempt, self.mesh, cases)
 
     def _divide_resident(self, attempt: Attempt, cases: PyTree, is_case: np.ndarray) -> PyTree:
-        """Return plans of B cases in jax arrays; cases with a false `is_case` (B,) are padding."""
         found = self._divide(attempt, jax.tree.map(lambda leaf: np.asarray(leaf)[is_case], cases))
         row = np.maximum(np.cumsum(is_case) - 1, 0)  # repeats a plan for the padding
         found = jax.tree.map(lambda leaf: leaf[row], found)
         return jax.device_put(found, lane_sharding(self.mesh))
 
     def plan_resident(self, attempts: Sequence[Attempt], cases: PyTree) -> tuple[PyTree, Array]:
-        """Return plans of cases in jax arrays; the host reads only numbers of unsolved cases."""
+        """Return plans of cases in jax arrays, and the number of unsolved cases of each device.
+
+        Only these numbers are copied to the host.
+        """
         planner, mesh, watch, num = self.planner, self.mesh, self.watch, count_lanes(cases)
         if num % mesh.size:  # repeat the last case until all devices have equally many cases
             cases = _take(cases, np.arange(-(-num // mesh.size) * mesh.size))
@@ -338,7 +337,6 @@ class _Batch:
         return plans, unsolved
 
     def _first_plans(self, attempt: Attempt, cases: PyTree) -> tuple[PyTree, Array]:
-        """Return the first attempt's plans, and the number of unsolved cases on each device."""
         mesh, sizes, share = self.mesh, self.sizes(attempt), count_lanes(cases) // self.mesh.size
         if share == sizes.next(share):
             return self._solve(attempt, cases)
@@ -419,7 +417,6 @@ def _join_locally(mesh: Mesh, parts: list[PyTree], share: int) -> tuple[PyTree, 
 
 @functools.partial(jax.jit, static_argnames="mesh")
 def _select_locally(mesh: Mesh, plans: PyTree, later: PyTree, lanes: Array) -> tuple[PyTree, Array]:
-    """Replace plans with indices `lanes` by better later plans; count unsolved plans by device."""
 
     def merge(plans: PyTree, later: PyTree, lanes: Array) -> tuple[PyTree, Array]:
         kept = select(later, _take(plans, lanes))

@@ -33,8 +33,8 @@ class DecidedPlanner(PlannerAround[CaseT, PlanT]):
     ) -> tuple[PyTree, PyTree]:
         """Return the inner planner, which minimises a cost, and the cases with their choices.
 
-        The choices are taken from plans that `plan_of` makes. Without `plan_of` they are the first
-        choices that `decision` proposes, and nothing is planned.
+        `plan_of(planner, cases)` makes plans, whose choices are taken. Without `plan_of` they are
+        the first choices that `decision` proposes, and nothing is planned.
         """
         if plan_of is None:
             return self.planner.settle(first_choice(self.decision, cases))
@@ -45,7 +45,7 @@ class DecidedPlanner(PlannerAround[CaseT, PlanT]):
         return self.planner.settle(cases.with_choice(choice), plan_of)
 
     def plan_by(self, drive: Drive, cases: PyTree) -> PyTree:
-        """Plan each case with the choices that the decision proposes; return its best plan."""
+        """Plan each case with every choice that `decision` proposes; return its best plan."""
         alone = cases.batch_shape == ()
         if not drive.is_pure:
             self.decision.check(cases)
@@ -70,7 +70,6 @@ class DecidedPlanner(PlannerAround[CaseT, PlanT]):
         return plans.replace(status=status if on_devices else np.asarray(status))
 
     def _plan_all(self, drive: Drive, cases: PyTree, choices: PyTree) -> tuple[PyTree, PyTree]:
-        """Plan every case with every choice; return the cases with their best choice, and plans."""
         xp = jnp if drive.is_pure else np
         num = len(choices)
         if not drive.is_pure:
@@ -112,7 +111,6 @@ def _propose_all(decision: Decision, cases: PyTree) -> list[PyTree]:
 
 @jax.jit
 def _explain(decision: Decision, cases: PyTree, status: Array) -> Array:
-    """Return statuses of plans, replaced where the decision knows why a case is unsolved."""
     explain = decision.explain if cases.batch_shape == () else jax.vmap(decision.explain)
     return explain(cases, status)
 

@@ -96,7 +96,7 @@ def plan(
         if not resident:
             require_sound(cases)
     plans, _ = Driver(chunk, devices, watch)(planner, cases)
-    # A single case is checked only if its plan has the status BAD_INPUT, which is faster.
+    # To save time, a single case is checked only if its plan has the status BAD_INPUT.
     if alone and not resident and int(plans.status) == Status.BAD_INPUT:
         require_sound(cases)
     if not alone and resident and not is_resident(plans):
@@ -186,7 +186,7 @@ def _raise(primals: tuple, tangents: tuple) -> tuple:
 
 @dataclasses.dataclass(frozen=True)
 class Driver:
-    """The loop over a planner's attempts, for `pj.plan` or, with `is_pure`, for `pj.solve`."""
+    """The loop over a planner's attempts (searches) in `pj.plan` or, with `is_pure`, `pj.solve`."""
 
     chunk: int | None = None
     devices: Sequence[jax.Device] | None = None  # pyright: ignore[reportInvalidTypeForm]
@@ -201,7 +201,7 @@ class Driver:
     def __call__(
         self, planner: Planner, cases: PyTree, attempts: Sequence[Attempt] | None = None
     ) -> tuple[PyTree, PyTree]:
-        """Plan by the listed attempts, or all; return plans, and which or how many are unsolved."""
+        """Plan by the listed attempts, or all; return plans, and a mask or count of unsolved."""
         if planner.kind is Kind.COMPOSITE:
             plans = planner.plan_by(self, cases)
             return plans, is_unsolved(plans.status)
@@ -219,7 +219,7 @@ class Driver:
     def plan_again(
         self, plan_of: Callable[[PyTree], PyTree], cases: PyTree, plans: PyTree, left: PyTree
     ) -> PyTree:
-        """Plan again the cases where `left` (B,) is true; return each case's better plan."""
+        """Plan cases with a true `left` (B,) again; return the better of a case's two plans."""
         if self.is_pure:
             again = lambda plans: select(plan_of(cases), plans, left)  # noqa: E731
             return lax.cond(jnp.any(left), again, lambda plans: plans, plans)
@@ -259,7 +259,7 @@ def _plan_purely(planner: Planner, attempts: Sequence[Attempt], cases: PyTree) -
     require_pure(planner)
     plans: PyTree = None
     pairs = [(attempt, planner.load_attempt(attempt, cases)) for attempt in attempts]
-    # Attempts of the same structure share one program, which a loop runs for each of them.
+    # Consecutive attempts whose pytrees have equal structure are iterations of one compiled loop.
     for _, same in itertools.groupby(pairs, lambda pair: jax.tree.structure(pair[1])):
         group, loaded = zip(*same, strict=True)
         solve_by = functools.partial(_solve_by, planner, cases, loaded)

@@ -48,8 +48,8 @@ class Sizes:
     def next(self, num: int) -> int:
         """Return the size of the next call (its number of lanes) when `num` lanes are unsolved.
 
-        It is the smallest size in `BUCKETS` that holds `num` lanes, or at most `most`. If the lanes
-        fill at most half of this size, the next smaller bucket is returned if it is >= `busy`.
+        It is the smallest size in `BUCKETS` that holds `num` lanes, at most `most`. If the lanes
+        fill at most half of it, the next smaller bucket is used if that still keeps a GPU busy.
         """
         needed = max(num, self.least)
         fits = next((bucket for bucket in BUCKETS if needed <= bucket <= self.most), self.most)
@@ -165,7 +165,7 @@ def solve_cases(planner: Planner, cases: PyTree, loaded: PyTree) -> PyTree:
     """Return the plans of one case, or of a batch with a leading axis on every leaf; pure.
 
     `loaded` is an attempt as `Planner.load_attempt` returns it. All compiled programs call this
-    function. It gives the status `BAD_INPUT` to every case that breaks a rule of its class.
+    function. It gives the status `BAD_INPUT` to every case with an invalid number, such as NaN.
     """
     require_shapes(cases)
     attempt = loaded.attempt if isinstance(loaded, Fixed) else loaded
@@ -232,7 +232,7 @@ compiled: set[Hashable] = set()
 def program_key(
     planner: Planner, attempt: Attempt, num: int, cases: PyTree, compiles_quickly: bool
 ) -> Hashable:
-    """Return the key in `compiled` of the program that solves `num` lanes (cases) of a device."""
+    """Return the key, in the set `compiled`, of the program that solves `num` cases per device."""
     own = tuple((leaf.shape, leaf.dtype) for leaf in jax.tree.leaves(planner))
     lanes = tuple((leaf.shape[1:], leaf.dtype) for leaf in jax.tree.leaves(cases))
     loaded = planner.load_attempt(attempt, cases)
@@ -290,14 +290,12 @@ class _Program:
 
     @functools.cached_property
     def fields(self) -> list[tuple[slice, tuple[int, ...]]]:
-        """Positions in the packed vector, and shapes, of the results' arrays."""
         stops = np.cumsum([math.prod(shape) for shape in self.results.shapes]).tolist()
         starts = [0, *stops[:-1]]
         return list(zip(map(slice, starts, stops), self.results.shapes, strict=True))
 
     @functools.cached_property
     def others(self) -> list[tuple[int, np.dtype]]:
-        """Indices and dtypes of the arrays whose dtype differs from the packed vector's dtype."""
         return [(k, each) for k, each in enumerate(self.results.dtypes) if each != self.dtype]
 
 

@@ -162,7 +162,7 @@ def settings() -> tuple:
 
 
 class _NotStoredError(Exception):
-    """A program that cannot be stored, or that another package's code is part of."""
+    """Error: a program cannot be stored, or contains code of another package."""
 
 
 def _folder() -> Path | None:
@@ -186,7 +186,6 @@ def _export(function: Any, layout: Sequence[Any], platform: str) -> bytes:
 
 
 def _read(path: Path, results: Results) -> bytes | None:
-    """Return a stored program, and set `results`; None if there is none or its file is damaged."""
     try:
         head, _, content = path.read_bytes().partition(b"\n")
         described = json.loads(head)
@@ -260,7 +259,6 @@ def _describe(value: Any) -> str:
 
 
 def _name_of(thing: Any) -> str:
-    """Return the full name of a class or function of this library, of Python, NumPy or JAX."""
     module, name = thing.__module__, thing.__qualname__
     if module.partition(".")[0] not in (_PACKAGE, "builtins", "numpy", "jax", "jaxlib"):
         raise _NotStoredError

@@ -214,7 +214,7 @@ def _beside_shield(case: dict, links: Sequence, capsules: list[_Capsule]) -> lis
 
 
 def _pole(case: dict) -> _Capsule:
-    """Return the vertical pole as a long capsule; without a pole, of radius minus infinity."""
+    """Return the pole as a long vertical capsule; without a pole, all distances are infinite."""
     x, y = case["scene.pole"].T[..., None]
     first, second = (np.stack([x, y, np.full_like(x, end)]) for end in (-_POLE_HALF, _POLE_HALF))
     radius = np.where(case["scene.has_pole"] != 0.0, case["scene.pole_radius"], -np.inf)
@@ -236,7 +236,6 @@ def _base_box(case: dict) -> _Box:
 
 
 def _pair(one: _Capsule | _Box, other: _Capsule | _Box, name: str) -> _Pair:
-    """Pair two solids; the sphere around the first one gives a lower bound of their distance."""
 
     def exact(lane: np.ndarray, sample: np.ndarray) -> np.ndarray:
         return _distance(one.at(lane, sample), other.at(lane, sample))

@@ -318,10 +318,6 @@ def _clearances(case: dict, links: tuple, motion: _Motion, turning: np.ndarray) 
 def _sample(
     motion: _Motion, lanes: np.ndarray, count: np.ndarray, sample: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return times and joint angles at the samples with the indices `sample`, for some plans.
-
-    Piece m of plan b has count[b, m] equal steps. Indices behind the last piece repeat its end.
-    """
     behind = np.cumsum(count, axis=1)
     piece = (sample >= behind[..., None]).sum(axis=1).clip(max=count.shape[1] - 1)  # (B, S)
     rows, lanes = np.arange(len(lanes))[:, None], lanes[:, None]

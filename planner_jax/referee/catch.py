@@ -268,8 +268,8 @@ def _judge(
     wrong = (~right).sum(axis=1).astype(np.float64)
     order_test = (wrong > 0.0, wrong, ends[lanes, right.argmin(axis=1)])
     held = due & right
-    # These arrays have one entry for each catch. Entries behind the last catch may hold any
-    # numbers, also NaN. They are replaced by values that pass all tests.
+    # The arrays of catches have N entries. Entries behind the last catch may hold any numbers, also
+    # NaN, and are replaced by values that pass all tests.
     case = case | {
         "coeffs": np.moveaxis(pieces.coeffs, 0, -1),
         "order": np.where(due, case["order"], 0.0),
@@ -315,10 +315,7 @@ def _test_order(
 
 
 def _judge_catches(case, pieces, held, ends, net_test: str, tolerances: dict) -> tuple[dict, dict]:
-    """Measure and test the distance and the angle between net and target at all catches.
-
-    `held` (B, N) is true for catches, and `ends` (B, N) [s] are their times.
-    """
+    """Measure and test the distance and the angle between net and target at all catches."""
     each = pieces.durations.shape[1] // held.shape[1]
     tail = np.moveaxis(pieces.coeffs[:, :, each - 1 :: each], -1, 0)
     spans = pieces.durations[:, each - 1 :: each]

@@ -28,9 +28,9 @@ class ExtraLimit(Protocol):
 # Number of intervals between samples that are searched more finely, and number of their
 # refinements. Each refinement reduces an interval to a quarter of its length.
 _REFINED, _REFINEMENTS = 6, 4
-# Assumed rise of the excess per interval before a piece's first sample; after the last sample the
-# rise is minus this number. For so large a number, the bound on the excess in the first or last
-# interval is the straight line through the next two samples inside the piece.
+# Slope of a line that is missing in `_worst_excess`: no two samples are before a piece's first
+# interval, or (with a minus sign) after its last one. So steep a line bounds nothing, and the
+# bound is the other line, through the two samples on the other side.
 _STEEP = 1e9
 
 

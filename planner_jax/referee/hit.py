@@ -215,8 +215,8 @@ def _judge_impact(case: dict, drag_after_impact: bool, tolerances: dict) -> tupl
     tail = case["coeffs"][:, -1].transpose(1, 2, 0)
     pos, vel, normal = (judging.derivative(tail, durations[:, -1], order) for order in range(3))
     normal[2] += gravity
-    # Without thrust the racket's normal is zero. The ball's speed along it is then 0, so that the
-    # test "wrong face", which requires a negative speed, fails.
+    # Without thrust the racket's normal is set to zero. The ball's speed along it is 0, and the
+    # plan fails the test "wrong face", which requires a negative speed.
     normal /= np.maximum(np.linalg.norm(normal, axis=0), np.finfo(float).tiny)
     racket = pos + case["racket_height"] * normal
     approach = ((state[3:] - vel) * normal).sum(axis=0)

@@ -195,11 +195,11 @@ _MEASURES = {
 
 
 def _tops(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Find the greatest of S samples in each of M pieces, and where the true maximum likely is.
+    """Find each trajectory's greatest sample, and the sample nearest to the highest maximum.
 
-    `values` (N, M, S) are samples of N trajectories, and are overwritten. Returns arrays (N,): the
-    index of the greatest of the M * S samples, its value, and the index of the sample next to the
-    highest vertex of all parabolas through three neighbours.
+    `values` (N, M, S) are S samples of M pieces of N trajectories, and are overwritten. Returns
+    arrays (N,): the index of the greatest of the M * S samples; its value; and the index of the
+    middle sample of the parabola, through three neighbours, with the highest vertex.
     """
     line, rows = values.ravel(), flat(values)
     top = rows.argmax(axis=1)

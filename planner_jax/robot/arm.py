@@ -56,7 +56,7 @@ class Regime:
 
 
 def _regime(factor: float, acceleration: float, ends_at_rest: bool) -> Regime:
-    """Return joint limits of the IRB 1600-6/1.2: `factor` times the speeds of its data sheet."""
+    """Return the IRB 1600's limits: data-sheet speeds times `factor`, `acceleration` [rad/s^2]."""
     speeds = np.deg2rad(np.array([150, 160, 170, 320, 400, 450], np.float32))
     limits = ArmLimits(host_leaf(factor * speeds), host_leaf(np.full(6, acceleration, np.float32)))
     return Regime(limits=limits, ends_at_rest=ends_at_rest)
@@ -95,7 +95,7 @@ def _joint_rotations(arm: Arm, angles: Array) -> Array:
     x, y, z = axis[:, 0], axis[:, 1], axis[:, 2]
     none = jnp.zeros_like(x)
     cross = jnp.stack([none, -z, y, z, none, -x, -y, x, none], axis=-1).reshape(6, 3, 3)
-    # `along` and `across` do not depend on the angles: under `vmap` they are computed only once.
+    # These two matrices do not depend on the angles, so `vmap` over angles computes them only once.
     along = product(turn, axis[:, :, None] * axis[:, None, :])
     across = product(turn, cross)
     cos, sin = jnp.cos(angles)[:, None, None], jnp.sin(angles)[:, None, None]

@@ -91,7 +91,7 @@ def pose_at(start: Array, end: Array, speed: Array, curvature: Array, time: Arra
     """
     num = speed.shape[0] - 1
     step = end / num
-    # `length` (K,) [s] is how long the car has driven on each of the K pieces until `time`.
+    # `length` (K,) [s] is the time that the car has spent on each of the K pieces until `time`.
     length = jnp.clip(time - step * jnp.arange(num, dtype=speed.dtype), 0.0, step)
     rise = (speed[1:] - speed[:-1]) / step
     bend = (curvature[1:] - curvature[:-1]) / step
@@ -112,7 +112,7 @@ def pose_at(start: Array, end: Array, speed: Array, curvature: Array, time: Arra
 
 
 def knots_at(end: Array, speed: Array, curvature: Array, time: Array) -> tuple[Array, Array, Array]:
-    """Return speed, curvature and acceleration at a time () [s] of a plan that lasts `end` [s]."""
+    """Return speed, curvature, acceleration at a time of a plan; see `pose_at` for arguments."""
     num = speed.shape[0] - 1
     position = jnp.clip(time / end * num, 0.0, num)
     k = jnp.clip(position.astype(jnp.int32), 0, num - 1)

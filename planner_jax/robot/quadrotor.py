@@ -59,7 +59,7 @@ class QuadrotorLimits:
         return least, none + jnp.inf if self.max_thrust is None else self.max_thrust
 
     def scale(self, factor: float, gravity: Array) -> "QuadrotorLimits":
-        """Return limits times `factor`; thrust limits are scaled in their difference from hover."""
+        """Return limits times `factor`; thrust limits f become gravity + factor * (f - gravity)."""
         limits = {"speed": factor * self.speed, "body_rate": factor * self.body_rate}
         if self.acceleration is not None:
             limits["acceleration"] = factor * self.acceleration

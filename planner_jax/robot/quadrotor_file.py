@@ -73,7 +73,7 @@ _PARTS: dict[str, type] = {"rotors": Rotors, "tool": Tool, "limits": FlightLimit
 
 
 class RobotError(PlannerJaxError, ValueError):
-    """Error: a quadrotor's description breaks a rule. The message names file and field."""
+    """Error: a quadrotor's description is invalid. The message names file and field."""
 
 
 class QuantityError(PlannerJaxError, ValueError):
@@ -138,7 +138,7 @@ def read_robot(path: str | os.PathLike, **given: Value) -> QuadrotorModel:
             in SI units, or an object such as a `Tool`.
 
     Raises:
-        RobotError: the file or a field breaks a rule. The message is one line.
+        RobotError: the file, or a field such as a negative mass, is invalid (message of one line).
         MissingExtra: the file is MJCF, and MuJoCo is not installed.
         OSError: the file cannot be read.
     """
@@ -154,7 +154,7 @@ def model_of(description: Mapping[str, Value], place: str = "robot") -> Quadroto
     """Make a quadrotor from a dictionary: the fields of a YAML file, or `dataclasses.asdict`.
 
     Raises:
-        RobotError: a field breaks a rule; the message begins with `place`, such as a file's name.
+        RobotError: a field is invalid; the message begins with `place`, such as a file's name.
     """
     _require_known(description, [*_FIELDS[""], *_PARTS], "", place)
     parts: dict[str, Value] = {}
@@ -321,7 +321,7 @@ def _to_si(given: Mapping[str, Value], part: str, place: str) -> dict[str, Value
 
 
 def _to_numbers(value: Value, quantity: _Quantity) -> Value:
-    """Convert a field's value to SI units: a number, a tuple of numbers, or four pairs (x, y)."""
+    """Convert a field's value to SI units; eight numbers become pairs (x, y) of four rotors."""
     is_pairs = quantity.count == 8
     if is_pairs and isinstance(value, list | tuple):
         pairs = (pair if isinstance(pair, list | tuple) else [pair] for pair in value)

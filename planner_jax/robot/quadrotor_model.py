@@ -133,7 +133,7 @@ class QuadrotorModel:
     """Description of a quadrotor; hashable, so that it can be a static argument of `jax.jit`.
 
     Raises:
-        ValueError: a number breaks its rule, or the rotors cannot hold the body in hover.
+        ValueError: a number is invalid, such as a negative mass, or the rotors cannot hover.
     """
 
     name: str

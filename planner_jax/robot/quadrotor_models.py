@@ -22,8 +22,8 @@ from planner_jax.robot.quadrotor_model import (
 )
 
 # Crazyflie 2.x. Mass and diagonal are from the manufacturer's data sheet (27 g, and 92 mm between
-# opposite motors). Inertia, drag torque and greatest thrust are from [Foerster2015]. The time
-# constant and the net are assumptions; a racket would weigh about as much as the robot.
+# opposite motors). Inertia, drag torque and greatest thrust are from [Foerster2015]. The rotors'
+# time constant and the net are assumptions; a racket would weigh about as much as the robot.
 CRAZYFLIE = QuadrotorModel(
     name="crazyflie",
     mass=0.027,
@@ -103,7 +103,7 @@ def robot_named(word: str) -> QuadrotorModel:
 
     Raises:
         UnknownName: no quadrotor and no file has this name. The message lists the names.
-        RobotError: the file breaks a rule. The message is one line.
+        RobotError: the file is invalid, such as a negative mass. The message is one line.
         MissingExtra: the file needs MuJoCo, which is not installed.
     """
     if word in MODELS:

@@ -94,7 +94,7 @@ class Dataset:
         self.write(0, encode(rows, {}))
 
     def damages(self, num: int | None = None) -> dict[Path, str]:
-        """Return by path what is wrong with damaged files, or with a folder without `num` rows."""
+        """Return path -> damage of that file; the folder is an entry if it lacks `num` rows."""
         found, counted = {}, 0
         for place, path in enumerate(self.files()):
             try:

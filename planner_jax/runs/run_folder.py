@@ -176,14 +176,14 @@ class RunFolder:
 
 @dataclasses.dataclass(frozen=True)
 class RunRows:
-    """Manifest and rows of a finished run, from which its figures are drawn."""
+    """Manifest and rows of a finished run (a sweep or flights), from which figures are drawn."""
 
     folder: RunFolder
     manifest: Entries
     failures: list[Row]  # the first rows whose plans the referee rejected
 
     def sample(self) -> list[Row]:
-        """Return about 60 evenly spaced rows, and further failures up to 12 failures in total."""
+        """Return about 60 evenly spaced rows, and more rejected plans until they are up to 12."""
         last = self.manifest["summary"]["num"] - 1
         spread = np.linspace(0, last, _CASES_SHOWN).astype(int).tolist()
         shown = self.folder.plans.pick(spread)
@@ -192,7 +192,7 @@ class RunRows:
         return shown + others[: max(missing, 0)]
 
     def same_case(self) -> list[tuple[str, Row]]:
-        """Return all planners' plans for one case as (planner, row), the run's own plan first."""
+        """Return (planner, row) for each planner's plan of the example case, the run's first."""
         own = self.folder.plans.pick([self.manifest["example"]])[0]
         others = self.folder.baselines
         rows = others.read().to_pylist() if others.files() else []

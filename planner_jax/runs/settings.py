@@ -31,13 +31,16 @@ def option(default: object, metavar: str, text: str) -> Any:
 
 
 def recovery_option(usual: str = NONE) -> str:
-    """Return the field `recovery` of settings: how the quadrotor stops after its last contact."""
+    """Return the field `recovery` of settings: how the quadrotor stops after its last contact.
+
+    The values are "none", no stop; "brake", at the cheapest position; "home", at the start.
+    """
     words = f"trajectory after the last contact, within all limits: {', '.join(CHOICES)}"
     return option(usual, "NAME", words)
 
 
 def recovery_options(value: str) -> dict[str, str]:
-    """Return the planner's arguments for the setting `recovery`; raise if the value is unknown."""
+    """Return the planner's arguments for `recovery`, {} for "none"; raise if it is unknown."""
     require_one_of(CHOICES, "recovery", value)
     return {} if value == NONE else {"recovery": value}
 
@@ -101,15 +104,15 @@ class SweepSettings:
         return dataclasses.asdict(self)
 
     def planner_options(self) -> Options:
-        """Return the keyword arguments for creating the planner that follow from the settings."""
+        """Return the settings that are keyword arguments of the task's function `planner`."""
         return self._values(self.PLANNER)
 
     def draw_options(self) -> Options:
-        """Return the keyword arguments for drawing cases that follow from the settings."""
+        """Return the settings that are keyword arguments of the task's function `draw`."""
         return {k: value for k, value in self._values(self.DRAW).items() if value is not None}
 
     def judge_options(self) -> Options:
-        """Return the keyword arguments for the task's referee that follow from the settings."""
+        """Return the settings that are keyword arguments of the task's function `judge`."""
         return self._values(self.JUDGE)
 
     def _values(self, names: tuple[str, ...]) -> Options:
@@ -129,7 +132,7 @@ def settings_to_resume(kind: type[AnySettings], parameters: Options, given: Opti
 def settings_of_manifest(
     kind: type[KnownSettings], parameters: Options, name: str
 ) -> KnownSettings:
-    """Return a run's settings from its manifest; raise `ArgumentError` if they break a rule."""
+    """Return a run's settings from its manifest; raise `ArgumentError` if they are invalid."""
     try:
         return kind(**parameters)
     except (TypeError, ValueError) as error:

@@ -42,7 +42,7 @@ class Source(abc.ABC):
         return -(-self.num // self.batch)
 
     def chunk(self, number: int) -> Chunk:
-        """Return the cases of chunk `number`; raise `ArgumentError` if a case breaks a rule."""
+        """Return the cases of chunk `number`; raise `ArgumentError` if a case is invalid."""
         return self.cases(number * self.batch, min((number + 1) * self.batch, self.num))
 
     def check(self) -> PyTree:
@@ -51,7 +51,7 @@ class Source(abc.ABC):
 
     @abc.abstractmethod
     def cases(self, first: int, last: int) -> Chunk:
-        """Return cases `first` to `last - 1`; raise `ArgumentError` if a case breaks a rule."""
+        """Return cases `first` to `last - 1`; raise `ArgumentError` if a case is invalid."""
 
     @abc.abstractmethod
     def description(self) -> Entries:
@@ -79,7 +79,7 @@ class DrawnSource(Source):
 
 
 def fill_in(settings: SweepSettings, num: int, batch: int) -> Entries:
-    """Return the fields of a `Source`; `num` and `batch` are used where the settings are None."""
+    """Return settings, `num`, `batch` for a `Source`; the arguments replace settings of None."""
     num, batch = settings.num or num, settings.batch or batch
     rule = f"at most {_MOST_PARTS * batch:,} with a batch of {batch}, as each batch is a file"
     require(num <= _MOST_PARTS * batch, "num", rule, num)

@@ -65,7 +65,7 @@ class Tally:
             more.add(rows)
 
     def examples(self, rows: pa.Table, success: np.ndarray) -> list[np.ndarray]:
-        """Return masks of the rows that figures may show as example, the preferred mask first."""
+        """Return masks of rows for the report's example, best first: successes, then any row."""
         return [success, np.ones_like(success)]
 
     def summary(self) -> Entries:

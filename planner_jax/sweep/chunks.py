@@ -181,7 +181,10 @@ def _make_here(
 
 
 def times_of(maker: Maker, records: dict[int, Record]) -> Entries:
-    """Return planning, compile and referee times; may plan some cases again without compilation."""
+    """Return planning, compile and referee times of all chunks of a sweep, without compilation.
+
+    If most chunks were planned while JAX compiled, one chunk is planned again to measure its time.
+    """
     parts = [records[number] for number in sorted(records)]
     warm = [part for part in parts if part["warm"]]
     num, seconds = (sum(part[name] for part in warm) for name in ("num", "plan_seconds"))

@@ -116,7 +116,7 @@ def _draw_thrust_limits(axes: Axes, setting: Entries) -> None:
         axes.axhspan(0.0, setting["min_thrust"], **FORBIDDEN)
         return
     most = setting.get("acceleration")
-    # If the thrust of each rotor is limited instead of their sum, no limit is drawn.
+    # If only the thrusts of single rotors are limited, the plotted total thrust has no limit.
     if most is None:
         return
     bound = gravity + most

@@ -72,6 +72,6 @@ class QuadrotorSettings(SweepSettings):
         require_one_of(CHOICES, "recovery", self.recovery)
 
     def planner_options(self) -> Entries:
-        """Return the keyword arguments for creating the planner that follow from the settings."""
+        """Return the settings that are keyword arguments of the task's function `planner`."""
         more = {} if self.effort == EFFORTS[0] else {"effort": self.effort}
         return super().planner_options() | more | recovery_options(self.recovery)

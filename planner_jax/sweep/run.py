@@ -54,7 +54,7 @@ def start_sweep(
             devices. None plans in this process.
 
     Raises:
-        ArgumentError: an argument or a case breaks a rule; all files of the run are removed.
+        ArgumentError: an argument or a case is invalid; all files of the run are removed.
         SweepInterrupted: on Ctrl-C; the folder can be resumed.
         WorkersFailed: the workers could not plan a chunk of cases; the folder can be resumed.
         OSError: a file cannot be written; the folder can be resumed.
@@ -202,7 +202,7 @@ def _finish(
         write_report(folder)
         return folder.write_manifest({**manifest, "state": "complete"})
     except ArgumentError:
-        # A case breaks a rule, so the run can never be finished. Its folder is deleted.
+        # A case is invalid, so the run can never be finished. Its folder is deleted.
         folder.discard()
         raise
     except (KeyboardInterrupt, WorkersFailed, OSError) as error:

@@ -32,7 +32,7 @@ SingleT = TypeVar("SingleT", bound=SingleSettings)
 
 _SAMPLES = 4001  # number of times at which a plan is compared with the limits
 
-# Units of the quantities of a flight that have an upper limit. The names are keys of `PANELS`.
+# Quantity of a flight with an upper limit -> unit. `PANELS` has a function to compute each one.
 _ABOVE = {"speed": "m/s", "acceleration": "m/s^2", "body_rate": "rad/s"}
 
 
@@ -70,9 +70,9 @@ class Answer:
 
 
 class Single(abc.ABC, Generic[SingleT]):
-    """Base class of the command `plan` for one task: it makes, plans and describes a case."""
+    """Base class of the command `plan TASK`: make a case from options, plan and describe it."""
 
-    # Option that sets a field of the case, by field. Other fields are set by options of their name.
+    # Field of the case -> option that sets it, if the names differ. Errors name the option.
     NAMES: ClassVar[dict[str, str]] = {"head_state": "start"}
 
     def __init__(self, task: Task, settings: SingleT):
@@ -91,7 +91,7 @@ class Single(abc.ABC, Generic[SingleT]):
         """Return how close the plan comes to each limit that only this task has."""
 
     def answer(self) -> Answer:
-        """Plan the case and judge the plan; raise `ArgumentError` if the case breaks a rule."""
+        """Plan the case and judge the plan; raise `ArgumentError` if an option is invalid."""
         try:
             case = jax.tree.map(np.asarray, self.case())
             planner = self.task.planner(self.settings.planner, **self.settings.planner_options())
@@ -136,7 +136,6 @@ def _pieces(found: QuadrotorPlan) -> tuple[np.ndarray, np.ndarray]:
 def _closest(
     times: np.ndarray, words: str, values: np.ndarray, allowed: SupportsFloat, least: bool = False
 ) -> Margin:
-    """Return the margin at the time at which `values` are closest to a limit, or exceed it most."""
     # Values are NaN where the attitude is undefined; such a plan exceeds the limit infinitely.
     values = np.nan_to_num(values, nan=-np.inf if least else np.inf)
     at = int(np.argmin(values) if least else np.argmax(values))
@@ -190,12 +189,12 @@ def _table(margins: Sequence[Margin]) -> list[str]:
 
 @dataclasses.dataclass(frozen=True)
 class OneRow(RunRows):
-    """One case in the form of a run's rows, so that the figures of runs can draw it."""
+    """The case of `planner-jax plan` in the form of a sweep's row, for the figures of sweeps."""
 
     row: Row
 
     def same_case(self) -> list[tuple[str, Row]]:
-        """Return one pair in a list: the planner's name, and the only row."""
+        """Return [(planner's name, row with its plan)]; only one planner has planned the case."""
         return [(self.manifest["parameters"]["planner"], self.row)]
 
 

@@ -18,7 +18,7 @@ class SingleCatch(Single[SingleCatchSettings]):
     NAMES = {**Single.NAMES, **{f"net.{name}": f"net_{name}" for name in ("height", "radius")}}
 
     def case(self) -> PyTree:
-        """Make the case of the specified balls, which must be caught before the horizon."""
+        """Make the case of the specified balls, all to be caught before the time `horizon`."""
         given = self.settings
         pos, vel = (jnp.asarray(part, jnp.float32) for part in zip(*given.balls, strict=True))
         num = pos.shape[0]
@@ -31,7 +31,7 @@ class SingleCatch(Single[SingleCatchSettings]):
         return self.task.case(path, np.full(num, given.horizon), **given.case_options())
 
     def contact(self, answer: Answer) -> list[str]:
-        """Describe time, position, speed of the ball and miss in one sentence for every catch."""
+        """Describe each catch in a sentence: time, position, speed, distance from net's centre."""
         lines, targets, verdict = [], answer.case.targets, answer.verdict
         numbers = (answer.plan.order, verdict.catch_times, verdict.net_distance)
         for target, time, away in zip(*map(np.asarray, numbers), strict=True):
@@ -46,7 +46,7 @@ class SingleCatch(Single[SingleCatchSettings]):
         return lines
 
     def task_margins(self, answer: Answer) -> list[Margin]:
-        """Return how close catches come to the limits of the net's radius, angle and time."""
+        """Return the margins of the catches: time, net angle, ball's distance from net's centre."""
         net, verdict = answer.case.net, answer.verdict
         times = np.asarray(verdict.catch_times)
         horizons = np.asarray(answer.case.horizon)[np.asarray(answer.plan.order)]

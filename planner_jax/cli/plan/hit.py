@@ -29,7 +29,7 @@ class SingleHit(Single[SingleHitSettings]):
         ]
 
     def task_margins(self, answer: Answer) -> list[Margin]:
-        """Return how close a hit comes to the limits of racket radius, hitting speed and apex."""
+        """Return the margins of a hit: ball's distance from racket's centre, speeds, and apex."""
         limits, verdict = answer.case.hit_limits, answer.verdict
         end = float(np.sum(answer.plan.trajectory.durations))
         speeds = np.abs(np.asarray(verdict.hitting_velocity))

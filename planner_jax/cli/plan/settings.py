@@ -23,7 +23,7 @@ class SingleSettings:
     """Options of `planner-jax plan` for hits and catches; a subclass adds options of one task.
 
     Each field is an option. Its `metavar`, such as "X Y Z", has one word for each number of the
-    option's value. A value that breaks a rule raises `ArgumentError`.
+    option's value. A number that is not finite, or an unknown name, raises `ArgumentError`.
     """
 
     planner: str | None = option(None, "NAME", "")  # None selects the first planner of the task
@@ -51,7 +51,7 @@ class SingleSettings:
                 value = tuple(tuple(x) if isinstance(x, list) else x for x in value)
                 object.__setattr__(self, field.name, value)
             for number in _numbers(value):
-                # Of all options only the greatest thrust may be infinite.
+                # Only `max_thrust` may be infinite, which means that the thrust has no upper limit.
                 sound = math.isfinite(number) or (field.name == "max_thrust" and number > 0.0)
                 require(sound, field.name, "finite", number)
 

@@ -37,11 +37,11 @@ class BlockSweep(Sweep[BlockSettings]):
         return [*COLUMNS, *columns_of(batch.plans)]
 
     def planner(self, settings: BlockSettings) -> Planner:
-        """Create the run's planner, wrapped if a camera or the planning time is simulated."""
+        """Create the run's planner, wrapped in simulations of camera or planning time if set."""
         return follow_study(super().planner(settings), settings)
 
     def other_planners(self, settings: BlockSettings) -> Entries:
-        """Return the task's other planners; none if a camera or planning time is simulated."""
+        """Return other planners to compare with; none if a camera or planning time is simulated."""
         return {} if settings.is_study else super().other_planners(settings)
 
     def require_fit(self, settings: BlockSettings, planner: Planner, cases: PyTree) -> None:

@@ -49,7 +49,7 @@ class HitSettings(QuadrotorSettings):
             object.__setattr__(self, "serves", os.path.abspath(self.serves))
 
     def planner_options(self) -> Entries:
-        """Return the keyword arguments for creating the planner that follow from the settings."""
+        """Return the settings that are keyword arguments of the task's function `planner`."""
         truer = {"drag_after_impact": True} if self.drag_after_impact else {}
         return super().planner_options() | truer
 

@@ -36,7 +36,7 @@ class ServeSource(Source):
     folder: Serves | None  # all serves of published files, if the settings name a folder of files
 
     def cases(self, first: int, last: int) -> Chunk:
-        """Return cases `first` to `last - 1` with their serves; raise if a case breaks a rule."""
+        """Return cases `first` to `last - 1` with their serves; raise if a case is invalid."""
         settings = self.settings
         if self.folder is not None:
             serves = self.folder[first:last]
@@ -51,7 +51,7 @@ class ServeSource(Source):
         return Chunk(serves.index, jax.tree.map(np.asarray, cases), serves)
 
     def check(self) -> PyTree:
-        """Check the first chunk of cases, or all cases if their serves are read from files."""
+        """Check the first chunk of cases; all chunks if the serves are read from files."""
         cases = super().check()
         for chunk in range(1, 1 if self.folder is None else self.num_chunks):
             self.chunk(chunk)
@@ -71,7 +71,7 @@ class HitTally(Tally):
     MORE, READS = (ScenarioCounts,), (*COUNTED, *ScenarioCounts.READS)
 
     def examples(self, rows: pa.Table, success: np.ndarray) -> list[np.ndarray]:
-        """Return masks of the rows that figures may show as example, the preferred mask first."""
+        """Return row masks for the example in figures, first successes from left to far court."""
         scenario = rows["scenario"].to_numpy()
         left_to_far = success & np.array([name[0] + name[2] == "LF" for name in scenario])
         return [left_to_far, *super().examples(rows, success)]

@@ -25,7 +25,7 @@ class InterceptTally(Tally):
     NEAR = 0.1  # [m] the figures prefer a case whose car passes a moving obstacle at less than this
 
     def examples(self, rows: pa.Table, success: np.ndarray) -> list[np.ndarray]:
-        """Return masks of the rows that figures may show as example, the preferred mask first."""
+        """Return row masks for the example in figures, first successes close to an obstacle."""
         is_near = rows["mover_clearance"].to_numpy() < self.NEAR
         return [success & is_near, *super().examples(rows, success)]
 
