@@ -15,10 +15,10 @@ from jax.custom_derivatives import SymbolicZero
 from planner_jax.ball.flight import BallState, fly, gravity_vector
 from planner_jax.core.arithmetic import reciprocal
 
-# Number of Runge-Kutta steps of a flight; the error at the end of a 2 s flight is then 0.2 mm.
+# Number of Runge-Kutta steps that integrate a flight. After a flight of 2 s the error is 0.2 mm.
 _FLIGHT_STEPS = 10
-# Number of steps of a coarse flight, for the first two Newton steps; with fewer steps, Newton's
-# method diverges for strong drag.
+# Number of Runge-Kutta steps that integrate a flight in the first two Newton steps of `_aim`. With
+# fewer steps, Newton's method diverges for strong drag.
 _COARSE_STEPS = 8
 
 Tangent = Array | SymbolicZero
@@ -32,19 +32,17 @@ def aim_drag_free(pos: Array, target: Array, flight_time: Array, gravity: Array)
 def aim_with_drag(
     pos: Array, target: Array, flight_time: Array, drag: Array, gravity: Array
 ) -> Array:
-    """Return the initial velocity with which a ball with quadratic drag reaches a target.
+    """Return the initial velocity (3,) with which a ball with quadratic drag reaches a target.
 
     The ball starts at `pos`, and is at `target` after `flight_time` > 0 [s]. Newton's method starts
-    from the drag-free velocity: two steps on a coarse flight, then two on a fine one. The implicit
-    function theorem gives the derivatives.
+    from the drag-free velocity. Two steps integrate the flight coarsely; two more steps integrate
+    it finely and reuse the last Jacobian. The implicit function theorem gives the derivatives.
     """
     return _aim(target - pos, jnp.asarray(flight_time), jnp.asarray(drag), jnp.asarray(gravity))
 
 
 @jax.custom_jvp
 def _aim(displacement: Array, flight_time: Array, drag: Array, gravity: Array) -> Array:
-    """Return the initial velocity (3,) with which a ball with drag moves by `displacement` [m]."""
-
     def newton_step(_: Array, near: tuple[Array, Array]) -> tuple[Array, Array]:
         def landing(vel: Array) -> tuple[Array, Array]:
             end = _displacement(vel, flight_time, drag, gravity, _COARSE_STEPS)
@@ -54,7 +52,6 @@ def _aim(displacement: Array, flight_time: Array, drag: Array, gravity: Array) -
         slope, end = jax.jacfwd(landing, has_aux=True)(vel)
         return vel - _solve3(slope, end - displacement), slope
 
-    # Loops instead of unrolled steps reduce an optimiser's compiled program to a third of its size.
     start = aim_drag_free(jnp.zeros_like(displacement), displacement, flight_time, gravity)
     vel, slope = lax.fori_loop(0, 2, newton_step, (start, jnp.eye(3, dtype=start.dtype)))
 
@@ -109,7 +106,6 @@ def apex_with_drag(ball: BallState, flight_time: Array, drag: Array, gravity: Ar
 
 
 def _compute_climb(vel: Array, flight_time: Array, drag: Array, gravity: Array) -> Array:
-    """Compute the apex of `apex_with_drag` as a height [m] above the ball's initial position."""
     now = BallState(pos=jnp.zeros_like(vel), vel=vel)
     _, path = fly(now, flight_time, drag, gravity, num_steps=_FLIGHT_STEPS)
     height = jnp.concatenate([now.pos[None, 2], path.pos[:-1, 2]])

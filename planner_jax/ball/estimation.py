@@ -70,8 +70,8 @@ def ekf_init(
         vel: (3,) [m/s], expected velocity of the ball.
         pos_std: () or (3,) [m], standard deviation of each coordinate of the position.
         vel_std: () or (3,) [m/s], standard deviation of each coordinate of the velocity. In
-            float32 the product of vel_std and the time between observations should be below 1000
-            times the standard deviation of an observed position.
+            float32 vel_std * (time between observations) should be below 1000 times the standard
+            deviation of an observed position, as larger covariances have large rounding errors.
     """
     std = jnp.concatenate([jnp.ones_like(pos) * pos_std, jnp.ones_like(vel) * vel_std])
     return EkfState(mean=jnp.concatenate([pos, vel]), covariance=jnp.diag(std**2))

@@ -71,8 +71,6 @@ def predict_path(
 
 @functools.cache
 def _node_function(num_nodes: int) -> Callable:
-    """Build the function that integrates positions and velocities (N, 3) at a table's N nodes."""
-
     # Derivatives use forward mode, also inside reverse mode, so that no states must be stored.
     def integrate(
         pos: Array, vel: Array, resolution: Array, drag: Array, gravity: Array

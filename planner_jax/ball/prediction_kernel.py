@@ -30,9 +30,9 @@ def table_kernel(
 
     Args:
         num_nodes: number N of nodes.
-        moving: indices of arguments other than the position. If there are any, the kernel returns
-            derivatives by these arguments instead of states: first the derivatives of positions,
-            then the derivatives of velocities.
+        moving: indices of 1 velocity, 2 resolution, 3 drag, 4 gravity. If there are any, the kernel
+            returns derivatives by these arguments instead of states: first the derivatives of the
+            nodes' positions, then the derivatives of the nodes' velocities.
         interpret: run the kernel in Pallas's interpreter, without a GPU, for tests.
     """
 

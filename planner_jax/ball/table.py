@@ -101,7 +101,6 @@ def _check_values(name: str, value: ArrayLike, num: int) -> Numbers:
 
 
 def _evaluate(times: np.ndarray, values: list[PyTree], at: np.ndarray, order: int) -> PyTree:
-    """Return derivative `order` of a spline through positions (and velocities) at times `at`."""
     units, none = np.eye(times.size), np.zeros((times.size, times.size))
     if len(values) == 1:
         splines = [CubicSpline(times, units)]

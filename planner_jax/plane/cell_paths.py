@@ -29,7 +29,7 @@ class CellPath:
 
 @struct.dataclass
 class PathNoise:
-    """Gumbel noise for D random paths, of which a search uses the smoothest; may be batched."""
+    """Gumbel noise that selects D random paths, of which `draw_path` returns the smoothest."""
 
     layers: Array  # (layers + 1,), noise for the choice of the last layer
     ends: Array  # (D, levels, headings, 9), noise for the choice of the last cell
@@ -37,10 +37,10 @@ class PathNoise:
 
 
 def draw_noise(lattice: Lattice, num: int, seed: int, candidates: int) -> PathNoise:
-    """Draw the Gumbel noise with which `draw_path` draws `num` random paths.
+    """Draw the Gumbel noise of `num` calls of `draw_path`; leaves have the leading axis `num`.
 
-    Each path is the smoothest of `candidates` random paths. `lattice` has the numbers of time
-    steps, speed levels and headings. All cases of a batch use the same noise.
+    Each call draws `candidates` random paths and returns the smoothest of them. `lattice` has the
+    numbers of time steps, speed levels and headings.
     """
     rng = np.random.default_rng(seed)
     ends = rng.gumbel(size=(num, candidates, lattice.levels, lattice.headings, 9))
@@ -50,14 +50,12 @@ def draw_noise(lattice: Lattice, num: int, seed: int, candidates: int) -> PathNo
 
 
 def _velocity(level: Array, heading: Array, grid: Grid) -> Array:
-    """Return velocities (..., 2) in units of a speed level; axis 0 has the heading of bin 0."""
     dtype = grid.cell.dtype
     angle = (2.0 * np.pi / grid.lattice.headings) * heading.astype(dtype)
     return level[..., None].astype(dtype) * jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)
 
 
 def _roughness(path: CellPath, grid: Grid, num: Array) -> Array:
-    """Return the sum of |v[n + 2] - v[n]|^2 for a path's velocities v at its first `num` times."""
     velocity = _velocity(path.level, path.bin, grid)
     change = jnp.sum((velocity[2:] - velocity[:-2]) ** 2, axis=1)
     return jnp.sum(jnp.where(jnp.arange(2, grid.lattice.layers) < num, change, 0.0))
@@ -78,10 +76,10 @@ def draw_path(
         grid: grid of the reach set.
         reach: set of cells that the car can reach.
         num: () int32, index of the layer at which the car meets the goal.
-        cells: cells around the goal, from `goal_cells`.
-        is_reached: whether the car can be in these cells, from `goal_cells`. If no entry is true,
-            the returned path is meaningless.
-        noise: noise of one path.
+        cells: (headings, 9, 2) int32, indices [x, y] of cells around the goal, by `goal_cells`.
+        is_reached: (levels, headings, 9) bool, whether the car can be in these cells. If no entry
+            is true, the returned path is meaningless.
+        noise: noise of one call, without the leading axis of the result of `draw_noise`.
         directness: weight of the squared difference, in levels of speed, between the velocity at a
             cell and the mean velocity from the start to this cell. With a greater weight, paths are
             straighter and their speed is more even.
@@ -90,14 +88,11 @@ def draw_path(
     choices = np.meshgrid([-1, 0, 1], np.arange(-SPAN, SPAN + 1), indexing="ij")
     choices = jnp.asarray(np.stack(choices, axis=-1).reshape(-1, 2), jnp.int32)
 
-    # `along` converts a displacement in cells per layer to a velocity in levels of speed, with axes
-    # along the heading of bin 0 and to its left.
     cosine, sine = jnp.cos(grid.heading), jnp.sin(grid.heading)
     along = jnp.stack([jnp.stack([cosine, sine]), jnp.stack([-sine, cosine])])
     along *= (lattice.levels - 1) / lattice.pace
 
     def draw(ends: Array, steps: Array) -> CellPath:
-        # The bonus 1 prefers the cell of the goal, which is cell 0, to its neighbours.
         score = ends + jnp.where(jnp.arange(9) == 0, 1.0, 0.0)[None, None]
         best = jnp.argmax(jnp.where(is_reached, score, -jnp.inf))
         level, heading, around = jnp.unravel_index(best, is_reached.shape)

@@ -6,8 +6,8 @@ from jax import Array, lax
 
 from planner_jax.plane.obstacles import Obstacles, distances
 
-# The corners of a wall are padded by repeating its last corner. If the second half of the corners
-# is only padding, and has at least `_HALF` corners, distances are computed from the first half.
+# An array of a wall's corners is padded by repeats of the last corner. To save time, distances are
+# computed from its first half if its second half is only padding and has at least this length.
 _HALF = 4
 
 

@@ -149,8 +149,6 @@ def _shift(rows: Array, move: Array) -> Array:
 
 
 def _map_needed(body: Callable[[Array], Array], over: Array, needed: Array) -> Array:
-    """Apply `body` to every entry of `over`; on a CPU, only to the first `needed` entries."""
-
     def loop(over: Array, needed: Array) -> Array:
         one = jax.eval_shape(body, over[0])
         results = jnp.zeros((over.shape[0], *one.shape), one.dtype)
@@ -162,7 +160,6 @@ def _map_needed(body: Callable[[Array], Array], over: Array, needed: Array) -> A
 
 
 def _stencils(grid: Grid, movers: Obstacles, radius: Array) -> Array:
-    """Return bitmaps (M, _STENCIL) of the cells closer than `radius` [m] to each of M obstacles."""
     offsets = grid.cell * (jnp.arange(_STENCIL, dtype=grid.corner.dtype) - _STENCIL // 2)
     x, y = jnp.meshgrid(offsets, offsets)
     far, _ = distances(movers.corners, movers.present, x.reshape(1, -1), y.reshape(1, -1))
@@ -170,7 +167,6 @@ def _stencils(grid: Grid, movers: Obstacles, radius: Array) -> Array:
 
 
 def _draw_movers(grid: Grid, movers: Obstacles, stencils: Array, time: Array) -> Array:
-    """Return a bitmap (words, cells) uint32 of the cells in moving obstacles at a `time` () [s]."""
     cells = grid.lattice.cells
     middle = (movers.centre + movers.velocity * time - grid.corner[None]) / grid.cell
     at = jnp.round(jnp.clip(middle, -cells, 2.0 * cells)).astype(jnp.int32) - _STENCIL // 2
@@ -224,8 +220,6 @@ def reach_set(
     halves = jnp.clip(halves, -_FARTHEST, _FARTHEST)
     moves = jnp.moveaxis(halves[1:].reshape(-1, 2, levels, headings, 2), 1, 3)
     most = vehicle.turn_rates * grid.step / width
-    # Turns are whole numbers of heading bins, too. The greatest turn at a layer is a difference of
-    # two rounded angles, so that these turns add up to the angle that the turn rate allows.
     before = jnp.arange(lattice.layers + 1, dtype=dtype)[:, None]
     whole = jnp.diff(jnp.floor(before * most[None] + 0.1), axis=0)  # (layers, levels)
     turns = jnp.abs(jnp.arange(-SPAN, SPAN + 1, dtype=dtype))[None, None] <= whole[..., None]
@@ -291,7 +285,6 @@ def reach_set(
 
 
 def _start_bits(grid: Grid, initial_speed: Array, speed: Array) -> Array:
-    """Mark the car's states at time 0: start cell, start heading, levels near the initial speed."""
     lattice, cell = grid.lattice, grid.start
     level = initial_speed / speed * (lattice.levels - 1)
     near = jnp.abs(jnp.arange(lattice.levels, dtype=level.dtype) - level) < 1.0

@@ -1,8 +1,8 @@
 """Paths of targets in the plane: classes that return position and velocity at a time.
 
 A path is a pytree with a method `at(time) -> PointState`, differentiable in time and in every leaf.
-The classes here cover the targets of [Qu2022] and the paths that are fitted to observations of
-them. A user may pass a class of their own. World frame in the plane, SI units.
+The classes here cover the targets of [Qu2022], and polynomials fitted to observed positions of a
+target. Users may write classes of their own. World frame in the plane, SI units.
 """
 
 from typing import Protocol
@@ -78,9 +78,9 @@ class LaterPath:
 
 
 def arc(turn_rate: Array, time: Array) -> tuple[Array, Array]:
-    """Return a target's displacements along its initial velocity and to its left, over its speed.
+    """Return how far a target moves ahead and to its left, both divided by its speed, (...) [s].
 
-    The target has a constant speed and turn rate [rad/s]. The results (...) are in seconds.
+    Ahead is the direction of the velocity at time 0. Speed and turn rate [rad/s] are constant.
     """
     angle = turn_rate * time
     return time * _sinc(angle), time * _cosc(angle)

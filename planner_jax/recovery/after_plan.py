@@ -38,7 +38,7 @@ def append_recovery(case: PyTree, found: Plan, to: str) -> Plan:
     Args:
         case: one case, whose limits and obstacles the recovery respects.
         found: plan of a quadrotor, a car or an arm for this case.
-        to: "brake", or for a quadrotor also "home"; see `with_recovery.add_recovery`.
+        to: "brake" stops anywhere; "home", only for a quadrotor, stops at the start position.
 
     Returns:
         The quadrotor's plan with a `recovery`, or one `CarPlan` or `ArmPlan` to standstill.

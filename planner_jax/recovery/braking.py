@@ -23,15 +23,19 @@ _SPARE = 0.98  # fraction of each limit that braking uses
 _SAMPLES = 400  # number of times at which distances are computed
 _GAP = 1e-3  # [m] least distance at these times, since it may be smaller in between
 _DECELERATIONS = (1.0, 0.7, 0.4)  # tried decelerations / the car's greatest deceleration
-# Final curvatures of candidates, as fractions of the car's greatest curvature. The curvature at the
-# plan's end is tried first.
+# Tried final curvatures / the car's greatest curvature. The curvature at the plan's end is tried
+# before these.
 _CURVATURES = (0.0, 0.5, -0.5, 1.0, -1.0)
 _USUAL = 1.0  # [m/s^2] or [1/m], value that replaces an infinite limit
 _SLOWER = (1.5, 2.0, 3.0)  # tried durations / the shortest in which all joints can stop
 
 
 def brake_car(case: PyTree, plan: CarPlan) -> CarPlan:
-    """Extend the plan of a car by braking; raise `NoRecovery` if every candidate collides."""
+    """Extend the plan of a car by braking to standstill.
+
+    Several decelerations and final curvatures are tried. The first motion without a collision is
+    selected. If there is none, `NoRecovery` is raised.
+    """
     why = ""
     knots = (jnp.asarray(plan.speed), jnp.asarray(plan.curvature))
     begin = pose_at(jnp.asarray(plan.start), plan.time, *knots, plan.time)
@@ -51,7 +55,6 @@ def brake_car(case: PyTree, plan: CarPlan) -> CarPlan:
 
 
 def _car_candidates(case: PyTree, plan: CarPlan) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Yield speeds and curvatures (n + 1,) at the plan's last knot and at n further knots."""
     limits = case.limits
     step = float(plan.time) / (len(plan.speed) - 1)
     first, bend = float(plan.speed[-1]), float(plan.curvature[-1])
@@ -111,10 +114,11 @@ _poses = jax.jit(jax.vmap(pose_at, in_axes=(None, None, None, None, 0)))
 
 
 def brake_arm(case: PyTree, plan: ArmPlan) -> ArmPlan:
-    """Extend the plan of an arm by braking; raise `NoRecovery` if every candidate fails.
+    """Extend the plan of an arm by braking to standstill, with constant decelerations of joints.
 
-    Each joint has a constant deceleration. Candidates: all joints stop together in the shortest
-    time, each joint stops as soon as it can, all joints stop together later.
+    Tried in this order: all joints stop together in the shortest time, each joint stops as soon as
+    it can, all joints stop together later. `NoRecovery` is raised if every one of these motions
+    collides or exceeds the range of a joint.
     """
     coeffs, durations = (np.asarray(x, np.float64) for x in vars(plan.motion).values())
     state = states_at(plan.motion, np.asarray(durations.sum()))
@@ -137,7 +141,6 @@ def brake_arm(case: PyTree, plan: ArmPlan) -> ArmPlan:
 def _arm_candidates(
     angles: np.ndarray, rates: np.ndarray, most: np.ndarray
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Yield braking motions of six joints: coefficients (M, 3, 6), durations (M,) of M pieces."""
     alone = np.maximum(np.abs(rates) / (_SPARE * most), 1e-3)
     together = np.full(6, alone.max())
     for ends in (together, alone, *(factor * together for factor in _SLOWER)):
@@ -153,7 +156,6 @@ def _arm_candidates(
 
 
 def _arm_problem(case: PyTree, pieces: np.ndarray, times: np.ndarray) -> str:
-    """Return why a motion of M pieces, given by coefficients (M, 3, 6), is not allowed, or ""."""
     tau = times[:, None, None] * np.linspace(0.0, 1.0, _SAMPLES // len(times))[:, None]
     first, second, third = np.moveaxis(pieces, 1, 0)[:, :, None]
     angles = (first + tau * (second + tau * third)).reshape(-1, 6)

@@ -16,17 +16,17 @@ from planner_jax.recovery.case import RecoveryCase
 from planner_jax.robot.quadrotor import QuadrotorPlan
 from planner_jax.trajectory.polynomial import PiecewisePolynomial
 
-# [m] Least height of the final position above the least allowed height, in starting points.
+# [m], least height of the final position of a starting point above the least allowed height.
 _ABOVE_GROUND = 0.2
-# Starting points of the search, best first. Column 1: a base duration T_0 [s], to which the time
-# for the displacement at half the greatest speed is added. Column 2: a factor c; the displacement
-# to standstill is c T_0 v / 2 for the initial velocity v.
+# Starting points of the search in the order of trial: rows of a time T_0 [s] and a factor c. The
+# displacement to standstill is d = c T_0 v / 2 for the initial velocity v, and the duration is
+# T_0 + |d| / (v_max / 2) for the greatest allowed speed v_max.
 _GUESSES = np.array([(1.0, 1.0), (1.6, 1.0), (0.7, 0.7), (2.5, 1.5), (1.2, 0.3), (4.0, 1.0)])
 
 
 @struct.dataclass
 class RecoveryContext:
-    """The data of one case for the methods of `RecoveryPlanner`: the case alone."""
+    """The data with which `RecoveryPlanner` evaluates the cost of a trajectory: only the case."""
 
     case: RecoveryCase
 
@@ -34,14 +34,15 @@ class RecoveryContext:
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class RecoveryPlanner(ChainPlanner[RecoveryCase, QuadrotorPlan]):
-    """Plans minimum-snap trajectories to standstill, whose durations are free.
+    """Planner of minimum-snap trajectories to standstill, whose durations are free.
 
-    A trajectory of M pieces has n = 3 (M - 1) + 4 decision variables, in units of `scale`: whitened
-    waypoint offsets (scaled deviations from the smoothest trajectory), log duration, and the
-    displacement to standstill. With `to="home"` it stands still at the case's `home` instead.
+    A trajectory of M pieces has n = 3 (M - 1) + 4 decision variables, in units of `scale`: offsets
+    (3,) of M - 1 waypoints from the smoothest trajectory, the logarithm of the duration, and the
+    displacement (3,) to standstill. With `to="home"` the trajectory ends at the case's `home`, and
+    the displacement has no effect.
 
-    Cost: energy_weight * integral |snap|^2 + time_weight * duration + integral of the smoothed
-    hinges of the limits, and of the case's extras.
+    Cost: energy_weight * integral |snap|^2 + time_weight * duration + integral of smooth one-sided
+    penalties on the limits and of the user's extra terms.
     """
 
     case_type = RecoveryCase
@@ -52,8 +53,8 @@ class RecoveryPlanner(ChainPlanner[RecoveryCase, QuadrotorPlan]):
     decode_nodes = (40, 40)
     proportions: tuple[float, ...] = (0.4, 0.8, 1.0, 1.0, 1.0)  # relative durations of the pieces
     to: str = "brake"  # where to stand still: "brake" anywhere, "home" at the case's `home`
-    # The preceding plan may end close to its limits, where the usual margin is exceeded. So later
-    # rounds (attempts) reduce the margin that the search keeps from the limits.
+    # The recovery starts where the preceding plan ends, which may be closer to a limit than the
+    # distance at which penalties start. So later rounds (attempts) reduce this distance, `margin`.
     rounds: tuple[Round, ...] = (
         Round(starts=1, solver=LbfgsConfig(max_steps=25)),
         Round(starts=2, solver=LbfgsConfig(max_steps=80), settings=(("margin", 0.01),)),

@@ -33,7 +33,10 @@ class RecoveringPlanner(PlannerAround[CaseT, PlanT]):
     def settle(
         self, cases: PyTree, plan_of: Callable[[Planner, PyTree], PyTree] | None = None
     ) -> tuple[PyTree, PyTree]:
-        """Raise `TypeError`: two separate minimisations, of plan and recovery, have no gradient."""
+        """Raise `TypeError`, since `pj.gradient` cannot differentiate plans with a recovery.
+
+        The plan and its recovery trajectory are results of two separate minimisations.
+        """
         raise TypeError(
             "plans with a recovery have no gradient, as plan and recovery are minimised one after "
             "the other: leave `recovery` out"
@@ -56,7 +59,6 @@ class RecoveringPlanner(PlannerAround[CaseT, PlanT]):
         return plans
 
     def _plan_at(self, factor: float, drive: Drive, cases: PyTree) -> tuple[PyTree, PyTree]:
-        """Plan with `factor` times the speed limit; return plans, and which only lack recovery."""
         speed = (factor * cases.limits.speed).astype(cases.limits.speed.dtype)
         slower = dataclasses.replace(cases.limits, speed=speed)
         plans, _ = drive(self.planner, dataclasses.replace(cases, limits=slower))
@@ -92,7 +94,7 @@ _end_states = jax.jit(jax.vmap(end_state))
 
 
 def add_recovery(planner: Planner[CaseT, PlanT], recovery: str) -> RecoveringPlanner[CaseT, PlanT]:
-    """Make a planner whose plans of a quadrotor continue from the last contact to standstill.
+    """Make a planner whose plans continue from a quadrotor's hit or last catch to standstill.
 
     Args:
         planner: a planner whose plans have the trajectory of a quadrotor.
@@ -100,7 +102,7 @@ def add_recovery(planner: Planner[CaseT, PlanT], recovery: str) -> RecoveringPla
             trajectory back to the position at which the case starts.
 
     Raises:
-        ValueError: `recovery` is another word.
+        ValueError: `recovery` is neither "brake" nor "home".
     """
     require_one_of(RECOVERIES, "recovery", recovery)
     return RecoveringPlanner(planner, RecoveryPlanner(to=recovery))

@@ -83,6 +83,8 @@ class Approach(NamedTuple):
 def nearest_points(distance: Callable, *bodies: Array) -> tuple[Array, Any]:
     """Return a distance () [m], and the parameters of the nearest points for `approach`.
 
+    A parameter is for example the fraction, from 0 to 1, at which the point lies along a segment.
+
     Args:
         distance: function of this module that returns a distance or a height.
         bodies: the arguments of the function `distance`.
@@ -181,8 +183,7 @@ def _nearest_of_rectangle(ends: Array, middle: Array, edges: Array) -> Any:
 
     They are the fraction along the segment (0 to 1), the multiples of both half-edges (-1 to 1),
     and whether the bodies are apart. The rectangle is treated as a box without thickness, whose
-    axes are the half-edges e and f and their cross product. Squared lengths are in units of
-    |e|^2 |f|^2, which saves divisions.
+    axes are the half-edges e and f and their cross product.
     """
     (start, end), (e, f) = _rows(ends), _rows(edges)
     step, away = _minus(end, start), _minus(start, tuple(middle))
@@ -225,11 +226,6 @@ class _Slab(NamedTuple):
 
 
 def _slab(to_low: Array, to_high: Array, speed: Array, weight: Array) -> _Slab:
-    """Make a slab from the signed distances () of its two planes from a segment's start.
-
-    `speed` is the segment's signed extent perpendicular to the slab. `weight` is the square of this
-    extent, in a unit that all slabs of one pair of bodies have in common.
-    """
     moves = weight > _TINY
     step = jnp.where(moves, speed, 1.0)
     # Do not multiply by 1 / step: XLA may fuse a product with a later difference of two equal
@@ -245,18 +241,16 @@ def _slab(to_low: Array, to_high: Array, speed: Array, weight: Array) -> _Slab:
 def _share_nearest_to_slabs(slabs: list[_Slab]) -> Array:
     """Return the fraction () along a segment nearest to the intersection of orthogonal slabs.
 
-    A slab is the space between two parallel planes. The squared distance of the segment's point at
-    the fraction s is the sum of its squared distances from three slabs i. It is convex in s, and
-    half its derivative,
+    A slab is the space between two parallel planes. The segment's line is in slab i from the
+    fraction enters_i to the fraction leaves_i, and weight_i is the squared length of the segment
+    across the slab. The squared distance of the segment's point at the fraction s is the sum of its
+    squared distances from three slabs. It is convex in s, and half its derivative,
 
         sum_i  weight_i (max(s - leaves_i, 0) - max(enters_i - s, 0)),
 
-    is piecewise linear and never falls, with kinks where the segment's line enters and leaves the
-    slabs. The derivative's zero is interpolated between the last kink with a value <= 0 and the
-    first kink with a value >= 0. If it is 0 on an interval, the interval's middle is returned.
-
-    In this form the term of a slab is exactly 0 at the slab's own kinks, also in float32. Rounding
-    errors of coordinates could exceed the terms of slabs that are nearly parallel to the segment.
+    is piecewise linear and never falls. Its zero is interpolated between the last of the fractions
+    enters_i and leaves_i with a value <= 0 and the first with a value >= 0. If the derivative is 0
+    on an interval, the interval's middle is returned.
     """
 
     def half_derivative(s: Array | float) -> Array:
@@ -290,11 +284,6 @@ def _gap_to_line(shares: tuple[Array], ends: Array, position: Array) -> Vector:
 
 
 def _nearest_of_projection(middle: Array, edges: Array, position: Array) -> Any:
-    """Return where a rectangle is nearest to a vertical line, in the projection onto the ground.
-
-    The point of the projection's four edges that is nearest to the line is given as multiples, from
-    -1 to 1, of both half-edges. The third result is whether the line is outside the projection.
-    """
     e, f = _ground(edges)
     to_x, to_y = to = tuple(x - m for x, m in zip(position, middle[:2], strict=True))
     squares, product = (dot(e, e), dot(f, f)), dot(e, f)
@@ -313,8 +302,8 @@ def _nearest_of_projection(middle: Array, edges: Array, position: Array) -> Any:
             p, q = jnp.where(closer, along_e, p), jnp.where(closer, along_f, q)
     area = jnp.abs(_area(e, f))
     inside = (jnp.abs(_area(to, f)) < area) & (jnp.abs(_area(e, to)) < area)
-    # The projection of a vertical rectangle is a line segment. All these areas are then 0 for every
-    # point of the segment's line, so the distance from the rectangle's middle is tested, too.
+    # A vertical rectangle projects to a line segment. Rounding errors of the areas can make any
+    # point of this segment's line look inside, so the distance from the middle is tested, too.
     inside = inside & (dot(to, to) <= squares[0] + squares[1] + 2.0 * jnp.abs(product))
     return p, q, ~inside
 

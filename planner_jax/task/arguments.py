@@ -25,7 +25,11 @@ _DRAWN_BYTES = 1_000  # [B], estimated memory of one case of a suite
 def array_of(
     name: str, value: object, *shape: int, batch: tuple[int, ...], dtype: DTypeLike
 ) -> Array:
-    """Return the argument `value` as an array of shape `batch + shape`; raise as `numbers_of`."""
+    """Return the argument `value` as an array of the shape `batch + shape` and the type `dtype`.
+
+    A value of the shape `shape` is repeated for every case of the batch. For any other shape an
+    `ArgumentError` is raised, which names the argument.
+    """
     numbers = checks.numbers_of(name, value, batch, shape)
     with np.errstate(over="ignore"):  # a number too large for `dtype` becomes infinite, no warning
         if isinstance(numbers, np.ndarray):
@@ -44,7 +48,7 @@ def batch_of(name: str, vectors: object, *shape: int) -> tuple[int, ...]:
 
 
 def require_draw(num: int, seed: int, first: int) -> None:
-    """Raise unless `num`, `seed` and `first` are valid arguments of a task's function `draw`."""
+    """Raise an error unless num >= 1, seed >= 0 and first >= 0, and `num` cases fit in memory."""
     for name, value, least in (("num", num, 1), ("seed", seed, 0), ("first", first, 0)):
         require_size(name, value, least)
     require_memory("num", num, _DRAWN_BYTES)
@@ -100,7 +104,10 @@ def judge_by(
     kinds: tuple[type[Case], type[Plan]],
     settings: dict[str, object],
 ) -> VerdictT:
-    """Check the arguments of a task's `judge` against `kinds`; return its referee's verdict."""
+    """Check the arguments of a task's function `judge`, and return the verdict of its referee.
+
+    `kinds` are the required classes of the cases and of the plans.
+    """
     checks.require_kind("cases", cases, kinds[0])
     checks.require_kind("plans", plans, kinds[1])
     require_settings(referee, settings)

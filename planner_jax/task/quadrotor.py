@@ -71,7 +71,7 @@ def require_start(cases: PyTree) -> None:
 
 
 def require_own_robot(robot: object, usual: QuadrotorModel, suite: str) -> None:
-    """Raise if `robot` is not the default `usual`: suites of other packages define the robot."""
+    """Raise an error if `robot` is not the default `usual`; the `suite` defines its own robot."""
     if robot != usual:
         raise ArgumentError("robot", f"left out with suite {suite!r}, which has its own", shown="")
 
@@ -82,7 +82,7 @@ def limits_of(
     """Return a case's limits: the values in `given` that are not None, else the robot's limits.
 
     A robot with a net has limits of thrust, a robot with a racket only if `robot.limits.thrust` is
-    not None. The function `leaf(name, value, *shape)` broadcasts a value to the batch's shape.
+    not None. The function `leaf(name, value, *shape)` makes an array with the batch's leading axes.
     """
     own = robot.limits
     least, most = robot.thrust_bounds if robot.tool.kind == NET else own.thrust or (None, None)

@@ -70,9 +70,11 @@ def total_duration(trajectory: PiecewisePolynomial) -> Array:
 def energy_form(degree: int, order: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the quadratic form of the integral of a polynomial's squared `order`-th derivative.
 
+    The arguments of the form are the polynomial's coefficients in ascending powers of time.
+
     Returns:
-        The matrix (degree + 1, degree + 1) of the form for duration 1, and for each entry the power
-        of the duration by which it must be multiplied.
+        The matrix (degree + 1, degree + 1) of the form for the duration 1 s, and for each entry the
+        power of the duration by which it must be multiplied.
     """
     factors, powers = derivative_factors(degree, order), np.arange(degree + 1)
     exponents = np.maximum(powers[:, None] + powers[None, :] - 2 * order + 1, 1)

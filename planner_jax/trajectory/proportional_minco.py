@@ -66,8 +66,8 @@ class ProportionalMinco:
         """Return the matrix from end states and waypoint offsets (C columns) to samples.
 
         Each of M pieces has `nodes` + 1 samples of a derivative (0 is the position). Neighbours
-        share one sample, so that the shape is (M nodes + 1, C). The product is divided by
-        h^derivative for a mean piece duration h.
+        share one sample, so that the shape is (M nodes + 1, C). The product of matrix and columns
+        must be divided by h^derivative, for a mean piece duration h [s].
         """
         degree = 2 * self.order - 1
         factors = polynomial.derivative_factors(degree, derivative)
@@ -80,7 +80,6 @@ class ProportionalMinco:
 
 @functools.cache
 def _hermite_map(order: int) -> np.ndarray:
-    """Return the matrix from a polynomial's derivatives at 0 and 1 to its coefficients."""
     size = 2 * order
     ends = np.zeros((size, size))
     for d in range(order):
@@ -93,8 +92,7 @@ def _energy(coefficients: np.ndarray, shares: np.ndarray) -> np.ndarray:
     """Return the matrix (C, C) of the integral of a spline's |p^(s)|^2, a quadratic form.
 
     The C numbers, end states and waypoint offsets, define the spline: `coefficients` (M, 2s, C) map
-    them to polynomials of M pieces with durations `shares` (M,). The matrix is a sum of squares, as
-    rounding errors could otherwise exceed the small integral of a motion far from the origin.
+    them to polynomials of M pieces with durations `shares` (M,).
     """
     s = coefficients.shape[1] // 2
     root = np.linalg.cholesky(polynomial.energy_form(2 * s - 1, s)[0][s:, s:]).T
@@ -103,7 +101,6 @@ def _energy(coefficients: np.ndarray, shares: np.ndarray) -> np.ndarray:
 
 
 def _least_energy(energy: np.ndarray, num: int) -> np.ndarray:
-    """Return the quadratic form of the first `num` unknowns when the others minimise `energy`."""
     first, free = np.s_[:num], np.s_[num:]
     best = np.linalg.solve(energy[free, free], energy[free, first])
     return energy[first, first] - energy[first, free] @ best
@@ -125,7 +122,6 @@ def proportional_minco(
         raise ArgumentError("proportions", "some numbers > 0", proportions)
     s, m = order, len(proportions)
     shares = np.array(proportions) * m / np.sum(proportions)
-    # Piece i lasts r_i h. A d-th derivative by t / (r_i h) is r_i^d times the derivative by t / h.
     units = np.tile(shares[:, None] ** np.arange(s), 2)
     hermite = _hermite_map(s)
     # Energy of a piece of duration 1, as a quadratic form in the derivatives at its ends.
@@ -176,7 +172,11 @@ def proportional_minco(
 
 
 def boundary_rows(head_state: Array, tail_state: Array, piece_duration: Array) -> Array:
-    """Return the boundary rows (2s, 3) of two states (s, 3): derivative d times duration^d."""
+    """Return boundary rows (2s, 3) of states (s, 3) at a spline's start and end.
+
+    Row d of each state, the d-th derivative of the position, is multiplied by h^d, with the mean
+    duration h [s] of a piece. The rows are then independent of the spline's duration.
+    """
     scale = jnp.stack([piece_duration**k for k in range(head_state.shape[0])])[:, None]
     return jnp.concatenate([head_state * scale, tail_state * scale])
 
@@ -281,7 +281,6 @@ def _boundary_form_jvp(
 
 
 def _by_rows(maps: ProportionalMinco, rows: Array) -> Array:
-    """Return the energy's matrix times end states (2s, 3); this sum is faster than `matmul`."""
     return jnp.sum(jnp.asarray(maps.boundary_energy, rows.dtype)[..., None] * rows[None], axis=1)
 
 

@@ -11,10 +11,12 @@ from planner_jax.task.block.spec import TASK
 def planner(name: str = "online", **options: object) -> Planner[BlockCase, BlockPlan]:
     """Make a planner of blocks by its name.
 
+    An end pose is a pose of the arm in which the shield meets the ball.
+
     * `online`: a straight motion in joint space if one is free of collisions. Otherwise least
       squares find end pose, time of contact and motion together, from several starting points.
-    * `brisk`: the paths of `online` from rest to rest, as fast as the limits allow. The arm then
-      waits for the ball at standstill. These motions need more torque.
+    * `brisk`: the paths of `online` from standstill to standstill, as fast as the limits allow. The
+      arm then waits for the ball. These motions need more torque than the motions of `online`.
     * `library:FILE`: a motion that is stored in a file of `planner-jax library build`. The faces of
       two boxes around the arm are divided into cells, and the file has a motion for each pair of
       an outer and an inner cell through which a ball can fly.

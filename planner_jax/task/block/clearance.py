@@ -22,8 +22,8 @@ from planner_jax.task.block.scene import Scene
 
 FAR = 10.0  # [m], added to the distances from the pole if the scene has no pole
 # The forearm ends in a fork around the wrist, and the forearm's capsule extends beyond the fork.
-# For the distance of this capsule from the shield, its radius is therefore reduced to at most 0.71
-# times the distance of the wrist from the shield's face.
+# For distances from the shield, the capsule's radius is therefore reduced to at most this fraction
+# of the distance between the wrist and the shield's face.
 _FORK = 0.71
 _HALF_THICKNESS = 0.005  # [m], of the shield
 _SHIELD_LINK = 5
@@ -40,7 +40,7 @@ class _Poses(NamedTuple):
 
 
 class _Pairs(NamedTuple):
-    """P pairs of a moving body and a body that it must not touch, such as segments and a box."""
+    """P pairs of a link or shield and a body that it must not touch, with one shape of each."""
 
     measure: Callable  # function of `space.distances` that returns the distance of two shapes
     bodies: tuple[Array, ...]  # arguments of `measure`; their last axes are (P or 1, N)
@@ -107,12 +107,10 @@ def num_of_pole(arm: Arm) -> int:
 
 
 def _from_link(arm: Arm, first: int) -> np.ndarray:
-    """Return the indices of the capsules of link `first`, 1 to 6, and of all later links."""
     return np.flatnonzero(np.asarray(arm.capsule_link) >= first - 1)
 
 
 def _poses(arm: Arm, angles: Array) -> _Poses:
-    """Return positions and axes of the arm's parts in N poses with joint angles (N, 6) [rad]."""
     # Without `optimization_barrier` XLA would compute the poses again for every distance.
     rotations, origins = lax.optimization_barrier(
         jax.vmap(lambda angles: link_frames(arm, angles), out_axes=-1)(angles)
@@ -143,7 +141,6 @@ def _poses(arm: Arm, angles: Array) -> _Poses:
 
 
 def _pairs(arm: Arm, scene: Scene, poses: _Poses) -> list[_Pairs]:
-    """List all pairs of bodies that must not touch, by their shapes; pairs with the pole first."""
     link, radius = np.asarray(arm.capsule_link), jnp.asarray(arm.capsule_radius)
     turning, swung, far = (_from_link(arm, first) for first in (1, 2, 3))
     trunk = np.flatnonzero(link == 0)

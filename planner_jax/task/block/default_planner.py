@@ -57,7 +57,7 @@ _GROUP, _WIDTH = 4, 2
 @with_run_time_numbers("straight", "tries", "first", "kept", "in_turn")
 @dataclasses.dataclass(frozen=True)
 class Search(Attempt):
-    """An attempt: check some straight motions, then run least squares from starting points."""
+    """An attempt: check motions straight in joint space, then run least squares from several."""
 
     starts: int = 8
     straight: int = 48  # number of straight joint motions to check
@@ -67,8 +67,8 @@ class Search(Attempt):
     # Whether each starting point is refined to its end before the next, if a single case is
     # planned. Otherwise all take a few trial steps first, and only the `kept` best ones continue.
     in_turn: bool = True
-    # After its trial steps a starting point is used further only if its cost is below `hope`, as it
-    # is for nearly all successful ones.
+    # `hope`: a starting point is abandoned if its cost after the trial steps is higher. Nearly all
+    # starting points that lead to a valid plan have a lower cost.
     solver: LevenbergConfig = LevenbergConfig(
         *(26, 1e-2, 0.25, 6.0), settled=1, tolerance=1.0, trial=3, hope=1000.0, fade=0.7
     )
@@ -90,7 +90,12 @@ _BRISK = (Search(tries=0), *_LEAST_SQUARES)
 
 @functools.cache
 def read_learned_starts() -> tuple[np.ndarray, np.ndarray]:
-    """Read N starting points: ranks (N,) of their end poses, and detours (N, 6) [rad] to these."""
+    """Read N stored starting points, each a straight motion in joint space plus a detour.
+
+    Returns:
+        ranks: (N,) int32, index of the motion's end pose in the order of `rank_poses`.
+        bumps: (N, 6), detour of each joint [rad] at half of the motion's duration.
+    """
     starts = json.loads((Path(__file__).parent / "learned_starts.json").read_text())
     ranks = np.array([start["rank"] for start in starts], np.int32)
     return ranks, np.array([start["bump"] for start in starts], np.float32)
@@ -108,8 +113,8 @@ def rank_poses(poses: EndPoses, num: int, most: float) -> Array:
     """Return the indices (num,) of the end poses that need the least effort, in rising order.
 
     In an end pose the shield meets the ball. The effort is the greatest ratio of a joint's rate or
-    acceleration to its limit. Noise is added to it, so that the poses vary. A pose whose effort
-    exceeds `most` cannot be reached in time and is ranked far behind.
+    acceleration to its limit. Random numbers from 0 to 1 are added, so that the first poses differ
+    more from each other. A pose whose effort exceeds `most` is too late and ranked far behind.
     """
     rng = np.random.default_rng(0)
     noise = jnp.asarray(rng.random(poses.effort.shape[0]), poses.effort.dtype)
@@ -148,24 +153,27 @@ class OnlineBlock(Planner):
         return self.searches
 
     def load_attempt(self, attempt: Search, cases: BlockCase) -> Search:
-        """Return a search as arguments of one compiled program, which all searches share.
+        """Return a search in the form of arguments of a compiled program that all searches share.
 
-        For a single case, searches of straight motions alone share a smaller program, so that the
-        first plan comes soon.
+        For a single case, searches without least squares share a smaller program. It is compiled
+        sooner, so that the first plan comes early.
         """
         is_small = cases.batch_shape == () and not attempt.tries
         return place_numbers(StraightSearch(**vars(attempt)) if is_small else attempt)
 
     def compiles_quickly(self, attempt: Search) -> bool:
-        """Return true for least squares: few balls need them, so compiling fast saves more time."""
+        """Return whether the attempt's program is compiled in less time, though it runs slower.
+
+        This is true for least squares: few cases need them, so that their run time matters less.
+        """
         return attempt.tries > 0
 
     def solve(self, case: BlockCase, attempt: Search) -> BlockPlan:
         """Return the plan of one case: a straight motion, else least squares from starting points.
 
-        Each turn of one loop checks a straight motion, or makes the solver's trial steps from a
-        starting point, or refines a starting point to its end, in order of the cost after the trial
-        steps.
+        With `attempt.in_turn`, starting points are refined one after another. Otherwise all take a
+        few trial steps, and the `attempt.kept` points of least cost are refined. The search ends at
+        the first solved plan, but with `brisk` it compares all straight motions.
         """
         flight, poses, order = self._rank(case)
         straight = self._count_straight(flight, poses, attempt)
@@ -209,15 +217,10 @@ class OnlineBlock(Planner):
         return dataclasses.replace(plan, status=explain_status(poses, plan.status))
 
     def solve_at_once(self, cases: BlockCase, attempt: Search) -> BlockPlan:
-        """Return the plans of a batch; all cases make the same steps at the same time."""
+        """Return the plans of a batch, with the same sequence of computations for every case."""
         return jax.vmap(lambda case: self._solve_in_step(case, attempt))(cases)
 
     def _solve_in_step(self, case: BlockCase, attempt: Search) -> BlockPlan:
-        """Return the plan of one case, in the same order of steps for every case.
-
-        Of each group of `_GROUP` starting points, the `_WIDTH` with the least cost after the
-        solver's trial steps are refined to their end.
-        """
         flight, poses, order = self._rank(case)
         straight = self._count_straight(flight, poses, attempt)
         best = self._plan_straight(case, flight, poses, order, straight)
@@ -258,8 +261,6 @@ class OnlineBlock(Planner):
     def _plan_straight(
         self, case: BlockCase, flight: Flight, poses: EndPoses, order: Array, num: Array
     ) -> BlockPlan:
-        """Return the first solved plan of `num` straight motions, or the quickest if `brisk`."""
-
         def plan_to(k: Array) -> BlockPlan:
             point = self.encode_straight(case, poses, order[k])
             return self.finish(case, flight, point, jnp.zeros((), jnp.int32))
@@ -277,12 +278,10 @@ class OnlineBlock(Planner):
         return flight, poses, rank_poses(poses, num, 1.0 - self.slack)
 
     def _count_straight(self, flight: Flight, poses: EndPoses, attempt: Search) -> Array:
-        """Return the number of end poses reached in time, but at most `attempt.straight`."""
         in_time = jnp.sum(poses.effort <= 1.0 - self.slack)
         return jnp.where(flight.comes, jnp.minimum(in_time, attempt.straight), 0)
 
     def _encode_start(self, case: BlockCase, poses: EndPoses, order: Array, k: Array) -> Array:
-        """Return the unknowns of the k-th starting point: a straight motion with a detour."""
         ranks, bumps = (jnp.asarray(each) for each in read_learned_starts())
         k = jnp.minimum(k, len(ranks) - 1)
         point = self.encode_straight(case, poses, order[ranks[k]])
@@ -326,7 +325,6 @@ class OnlineBlock(Planner):
         steps, first, duration = self.decode(case, point)
         pieces, dtype = self.pieces, point.dtype
         joints = motion.joint_terms(case, steps, first, duration, self.weights, 1.0 - self.slack)
-        # Derivatives are computed at the end and at the samples with the least distances.
         shares = tuple(np.arange(1, self.samples + 1) / self.samples)
         angles = motion.angles_at(case.angles, first, steps, shares)
         gaps, slopes_at = clearances_and_slopes(case.arm, case.scene, angles)
@@ -337,7 +335,6 @@ class OnlineBlock(Planner):
         slopes = slopes_at(worst)  # (R, 6, W)
         short = jnp.maximum(margins - gaps[:, worst], 0.0) * self.weights.clearance  # (R, W)
         active = jnp.where(short > 0.0, -self.weights.clearance, 0.0)
-        # The barrier keeps the compiler from repeating this computation in each product.
         lifts, short = lax.optimization_barrier((slopes * active[:, None], short))
         grams = jnp.einsum("riw,rjw->wij", lifts, lifts, precision=_HIGHEST)
         pushes = jnp.einsum("riw,rw->wi", lifts, short, precision=_HIGHEST)
@@ -373,8 +370,8 @@ class OnlineBlock(Planner):
         """
         moves, first, duration = self.decode(case, point)
         joints = motion.joint_terms(case, moves, first, duration, self.weights, 1.0 - self.slack)
-        # The start and all samples except the first after it are checked. On a GPU, the check of
-        # one more sample would take a third longer.
+        # The start and all samples except the first after it are checked: 96 by default, because
+        # 97 samples would take a third longer on a GPU.
         shares = (0.0, *(np.arange(min(2, self.checked), self.checked + 1) / self.checked))
         angles = motion.angles_at(case.angles, first, moves, shares)
         gaps = least_clearances(case.arm, case.scene, angles)

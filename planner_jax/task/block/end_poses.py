@@ -36,7 +36,7 @@ class EndPoses:
 
 @struct.dataclass
 class Flight:
-    """Interval of time in which a ball must be met: in the outer box, before the inner box."""
+    """Times at which a ball enters an outer and an inner box; it must be met in between."""
 
     earliest: Array  # () [s], time at which the ball enters the outer box
     latest: Array  # () [s], time at which the ball enters the inner, protected box
@@ -44,7 +44,7 @@ class Flight:
 
 
 def flight_of(case: BlockCase) -> Flight:
-    """Compute when a ball enters the outer box, where it may be met, and the protected one."""
+    """Compute when a ball enters the outer box, where it may be met, and the inner box."""
     scene = case.scene
     earliest, enters = entry_time(scene.outer, case.ball, case.gravity)
     latest, hits = entry_time(scene.inner, case.ball, case.gravity)
@@ -52,15 +52,19 @@ def flight_of(case: BlockCase) -> Flight:
 
 
 def all_profiles(pieces: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return P speed profiles, rates (P, K) after K = `pieces` pieces, and which end at rest."""
+    """Return P speed profiles (P, K), and which of them end at standstill, (P,) bool.
+
+    A profile has a joint's rates [rad/s] at the ends of K = `pieces` equal pieces of a motion that
+    starts at standstill, lasts 1 s and turns the joint by 1 rad.
+    """
     at_rest, free = profiles(pieces, True), profiles(pieces, False)
     return np.concatenate([at_rest, free]), np.arange(len(at_rest) + len(free)) < len(at_rest)
 
 
 def profile_peaks(pieces: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the greatest rate and acceleration of each of P speed profiles, and which end at rest.
+    """Return the greatest rate [rad/s] and acceleration [rad/s^2] of P speed profiles, each (P,).
 
-    Rates are in rad/s and accelerations in rad/s^2, for profiles that turn a joint by 1 rad in 1 s.
+    The profiles turn a joint by 1 rad in 1 s. The third result is whether they end at standstill.
     """
     shapes, rests = all_profiles(pieces)
     rises = np.diff(shapes, axis=1, prepend=0.0) * pieces
@@ -113,9 +117,10 @@ def end_poses(
 
 
 def coast(case: BlockCase, duration: Array, pieces: int) -> Array:
-    """Return the angles (..., 6) [rad] at which joints stop that brake in the first piece.
+    """Return the joint angles (..., 6) [rad] at standstill after braking in a motion's first piece.
 
-    The piece is one of `pieces` equal pieces of a motion of `duration` (...) [s].
+    The motion has `pieces` equal pieces and the `duration` (...) [s]. It starts at the case's joint
+    angles and rates.
     """
     of_first = step_weights(pieces, (1.0,))[0][0]
     angles, rates = (jnp.broadcast_to(x, (*duration.shape, 6)) for x in (case.angles, case.rates))

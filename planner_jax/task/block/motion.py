@@ -33,13 +33,14 @@ class Weights:
 
 @functools.cache
 def step_weights(pieces: int, shares: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Return weights of a motion's parameters whose weighted sum is the angle turned so far.
+    """Return the weights with which a motion's parameters add up to the angle turned by N times.
 
-    The motion has K = `pieces` pieces. The N times are `shares`, in [0, 1], of the duration.
+    The parameters are a joint's rates, multiplied by the duration, at the start and at the ends of
+    K = `pieces` pieces. The times are `shares`, from 0 to 1, of the duration.
 
     Returns:
-        first: (N,), weights of the initial rate multiplied by the duration.
-        steps: (N, K), weights of the rates after the K pieces, multiplied by the duration.
+        first: (N,), weights of the parameter at the start.
+        steps: (N, K), weights of the parameters at the ends of the pieces.
     """
     position = np.asarray(shares)[:, None] * pieces
     knots = np.arange(pieces + 1)
@@ -65,8 +66,8 @@ def angles_at(start: Array, first: Array, steps: Array, shares: tuple[float, ...
 class JointTerms(NamedTuple):
     """Cost of joint limits and accelerations, a sum of squared residuals r, with derivatives.
 
-    J is the Jacobian of a joint's residuals by the joint's rates after K pieces of the motion,
-    multiplied by the duration, and by the time of contact.
+    J is the Jacobian of one joint's residuals by K + 1 variables: the joint's rates at the ends of
+    K pieces of the motion, multiplied by the duration, and the time of contact.
     """
 
     cost: Array  # (), r . r, summed over the joints
@@ -80,8 +81,9 @@ def joint_terms(
 ) -> JointTerms:
     """Compute the cost of the joints' limits and accelerations, with its derivatives.
 
-    See `angles_at` for `steps` and `first`. `duration` () [s] is the time of the motion. A value is
-    penalised above `most` times its limit.
+    The joint rates at the start are `first` (6,) [rad], and at the ends of K pieces `steps` (K, 6)
+    [rad], both multiplied by the motion's `duration` () [s]. Rates, accelerations and angles are
+    penalised above `most` times their limits.
     """
     pieces, dtype = steps.shape[0], steps.dtype
     knots = tuple(np.arange(1, pieces + 1) / pieces)
@@ -100,7 +102,6 @@ def joint_terms(
         return value.T, slopes * jnp.broadcast_to(slope, value.shape).T[:, :, None]
 
     def hinge(share: Array, by_steps: Array, by_time: Array) -> tuple[Array, Array]:
-        """Penalise values above `most` times their limits; return residuals and derivatives."""
         over = weights.limits * jnp.maximum(jnp.abs(share) - most, 0.0)
         sign = weights.limits * jnp.sign(share) * (over > 0.0).astype(over.dtype)
         return row(over, by_steps, by_time, sign)
@@ -109,8 +110,6 @@ def joint_terms(
     rate_shares = rates / case.limits.velocity[None]
     of_rise = rise[None] * (pieces / duration**2 / case.limits.acceleration[:, None, None])
     rise_shares = accelerations / case.limits.acceleration[None]
-    # The first difference of rates contains the initial rate times the duration, `first`, so that
-    # its derivative by the duration has one more term.
     of_start = jnp.zeros_like(rise_shares).at[0].set(first * pieces / duration**2)
     by_time = (-2.0 * rise_shares - of_start / case.limits.acceleration[None]) / duration
     angle_shares = (angles - middle[None]) / half[None]
@@ -145,7 +144,11 @@ def bump_steps(height: Array, pieces: int) -> Array:
 
 
 def polynomial(start: Array, first: Array, steps: Array, duration: Array) -> PiecewisePolynomial:
-    """Convert a motion (see `angles_at`) of `duration` [s] to K polynomial pieces of degree 2."""
+    """Convert a motion of `duration` [s] to K polynomial pieces of degree 2.
+
+    The joint angles start at `start` (6,) [rad]. The joint rates at the start are `first` (6,), and
+    at the ends of the pieces `steps` (K, 6), both multiplied by the duration [rad].
+    """
     pieces = steps.shape[0]
     step = duration / pieces
     rates = jnp.concatenate([first[None], steps]) / jnp.maximum(duration, 1e-9)
@@ -223,10 +226,11 @@ def lift_to_unknowns(
     its duration, and the time of contact.
 
     Args:
-        lift: (W, K), derivatives of a joint's angle at W samples by its K unknowns.
-        drift: (W, 6), derivatives of the angles at the samples by the time of contact.
-        grams: (W, 7, 7), J^T J of the residuals at each sample, by angles and time.
-        pushes: (W, 7), J^T r of these residuals.
+        lift: (W, K), derivatives of a joint's angle at W samples by the K unknowns of the joint.
+        drift: (W, 6), derivatives of the joint angles at the samples by the time of contact.
+        grams: (W, 7, 7), J^T J of the residuals at each sample, here with the Jacobian J by the six
+            joint angles and the time.
+        pushes: (W, 7), J^T r of the residuals at each sample, with the same J.
         joints: terms of the joints' limits and accelerations.
     """
     grams_q, grams_t = grams[:, :6, :6], grams[:, :6, 6]

@@ -38,7 +38,10 @@ def make_empty_plan(case: BlockCase, pieces: int) -> BlockPlan:
 
 
 def explain_status(poses: EndPoses, status: Array) -> Array:
-    """Return a plan's status () int32: OUT_OF_REACH if it is unsolved and no end pose exists."""
+    """Return a plan's status () int32: OUT_OF_REACH if it is unsolved and no pose is reachable.
+
+    `poses` are poses of the arm in which the shield meets the ball.
+    """
     is_kept = is_solved(status) | jnp.any(jnp.isfinite(poses.effort))
     return jnp.where(is_kept, status, Status.OUT_OF_REACH).astype(jnp.int32)
 

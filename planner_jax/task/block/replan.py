@@ -130,7 +130,7 @@ class ReplanBlock(Planner):
         return Replanning(case=left, previous=previous, elapsed=host_leaf(elapsed))
 
     def plan_by(self, drive: Drive, tasks: Replanning) -> BlockPlan:
-        """Return plans of one case or a batch, from scratch where the previous motion fails."""
+        """Return the plans of one case or a batch, from scratch where refining a motion fails."""
         plans, _ = drive(self.warm, tasks)
         unsolved, cases = is_unsolved(plans.status), tasks.case
         if not tasks.batch_shape:

@@ -14,7 +14,7 @@ class Suite:
     has_pole: bool = True
 
 
-# `planner_jax.task.block.suites` defines all ranges that are not fields of `Suite`.
+# `planner_jax.task.block.suites` defines the other ranges of random throws, such as heights.
 SUITES = {
     "pole": Suite("Throws from 6 to 12 m, a pole in front of the arm."),
     "open": Suite("Throws from 6 to 12 m, without a pole.", has_pole=False),

@@ -58,7 +58,10 @@ def draw(
 
 
 def _draw_throw(suite: Suite, random: np.random.Generator) -> np.ndarray:
-    """Draw throws until one is valid; return its launch position [m] and velocity [m/s], (2, 3)."""
+    """Draw throws until one meets the conditions of `_is_valid`.
+
+    The result (2, 3) is the position [m] and the velocity [m/s] of the ball at the launch.
+    """
     while True:
         azimuth, distance = random.uniform(-AZIMUTH, AZIMUTH), random.uniform(*suite.distance)
         pos = np.array(
@@ -78,7 +81,7 @@ def _draw_throw(suite: Suite, random: np.random.Generator) -> np.ndarray:
 
 
 def _is_valid(suite: Suite, pos: np.ndarray, vel: np.ndarray, duration: float) -> bool:
-    """Return whether a throw misses the pole, and is in the outer box before the inner box."""
+    """Return whether a throw misses the pole, and stays in the outer box after it has entered."""
     times = np.linspace(0.0, duration, int(np.ceil(duration / _STEP)) + 1)[:-1]
     path = pos + vel * times[:, None]
     path[:, 2] -= 0.5 * GRAVITY * times**2

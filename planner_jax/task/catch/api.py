@@ -40,8 +40,9 @@ def planner(
             always catches next the target that can be caught first. "given" uses order and times in
             the cases. "policy" and "policy:rush6" are trained networks, "policy:FILE" is a network
             of yours. An object is also accepted: `Best(finalists=3)` plans only three orders.
-        recovery: as in `pj.hit.planner`.
-        effort: as in `pj.hit.planner`.
+        recovery: trajectory after the last catch: "brake" ends at standstill wherever this costs
+            least, "home" at the start position. None: no such trajectory.
+        effort: "feasible" stops as soon as every limit holds; "good" and "best" lower the cost.
         **options: fields of the planner's dataclass, for example `rounds`.
 
     Returns:

@@ -188,7 +188,6 @@ def case(
 
 
 def _broadcast_present(present: ArrayLike, shape: tuple[int, ...]) -> Array:
-    """Check the argument `present` of `case`, and broadcast it to one entry for each target."""
     array = np.asarray(present)
     if array.dtype != np.bool_:
         raise ArgumentTypeError("present", "True or False of each target", present)

@@ -14,7 +14,7 @@ from planner_jax.task.catch.case import CatchCase
 # [m/s], added upwards to a target's reversed velocity, so that the net is upright at zero velocity.
 _RESTING = 1e-3
 _TIMES = 32  # number of times up to the horizon at which `is_too_far` evaluates its bound
-_SLACK = 0.02  # [m], in `is_too_far`, far more than the errors of catches that the referee accepts
+_SLACK = 0.02  # [m], margin of `is_too_far`; errors of catches that the referee accepts are smaller
 
 
 @struct.dataclass

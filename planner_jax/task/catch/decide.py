@@ -1,4 +1,4 @@
-"""Decisions on the order and the times of catches, which the module `estimate` estimates.
+"""Decisions on the order and the times of catches, from estimates by the module `estimate`.
 
 A decision proposes orders, and the planner plans each of them. If targets are optional, a decision
 also selects which targets to catch: it proposes every order also with fewer catches, and the plan
@@ -77,7 +77,7 @@ def in_several_lengths(case: CatchCase, choices: CatchChoice) -> CatchChoice:
 
 @struct.dataclass
 class _Partial:
-    """State of a beam search: W sequences of catches, each of the same length so far."""
+    """State of a beam search: W sequences with equal numbers of catches."""
 
     rank: Array  # (W,) [s], the least is best; infinite in rows that hold no sequence
     short: Array  # (W,) [m], sum of the distances by which targets are missed

@@ -38,8 +38,8 @@ if TYPE_CHECKING:
 _PROPORTIONS = (0.3,) + (1.0,) * 5
 _FEATURE_TIMES = (-0.1, 0.1)  # [s] times of the ball that the network sees, after the decided time
 _RIM = 0.9  # greatest distance of a catch from the net's centre, relative to the net's radius
-# Greatest norm of the two variables of a catch point that a network predicts. The point is then at
-# most 0.89 * `_RIM` * (radius of the net) from the net's centre.
+# Greatest norm of the two unbounded variables that determine a catch point, if a network predicts
+# them. The point is then at most 0.89 * `_RIM` * (radius of the net) from the net's centre.
 _LEARNED_SIZE = 2.0
 _ENCODED_RIM = 0.99  # greatest distance of a catch point made by `encode`, relative to `_RIM`
 # Starting points, the most successful first. Column 1 is a factor on the decided times of the
@@ -64,8 +64,8 @@ _ROUNDS = (
     Round(starts=6, solver=LbfgsConfig(max_steps=200)),
 )
 _FROM_LEARNED = Round(starts=1, solver=LbfgsConfig(max_steps=2))  # from a network's starting point
-# With several targets this search runs before Newton's method, because the short search of `_FIRST`
-# would end too far from the optimum.
+# With several targets these iterations of L-BFGS run before Newton's method, because the eight
+# iterations of `_FIRST` would end too far from the optimum.
 _LONG_CHAIN = Stage(LbfgsConfig(max_steps=200, tolerance=1e-6, patience=5))
 _CHAIN_TOLERANCE = 1e-4
 # If more than `_FEW` targets must all be caught, the first two attempts have more iterations.
@@ -118,8 +118,9 @@ class ExactCatch(ChainPlanner[CatchCase, CatchPlan]):
     def start_network(self, case: CatchCase) -> StartNetwork | None:
         """Return the network that predicts a starting point; None if there is no such network.
 
-        It exists for one target, the default pieces, scale and `lift`, and no obstacles: around
-        obstacles the side on which a search starts decides on which side it ends.
+        It exists for cases with one target and without obstacles, if `proportions`, `scale` and
+        `lift` have their defaults. Around obstacles the side on which a search starts decides on
+        which side it ends.
         """
         is_usual = self.proportions == _PROPORTIONS and self.lift == _GUESSES[0, 3]
         is_usual &= case.num_targets == 1 and not case.extras
@@ -168,7 +169,10 @@ class ExactCatch(ChainPlanner[CatchCase, CatchPlan]):
         return super().load_attempt(self._for_start(attempt, cases), cases)
 
     def starts_long(self, cases: CatchCase) -> bool:
-        """Return whether the first round (attempt) is long: many targets, all to be caught."""
+        """Return whether the first round (attempt) has more iterations than usual.
+
+        It has if more than `_FEW` targets must all be caught.
+        """
         return self.rounds == _ROUNDS and cases.num_targets > _FEW and not cases.optional
 
     def _for_start(self, attempt: Round, case: CatchCase) -> Round:
@@ -185,10 +189,10 @@ class ExactCatch(ChainPlanner[CatchCase, CatchPlan]):
         return _FROM_LEARNED if is_near else attempt
 
     def limit_learned(self, point: Array) -> Array:
-        """Limit the catch points in a predicted starting point, so that searches can move them.
+        """Move the catch points of a predicted starting point away from the hoop's rim.
 
-        Catches are earliest with catch points at the hoop's rim. There the variables of a catch
-        point grow without bound while the point hardly moves, and a re-plan could not move it back.
+        Two unbounded variables determine a catch point in the hoop. Near the rim, where catches are
+        earliest, the point hardly moves with its variables, so that a search could not move it.
         """
         offsets, natural = self.split(point)
         place = natural[:, 1:3]
@@ -197,7 +201,6 @@ class ExactCatch(ChainPlanner[CatchCase, CatchPlan]):
         return self.join(offsets, natural)
 
     def _guess(self, context: CatchContext, guess: Array) -> Array:
-        """Return the 12 variables of N catches for the row `guess` of `guess_table`, (N, 12)."""
         case = context.case
         factor, *of_catches = guess
         begin = jnp.zeros_like(context.times[:1])

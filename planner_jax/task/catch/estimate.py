@@ -75,7 +75,8 @@ def arrival(
 
     The quadrotor leaves the position `place` (3,) [m] at `begin` () [s]; `speed` () [m/s] is its
     greatest speed. The shortfall is 0 if a catch is possible. Else it is the distance by which the
-    quadrotor misses the target plus the table's penalty, at the time at which this sum is least.
+    quadrotor misses the target, plus a penalty [m] if the target is too low or rises too steeply,
+    at the time at which this sum is least.
     """
     times, places, penalty = table.times, table.places, table.penalty
     late = jnp.where(times > begin, 0.0, 100.0)
@@ -89,7 +90,6 @@ arrivals = jax.vmap(arrival, (0, None, None, None))  # `arrival` for N targets f
 
 
 def _out_of_reach(offset: Array, span: Array, speed: Array) -> Array:
-    """Return how far [m] a flight of `span` (..., K) [s] ends short of a displacement `offset`."""
     span = jnp.maximum(span - _TURNING, 0.0)
     rise = speed / _ACCELERATION
     reach = jnp.where(span < rise, 0.5 * _ACCELERATION * span**2, speed * span - 0.5 * speed * rise)
@@ -158,7 +158,11 @@ def later_by_shortfall(times: Array, shortfalls: Array) -> Array:
 
 
 def can_be_next(case: CatchCase, shortfalls: Array) -> Array:
-    """Return which of N targets may be caught next; each would be missed by `shortfalls` [m]."""
+    """Return which of N targets may be caught next, (N,) bool.
+
+    These are all targets that are present. Optional targets must also be within reach: estimates
+    of the distances `shortfalls` (N,) [m] by which they are missed must be at most `_MARGIN`.
+    """
     return case.present & (shortfalls <= _MARGIN) if case.optional else case.present
 
 
@@ -170,6 +174,5 @@ def top_speed(case: CatchCase) -> Array:
 def _leave_from(
     taken: Array, begin: Array, place: Array, time: Array, there: Array
 ) -> tuple[Array, Array]:
-    """Return when () [s] and where (3,) the quadrotor leaves after it catches or skips a target."""
     soonest = begin + INSTANT
     return jnp.where(taken, jnp.maximum(time, soonest), soonest), jnp.where(taken, there, place)

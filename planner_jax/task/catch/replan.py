@@ -33,7 +33,8 @@ _LATEST = 0.05  # [s], greatest shift of a catch's time in the starting point
 _SHORTEST = 0.01  # [s], least duration of a segment in the starting point
 _CLOSING = 0.1  # [m/s], least speed towards the net's plane at which a catch's time is shifted
 _BINOMIALS, _SHIFTS = polynomial.shift_basis(2 * _ORDERS)
-# Step lengths that a search tries. Its first direction ignores curvature, and is too long.
+# Step lengths that a search tries. They include small ones, because the direction of the first
+# iteration ignores the cost's curvature and is too long.
 _TRIALS = (1.0, 0.2, 0.04)
 
 
@@ -58,12 +59,11 @@ class ReplanCatch(OptimisedPlanner):
     target that has moved is caught at another point of the net. If it would miss the net, the
     starting trajectory is changed as smoothly as possible to reach it.
 
-    If less than `shortest` is left until the next catch, the remainder of the previous plan is
-    returned, in the same number of pieces and with the same violation. After the last catch the
-    remainder is empty and stays at the position of that catch.
+    If less than `shortest` [s] is left until the next catch, the remainder of the previous plan is
+    returned. After the last catch the remainder is empty and stays at the position of that catch.
 
-    The first round makes one iteration, and the next re-plan continues from its result: the
-    real-time iteration of [Diehl2005]. One iteration usually suffices to keep all limits.
+    The first round (attempt) makes one iteration, and the next re-plan continues from its result:
+    the real-time iteration of [Diehl2005]. One iteration usually suffices to keep all limits.
     """
 
     case_type = Replanning
@@ -176,11 +176,11 @@ class ReplanCatch(OptimisedPlanner):
         return jnp.concatenate([first, self.planner.guesses(context.catch, num - 1)])
 
     def objective(self, point: Array, context: ReplanContext) -> Evaluation:
-        """Return cost and violation at `point`, or of the previous plan if `context.keep`."""
+        """Return cost and violation at `point`; shortly before a catch, of the previous plan."""
         return self.planner.objective(jnp.where(context.keep, context.start, point), context.catch)
 
     def decode(self, point: Array, context: ReplanContext) -> CatchPlan:
-        """Return the plan at `point`, or the previous plan's remainder if `context.keep`."""
+        """Return the plan at `point`; shortly before a catch, the previous plan's remainder."""
         plan = self.planner.decode(point, context.catch)
         return jax.lax.cond(
             context.keep, lambda: _remainder(context.task, context.catch), lambda: plan

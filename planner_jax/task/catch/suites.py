@@ -107,7 +107,7 @@ def draw(
 
 
 def draw_by_key(key: Array, num: int, suite: str) -> CatchCase:
-    """Draw `num` cases of a suite with a key of `jax.random`; the function can be compiled."""
+    """Draw `num` cases of a suite with a key of `jax.random`; may be called inside `jax.jit`."""
     columns, make_targets = _PATHS[suite]
     paths = make_targets(jax.random.uniform(key, (num, columns)))
     targets, horizon = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), paths)
@@ -130,11 +130,7 @@ def _unit(angle: PyTree) -> PyTree:
     return xp.stack([xp.cos(angle), xp.sin(angle), xp.zeros_like(angle)], axis=-1)
 
 
-# Functions that make the thrown balls of `throws`, `hard`, `parabola1` and `parabola2`.
-
-
 def _throws(uniform: PyTree, throws: tuple[_Throw, ...]) -> tuple[BallPath, PyTree]:
-    """Make the balls of `throws` from three random numbers each, with latest times of catches."""
     xp = _module(uniform)
     drawn = [_throw(u, t) for u, t in zip(xp.split(uniform, len(throws), 1), throws, strict=True)]
     pos, vel, horizon = (xp.stack(column, axis=1) for column in zip(*drawn, strict=True))
@@ -166,7 +162,7 @@ def _throw(uniform: PyTree, throw: _Throw) -> tuple[PyTree, PyTree, PyTree]:
 
 
 def earliest_throw(name: str) -> tuple[BallState, float]:
-    """Return the shortest throw of a suite to the centre of its landing rectangle.
+    """Return the throw of a suite with the least flight time to the centre of its landing area.
 
     The result is the ball at time 0, with NumPy arrays (3,) in float32, and the horizon [s].
 
@@ -192,9 +188,6 @@ def _fly(pos, vel, time, drag: float, gravity: float = GRAVITY) -> tuple[PyTree,
     return pos + vel * decayed + terminal * t, terminal + vel * xp.exp(-drag * t)
 
 
-# Functions that make targets that move on straight lines or oscillate, for all other suites.
-
-
 def _lines(pos: PyTree, vel: PyTree) -> BallPath:
     """Return N targets for each of B cases, with positions `pos` at time 0 and constant `vel`."""
     ball = BallState(pos=pos, vel=vel)
@@ -203,7 +196,6 @@ def _lines(pos: PyTree, vel: PyTree) -> BallPath:
 
 
 def _harmonic(uniform: PyTree) -> tuple[HarmonicPath, PyTree]:
-    """Make two oscillating targets from nine random numbers each, with latest times of catches."""
     u = uniform.reshape(len(uniform), 2, 9)
     drift = _between(u[..., :1], 1.0, 1.5) * _unit(2.0 * np.pi * u[..., 1])
     xp, level = _module(u), _between(u[..., 2:3], 0.0, 1.5) * _unit(2.0 * np.pi * u[..., 3])
@@ -216,7 +208,6 @@ def _harmonic(uniform: PyTree) -> tuple[HarmonicPath, PyTree]:
 
 
 def _triangle(uniform: PyTree) -> tuple[BallPath, PyTree]:
-    """Make three random targets along a triangle's sides, and latest times of their catches [s]."""
     xp, u = _module(uniform), uniform[:, :, None]
     centre = xp.concatenate([uniform[:, :2] - 0.5, _between(uniform[:, 2:3], 1.5, 2.5)], axis=1)
     corner = 2.0 * np.pi * (u[:, 3] + np.arange(3) / 3.0)
@@ -227,7 +218,6 @@ def _triangle(uniform: PyTree) -> tuple[BallPath, PyTree]:
 
 
 def _polygon(uniform: PyTree, *, num: int) -> tuple[BallPath, PyTree]:
-    """Make `num` targets of equal velocity from random numbers, and latest times of catches [s]."""
     xp, u = _module(uniform), uniform[:, :, None]
     near = xp.concatenate([uniform[:, :2] - 0.5, _between(uniform[:, 2:3], 1.5, 2.5)], axis=1)
     corner = 2.0 * np.pi * (u[:, 3] + np.arange(num) / num)
@@ -251,7 +241,6 @@ def _rush(
 
 
 def _swarm(uniform: PyTree, *, num: int) -> tuple[BallPath, PyTree]:
-    """Make `num` sinking balls from random numbers, and latest times of their catches [s]."""
     xp, u = _module(uniform), uniform.reshape(len(uniform), num, 6)
     height, sinking = _between(u[..., 2:3], 2.0, 6.0), _between(u[..., 3:4], 0.4, 2.0)
     level = 6.0 * xp.sqrt(u[..., 1:2]) * _unit(2.0 * np.pi * u[..., 0])

@@ -75,7 +75,7 @@ def _next(
 
 
 def _rank(group: InterceptGroup, table: tuple[Array, Array], order: Array) -> Array:
-    """Return the rank () [s] of an order: time of the last meeting, plus 10 times all delays."""
+    """Return the rank () [s] of an order: time of the last meeting + 10 * sum of all lateness."""
 
     def advance(last: _Meeting, target: Array) -> tuple[_Meeting, None]:
         return _select(group.present[target], _next(group, table, last, target), last), None

@@ -67,7 +67,6 @@ class GroupIntercept(Planner):
         return jax.device_get(_join(cases, begins, legs))
 
     def _plan_legs(self, drive: Drive, case: InterceptCase, needed: Array) -> InterceptPlan:
-        """Plan the legs (drives) for which `needed` is true; other plans have no meaning."""
         patiently = lambda some: drive(self.patient, some)[0]  # noqa: E731
         if drive.is_pure:
             plans, _ = drive(self.planner, case)
@@ -136,8 +135,6 @@ def _clear_unneeded(cases: InterceptCase, plans: InterceptPlan, needed: Array) -
 def _advance(
     plans: InterceptPlan, begin: Array, solved: Array, needed: Array
 ) -> tuple[CarState, Array, Array]:
-    """Return B cars' states and times [s] after a drive, and which groups are solved so far."""
-
     def end(plan: InterceptPlan) -> CarState:
         duration = jnp.where(plan.time > 0.0, plan.time, 1.0)
         pose = pose_at(plan.start, duration, plan.speed, plan.curvature, plan.time)

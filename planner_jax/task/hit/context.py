@@ -25,7 +25,10 @@ class HitContext:
 
 
 def prepare_hit(case: HitCase, num_nodes: int) -> HitContext:
-    """Tabulate the incoming ball's flight, for 1.1 times the duration of a flight without drag."""
+    """Tabulate the incoming ball's flight at `num_nodes` times, and estimate its landing time.
+
+    The table extends to 1.1 times the time at which a ball without drag would land.
+    """
     fall, _ = drag_free_fall_time(case.ball, jnp.zeros_like(case.drag), case.gravity)
     horizon = lax.stop_gradient(1.1 * fall)
     path = predict_path(case.ball, horizon, case.drag, case.gravity, num_nodes=num_nodes)

@@ -3,8 +3,8 @@
 Every plan meets the ball and returns it to the target; only inequalities are treated by penalties.
 As in [Yu2023bat, eqs 11-12] the ball's velocities before and after the impact determine the
 racket's normal and its speed along the normal. In [Yu2023bat, eqs 13-14] components of velocity and
-thrust are variables, and the others follow from divisions that may be by zero. Here the flight time
-after the impact is a variable instead, which avoids these divisions.
+thrust are variables, and their other components follow from divisions that may be by zero. Here the
+flight time after the impact is a variable instead, which avoids these divisions.
 """
 
 import dataclasses
@@ -43,9 +43,9 @@ if TYPE_CHECKING:
 
 _PROPORTIONS = (0.2, 0.5) + (1.0,) * 10
 _FEATURE_TIMES = (0.5, 0.75, 0.95)  # times of the ball that the network sees / landing time
-# Settings of searches for any plan that keeps the limits, whatever its cost. Searches in which the
-# waypoints' velocities are variables need a starting point that nearly keeps the limits. `margin`
-# is the relative distance from a limit at which penalties start; it must cover peaks between nodes.
+# Settings of searches for any plan that keeps the limits, whatever its cost. If the velocities at
+# waypoints are variables, the starting point must nearly keep the limits. `margin` is the relative
+# distance from a limit at which penalties start; it must cover peaks between the `nodes`.
 _ANY_FEASIBLE = (("energy_weight", 1e-11), ("margin", 0.01), ("nodes", 8))
 WITH_VELOCITIES = (*_ANY_FEASIBLE, ("velocities", True))
 _SMALL_MARGIN = (
@@ -90,9 +90,9 @@ def _smooth(steps: int, keep: int) -> Stage:
 # A round is an attempt to solve the cases that are unsolved so far. The first two rounds solve easy
 # cases. Later rounds search for any plan that keeps the limits: the energy has hardly any weight.
 # Rounds 3 and 4 start at a point that a network predicts. Rounds 5 and 6 start at all rows of
-# `_GUESSES` after the first one, at first without changing velocities at waypoints, and continue
-# the best of these starts. Rounds 4 and 6 take only cases whose greatest relative excess over a
-# limit is below `within`.
+# `_GUESSES` after the first one. They hold the velocities at waypoints constant at first, and then
+# continue only the searches of least cost. Rounds 4 and 6 take only cases whose greatest relative
+# excess over a limit is below `within`.
 _ROUNDS = (
     Round(1, LbfgsConfig(max_steps=3)),
     Round(1, LbfgsConfig(max_steps=60)),
@@ -168,7 +168,7 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
 
     @property
     def num_offsets(self) -> int:
-        """Number of waypoint variables: positions, and velocities if these are variables."""
+        """Number of waypoint variables: coordinates of positions, and of velocities if variable."""
         return self._num_places * (2 if self.velocities else 1)
 
     @property
@@ -184,8 +184,8 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
     def start_network(self, case: HitCase) -> StartNetwork | None:
         """Return the network that predicts a starting point; None if there is no such network.
 
-        Networks exist for the default pieces and scales, one without and one with waypoint
-        velocities as variables. There is none for cases with the user's extra terms, such as
+        One network is for planners with, one for planners without `velocities`; both need default
+        `proportions` and `scale`. There is none for cases with the user's extra terms, such as
         obstacles: the side on which a search starts decides on which side it ends.
         """
         if not self.learned or not (self.proportions == _PROPORTIONS and not case.extras):
@@ -256,7 +256,10 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
 
     @property
     def held(self) -> np.ndarray | None:
-        """The velocities at the waypoints, if they are variables: with offset 0 they are smooth."""
+        """Which variables are velocities at waypoints, (n,) bool; None if no velocities are.
+
+        Some stages of a search hold these variables at their starting values.
+        """
         if not self.velocities:
             return None
         index = np.arange(len(self.scale))
@@ -281,7 +284,8 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
     def relative_excess(self, excess: Array) -> Array:
         """Return the relative excess (5,) over limits from the result of `meet`.
 
-        In `meet` the excess of hitting speeds is a squared ratio; here it is the ratio.
+        For a hitting speed v with the limit v_max, `meet` returns v^2 / v_max^2 - 1, and this
+        method returns v / v_max - 1.
         """
         return jnp.concatenate([excess[:2], Measure.ABOVE.relative(excess[2:])])
 

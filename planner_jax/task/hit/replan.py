@@ -27,7 +27,8 @@ from planner_jax.task.hit.plan import HitPlan
 from planner_jax.trajectory.polynomial import evaluate, states_at, total_duration
 
 _SHORTEST = 0.01  # [s] least time to the impact in a starting point
-# Step lengths that a search tries. Its first direction ignores curvature, and is too long.
+# Step lengths that a search tries. They include small ones, because the direction of the first
+# iteration ignores the cost's curvature and is too long.
 _TRIALS = (1.0, 0.2, 0.04)
 
 

@@ -85,9 +85,9 @@ def generate_serves(
     """Draw random serves with the distribution of the published serves, equally many per scenario.
 
     Serves come in groups that contain each scenario once, in random order. Serve k of a seed and a
-    list of scenarios is always the same serve. The distribution is at the top of this module.
-    Landing point p and vertical speed are drawn uniformly. But the horizontal velocity v shall be
-    uniform: a draw is accepted with a probability proportional to the determinant |dv / dp|.
+    list of scenarios is always the same serve. The module's constants, such as `SERVE_HEIGHT`, are
+    the ranges. Landing point p and vertical speed are drawn uniformly. To make the horizontal
+    velocity v uniform, a draw is accepted with a probability proportional to |det (dv / dp)|.
 
     The `scenarios` are names in court.SCENARIOS, by default all. See `pj.hit.draw` for the other
     arguments and the errors.
@@ -118,7 +118,6 @@ def _random(seed: int, stream: int, block: int) -> np.random.Generator:
 
 
 def _draw_block(chosen: np.ndarray, seed: int, block: int):
-    """Draw `_ROUNDS` serves of each scenario: scenarios (N,), positions and velocities (N, 3)."""
     random = _random(seed, _SERVE_STREAM, block)
     scenario = random.permuted(np.tile(chosen, (_ROUNDS, 1)), axis=1).ravel()
     states = np.zeros((2, len(scenario), 3))
@@ -131,7 +130,6 @@ def _draw_block(chosen: np.ndarray, seed: int, block: int):
 
 
 def _draw(scenario: np.ndarray, random: np.random.Generator):
-    """Draw positions and velocities (2, N, 3) of N serves, and which are accepted, (N,) bool."""
     regions = court.scenario_regions(scenario)
     bounds = court.region_bounds(DEPTH)
     uniform = random.random((len(scenario), 6))
@@ -159,7 +157,7 @@ def _draw(scenario: np.ndarray, random: np.random.Generator):
 
 
 class _AimTable(NamedTuple):
-    """Splines over a serve's horizontal distance [m] and vertical speed [m/s]."""
+    """Quantities of serves as splines over horizontal distance [m] and vertical speed [m/s]."""
 
     speed: RectBivariateSpline  # [m/s], horizontal speed that reaches the distance
     density: RectBivariateSpline  # [1/s^2], |d horizontal velocity / d landing point|
@@ -169,7 +167,6 @@ class _AimTable(NamedTuple):
 
 @functools.cache
 def _aim_table() -> _AimTable:
-    """Compute the splines for all distances on the court and all vertical speeds of serves."""
     shortest, longest = 2.0 * court.DEAD_ZONE, math.hypot(2.0 * DEPTH, 2.0 * court.HALF_WIDTH)
     axes = np.linspace(shortest, longest, 40), np.linspace(*RISE_SPEED, 12)
     distance, rise = np.meshgrid(*axes, indexing="ij")

@@ -135,7 +135,10 @@ def judge(cases: InterceptCase, plans: InterceptPlan, **settings: object) -> Int
 
 
 def position_setting(target: PlanePath) -> dict[str, object]:
-    """Return the referee's setting for targets of a user's class; {} for the library's classes."""
+    """Return the referee's setting `target_positions` for a target of a user's own class.
+
+    The result is {} for the library's classes, whose positions the referee computes itself.
+    """
     while isinstance(target, LaterPath):
         target = target.path
     return {} if type(target) in (TurningPath, PolynomialPath) else {"target_positions": positions}

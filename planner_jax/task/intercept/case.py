@@ -188,7 +188,6 @@ def _make_obstacles(
     batch: tuple[int, ...],
     dtype: DTypeLike,
 ) -> Obstacles:
-    """Make `Obstacles` with the batch's axes from polygons; errors name the argument of `case`."""
     if isinstance(polygons, Obstacles):
         return polygons
     try:

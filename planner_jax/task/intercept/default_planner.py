@@ -55,9 +55,9 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
     """Planner of interceptions by least squares from random paths of reachable grid cells.
 
     `meet` selects the time of the meeting: "given" is the time of the case, "early" is as early as
-    possible before it, and "least" is the time until then that needs the least effort, which is the
-    integral of the squared acceleration. A plan's cost is the meeting time [s] if `meet` is
-    "early", and else the effort [m^2/s^3].
+    possible before it, and "least" is the time, up to the case's time, that needs the least effort,
+    which is the integral of the squared acceleration. A plan's cost is the meeting time [s] if
+    `meet` is "early", and else the effort [m^2/s^3].
     """
 
     case_type: ClassVar[type] = InterceptCase
@@ -95,7 +95,11 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
     def smooth_near(
         self, cases: InterceptCase, plans: InterceptPlan
     ) -> tuple[SmoothIntercept, StartedCase]:
-        """Return a planner that minimises cost from existing plans, and cases with these plans."""
+        """Return a planner and cases by which `pj.gradient` differentiates existing plans.
+
+        The planner minimises the cost from a start near its minimum: the plans, which are stored in
+        the cases.
+        """
         problem = self.problem
         start = problem.pack(plans.speed[..., 1:], plans.curvature[..., 1:], plans.time)
         return SmoothIntercept(problem), add_start(cases, start)
@@ -105,7 +109,10 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
         cases: InterceptCase,
         plan_of: Callable[[Planner, InterceptCase], InterceptPlan] | None = None,
     ) -> tuple[SmoothIntercept, StartedCase]:
-        """Plan cases by `plan_of`, or else by the first search; return `smooth_near` of these."""
+        """Plan the cases, and return the result of `smooth_near` for these plans.
+
+        `plan_of(planner, cases)` makes the plans; by default the first search makes them.
+        """
         if plan_of is None:
             plans = self.solve(lax.stop_gradient(cases), self.attempts[0])
         else:
@@ -141,15 +148,12 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
     def solve_at_once(self, cases: InterceptCase, attempt: Search) -> InterceptPlan:
         """Return the plans of a batch: try all paths together, select the best of each case."""
         search = self.load_attempt(attempt, cases)
-        # `layers` is the number of times of the reach set (the cells that the car can reach at a
-        # time). It is equal for all cases of the batch.
         layers = jnp.max(jax.vmap(lambda case: make_grid(case, search.lattice).num)(cases))
         return jax.vmap(lambda case: self._solve_all_paths(case, search, layers))(cases)
 
     def _solve_all_paths(
         self, case: InterceptCase, attempt: LoadedSearch, layers: Array
     ) -> InterceptPlan:
-        """Try all paths of one case; refine only the best plan, or all plans with `tries_all`."""
         problem = self.problem
         found = search_reach(case, attempt, is_time_free=problem.is_time_free, layers=layers)
 

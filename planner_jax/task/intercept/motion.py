@@ -190,12 +190,10 @@ def by_unknowns(drive: Motion, cost: Quadratic, is_time_free: bool) -> tuple[Arr
     pull = forms[:, :5, 8] + cost.piece_push
 
     def shift(values: Array, by: int) -> Array:
-        """Return for each piece k the entry k + by of `values`, or zero past the end."""
         if by >= num:
             return jnp.zeros_like(values)
         return jnp.concatenate([values[by:], jnp.zeros_like(values[:by])])
 
-    # For each knot, sums over all later pieces that a change at the knot only displaces rigidly.
     later = shift(jnp.cumsum(forms[::-1, 5:], axis=0)[::-1], 2)  # (K, 3, 9)
     lefts, rights = np.array([V_LEFT, C_LEFT]), np.array([V_RIGHT, C_RIGHT])
     twist = drive.right + shift(drive.left, 1)  # (K, 2, 3)
@@ -206,7 +204,6 @@ def by_unknowns(drive: Motion, cost: Quadratic, is_time_free: bool) -> tuple[Arr
     same = own[:, rights][:, :, rights] + shift(own[:, lefts][:, :, lefts], 1)
 
     def flatten(values: Array) -> Array:
-        """Reorder values (K, 2, ...) of speed and curvature at K knots: first all speeds."""
         return values.swapaxes(0, 1).reshape(2 * num, *values.shape[2:])
 
     knot = np.arange(2 * num) % num

@@ -42,8 +42,8 @@ _KEEPING = terms.Weights()
 _SETTLING = terms.Weights(effort=10.0)
 # Weights of the last stage if the meeting shall be as early as possible.
 _HURRYING = terms.Weights(early=1000.0)
-# Weight of the meeting time when the cost is differentiated. It is small beside the weight of the
-# limits, whose penalties start before a limit is reached: the minimum then exceeds no limit.
+# Weight of the meeting time in the cost that `pj.gradient` differentiates. It is small, so that the
+# minimum exceeds no limit: penalties on limits start before a limit is reached.
 _EARLY = 30.0
 
 
@@ -60,7 +60,7 @@ class Stage:
 
 @struct.dataclass
 class Guess:
-    """A starting point of least squares, and K positions that their first stage follows."""
+    """A starting point of least squares, and K positions that the motion shall follow at first."""
 
     point: Array  # (n,), the n unknowns
     positions: Array  # (K, 2) [m], rear axle's middle at the knots 1..K, on a path of cells
@@ -134,8 +134,8 @@ class MotionProblem:
 
         speed = interpolate(pace * path.level.astype(grid.cell.dtype), case.speed, at)
         bins = width * path.bin.astype(grid.cell.dtype)
-        # Headings of the path are relative to the car's initial heading, but may include full
-        # turns: `straight` is the sum [rad] of the full turns in the first heading.
+        # The path's headings, relative to the car's initial heading, may include full turns.
+        # `straight` [rad] is the multiple of 2 pi in the first of these headings.
         straight = jnp.round(bins[0] / (2.0 * np.pi)) * 2.0 * np.pi
         after, before = (interpolate(bins, straight, at + half) for half in (0.5, -0.5))
         rate = (after - before) / grid.step
@@ -252,7 +252,11 @@ class MotionProblem:
         attempt: Search | Warm,
         stages: list[Stage],
     ) -> InterceptPlan:
-        """Run the stages from `guess`; of the last two stages' plans return the better one."""
+        """Run the stages from `guess`, and return the better of the last two stages' plans.
+
+        That is the plan that keeps all limits. If both do, it is the cheaper plan; if neither does,
+        it is the plan with the smaller violation.
+        """
         points, steps = self.run_stages(case, field, guess, attempt, stages)
         plans = lax.map(lambda point: self.decode(case, point, steps), points[-2:])
         before, after = (jax.tree.map(lambda leaf, k=k: leaf[k], plans) for k in range(2))
@@ -261,7 +265,7 @@ class MotionProblem:
     def refine_solved(
         self, case: InterceptCase, field: DistanceField, plan: InterceptPlan, attempt: Search
     ) -> InterceptPlan:
-        """Run the last stage from a plan that is solved, and return the better of both plans."""
+        """Run the last stage from a solved plan; return its result if it is solved at less cost."""
         guess = self.guess_at(self.pack(plan.speed[1:], plan.curvature[1:], plan.time))
         last = self.list_last_stages(attempt)[-1]
         steps = jnp.where(is_solved(plan.status), last.steps, 0)
@@ -310,7 +314,7 @@ class SmoothIntercept(OptimisedPlanner):
         )
 
     def guesses(self, context: _Context, num: int) -> Array:
-        """Return the unknowns that minimise the cost near the start, as `num` equal rows."""
+        """Minimise the cost near the case's start; return the unknowns, repeated in `num` rows."""
         fixed = lax.stop_gradient(context)
         start = fixed.case.start_point
         end = least_squares(lambda x: self._exact_model(x, fixed), start, self.solver)
@@ -339,11 +343,11 @@ class SmoothIntercept(OptimisedPlanner):
         return Evaluation(cost=model.cost, violation=model.violation)
 
     def decode(self, point: Array, context: _Context) -> InterceptPlan:
-        """Return the plan of the unknowns `point`: speeds and curvatures at knots, free time."""
+        """Return the plan of the unknowns `point`: speeds, curvatures and, if free, the time."""
         return self.problem.decode(context.case, point, jnp.zeros((), jnp.int32))
 
     def with_polish(self, solver: NewtonConfig | None = None) -> "SmoothIntercept":
-        """Return the planner unchanged: its plans need no Newton steps, as they are minima."""
+        """Return this planner unchanged: its plans are minima already and need no Newton steps."""
         return self
 
 

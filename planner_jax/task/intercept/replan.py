@@ -137,7 +137,6 @@ class ReplanIntercept(Planner[Replanning, InterceptPlan]):
         return super().solve_at_once(tasks, attempt)
 
     def _sample_previous(self, task: Replanning, time: Array) -> tuple[Array, Array]:
-        """Sample the previous plan's speed and curvature at the K new knots after the start."""
         previous, num = task.previous, self.problem.pieces
         at = task.elapsed + time * (jnp.arange(1, num + 1) / num)
         old = previous.time * jnp.linspace(0.0, 1.0, previous.speed.shape[0])

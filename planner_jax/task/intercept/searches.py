@@ -21,8 +21,8 @@ from planner_jax.plane.distance_field import DistanceField, distance_field
 from planner_jax.task.intercept.case import InterceptCase
 from planner_jax.task.intercept.terms import discs_of, wrap
 
-# Memory that a search needs for each path, and for each 32-bit word of its set of reachable cells.
-# The unit is the memory for one starting point of a planner with few unknowns.
+# Estimated memory of a search for each path, and for each 32-bit word of its set of reachable
+# cells, in units of the memory for one starting point of a planner with few unknowns.
 _PATH_STARTS = 8
 _WORD_STARTS = 1 / 32768
 _PADDED = ("paths", "candidates")
@@ -76,11 +76,11 @@ class LoadedSearch(Search):
 
 @cached_by_precision
 def load_search(search: Search, searches: tuple[Search, ...], is_apart: bool) -> LoadedSearch:
-    """Return one of a planner's searches as arguments of its compiled program.
+    """Return one of a planner's searches in the form of arguments of a compiled program.
 
-    All searches share one program, so that its arrays of random numbers have the sizes of the
-    search with most paths, and with most candidates for a path. If `is_apart` is true, the search
-    has its own program with arrays of its own sizes, because a GPU tries all paths at once.
+    All searches share one program. Its arrays of random numbers, which select the paths, are as
+    large as in the search with most paths and most candidates for a path. If `is_apart` is true,
+    the search has its own program without such padding, because a GPU would try padded paths, too.
     """
     sizes = (search,) if is_apart else searches
     paths, candidates = (max(vars(each)[name] for each in sizes) for name in _PADDED)

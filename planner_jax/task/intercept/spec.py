@@ -26,7 +26,7 @@ class Suite:
     num_targets: tuple[int, int] = (1, 1)  # least and greatest number of targets
 
 
-# `planner_jax.task.intercept.suites` defines all ranges that are not fields of `Suite`.
+# `planner_jax.task.intercept.suites` defines the other ranges of random cases, such as distances.
 SUITES = {
     "easy": Suite("Four to six walls and one mover.", (4, 6), (1, 1)),
     "medium": Suite("Seven to nine walls, two or three movers.", (7, 9), (2, 3)),

@@ -200,7 +200,6 @@ _earliest = jax.jit(earliest_arrival)
 def _polygons(
     uniform: np.ndarray, corners: tuple[int, int], radius: tuple[float, float]
 ) -> np.ndarray:
-    """Make convex polygons (..., 6, 2) [m] whose corners lie on circles, from random numbers."""
     size, num = _between(uniform[..., 0], *radius), _integer(uniform[..., 1], *corners)[..., None]
     index = np.minimum(np.arange(6), num - 1)
     shift = 0.6 * np.take_along_axis(uniform[..., 3:], index, axis=-1)
@@ -209,7 +208,6 @@ def _polygons(
 
 
 def _across(uniform: np.ndarray, count: np.ndarray) -> np.ndarray:
-    """Map random numbers of [0, 1) to the x positions [m] of the 2 or 3 walls of each maze."""
     even = np.where((count == 2)[:, None], [2.9, 5.5, SIZE], [2.2, 4.1, 6.0])
     return even + _between(uniform, -0.2, 0.2)
 
@@ -249,7 +247,6 @@ def _maze(
 
 
 def _boxes(left, low, right, high) -> np.ndarray:
-    """Return six corners (..., 6, 2) of axis-aligned rectangles; the last corner is repeated."""
     x = np.stack([left, right, right, left, left, left], axis=-1)
     return np.stack([x, np.stack([low, low, high, high, high, high], axis=-1)], axis=-1)
 
@@ -390,7 +387,10 @@ CAUSES = tuple(_APPLIES)
 
 
 def first_cause(suite: Suite, draws: Draws) -> np.ndarray:
-    """Return for B candidates the index in CAUSES of the first cause that holds, or len(CAUSES)."""
+    """Return for B candidates the index in CAUSES of the cause of rejection, (B,) int.
+
+    The index is len(CAUSES) if the candidate is accepted. The first of several causes counts.
+    """
     cause = np.full(len(draws["start"]), len(CAUSES))
     alive = np.arange(len(cause))
     for index, applies in enumerate(_APPLIES.values()):

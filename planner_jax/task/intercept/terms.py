@@ -59,8 +59,8 @@ def limit_terms(
 
     Returns:
         squares: (K, 6, 6), for every piece the sum of w g g^T over its residuals r with weights w.
-            The vector g holds the derivatives of r by the five variables of the piece (see
-            `motion`), and last r itself.
+            The vector g holds the derivatives of r by five variables, and last r itself: speed at
+            the piece's start and end, curvature there, and the end time of the motion.
         violation: (), largest relative excess over a limit.
     """
     limits, dtype = case.limits, speed.dtype
@@ -115,7 +115,6 @@ def limit_terms(
 
 
 def _sum_squares(rows: Array, weight: Array | float) -> Array:
-    """Return (G, G, K): sums over R residuals of w g g^T, for `rows` (G, R, K) and weights w."""
     return jnp.sum((weight * rows)[:, None] * rows[None], axis=2)
 
 
@@ -196,7 +195,7 @@ def obstacle_terms(
 ) -> tuple[Array, Array]:
     """Compute the penalties on the distances of the body from obstacles and from the map's edge.
 
-    The body is represented by `discs` discs. Fewer discs extend further beyond its sides.
+    The body is covered by `discs` discs. The fewer discs, the further they extend beyond its sides.
 
     Returns:
         squares: (K, S, 5, 5), the matrix `squares` of `meeting_terms` for S samples on K pieces.
@@ -212,7 +211,6 @@ def obstacle_terms(
     velocity = movers.velocity[..., None]  # (N, 2, 1)
 
     def measure(offset: Array) -> tuple[Array, Array, Array]:
-        """Return one disc's distances from walls and moving obstacles, and their gradients."""
         at_x, at_y = x + offset * cos, y + offset * sin
         still, still_x, still_y = (each[None] for each in field.near(at_x, at_y))
         moved = movers.centre[..., None] + velocity * times[None, None]  # (N, 2, M)
