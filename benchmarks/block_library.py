@@ -97,7 +97,7 @@ def build_timed(bench: Bench, path: Path, layout: str, regime: str) -> Library:
 
 
 def describe(bench: Bench, library: Library) -> None:
-    """Report the share of pairs (outer cell, inner cell) with a stored motion, and the size."""
+    """Report the share of pairs (outer cell, inner cell) with a stored motion, and size [MB]."""
     covered = coverage(library)
     shares = {
         "feasible": float(covered.share(covered.is_feasible)[0]),

@@ -193,8 +193,8 @@ def learn(bench: Bench, num: int, tries: int, lanes: int) -> list[dict[str, Any]
     if not solvable.size:
         return []
 
-    # The candidates for bumps come from random starts that solve a throw, at most 8 of each throw.
-    # Otherwise most candidates would come from easy throws, which nearly every start solves.
+    # Candidates come from random starting points that solve a throw, at most 8 of each throw.
+    # Otherwise most of them would come from easy throws, which nearly every starting point solves.
     some = [rng.permutation(np.flatnonzero(good & (places == throw)))[:8] for throw in solvable]
     picked = np.concatenate(some)
     # The initial cluster centres are drawn here and passed to `kmeans2`: its own argument `seed` is

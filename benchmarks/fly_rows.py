@@ -242,7 +242,7 @@ def hit_rows(args: Any) -> None:
 
 
 def make_ablations(whole: Loop) -> dict[str, Loop]:
-    """Return the loop `whole`, and copies without Kalman filter, drag estimate or re-planning."""
+    """Return the control loop `whole`, and copies without filter, drag estimate or re-planning."""
     return {
         "everything": whole,
         "no Kalman filter": dataclasses.replace(whole, kalman=False),

@@ -21,10 +21,10 @@ _SLACK = CELL * np.sqrt(0.5)  # [m] Distance from the middle of a cell to its co
 
 
 def earliest_bound(scene: Scene) -> tuple[bool, float]:
-    """Return whether a car may meet the target at the prescribed time, and a bound on the earliest.
+    """Return whether a car may meet the target at the prescribed time, and the earliest time [s].
 
-    False proves that a meeting at the time which the case prescribes is impossible. The bound [s]
-    is the time of a layer (time step): at every earlier layer a meeting is impossible. It is
+    False proves that a meeting at the time which the case prescribes is impossible. The earliest
+    time is the time of a layer (time step): at every earlier layer a meeting is impossible. It is
     infinite if no layer permits a meeting.
     """
     middle = scene.start[:2] + scene.middle * np.array(

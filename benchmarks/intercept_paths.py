@@ -161,7 +161,7 @@ def peer_row(cases: list, meetings: np.ndarray, headings: list[float]) -> Row:
 
 
 def say_rows(bench: Bench, suite: str, heading: str, rows: dict[str, Row]) -> None:
-    """Print each planner's row for one suite; path lengths are means over problems all solve."""
+    """Print each planner's row for one suite; lengths are means over problems that all solve."""
     together = np.logical_and.reduce([row.found for row in rows.values()])
     for name, row in rows.items():
         ms = np.nanpercentile(row.ms, [50, 95, 99]) if np.isfinite(row.ms).any() else [np.nan] * 3

@@ -174,9 +174,9 @@ def table_of_outcomes(bench: Bench, outcomes: dict[str, Outcome]) -> None:
 
 
 def table_of_accelerations(bench: Bench, outcomes: dict[str, Outcome]) -> None:
-    """Print Table II: accelerations of pairs of planners, on cases where both succeed.
+    """Print accelerations for pairs of planners (`PAIRS`), on cases where both of a pair succeed.
 
-    The paper's values are printed in the first row.
+    The first row has the values of Table II of [Qu2022].
     """
     bench.say(
         "",
@@ -208,9 +208,9 @@ def table_of_accelerations(bench: Bench, outcomes: dict[str, Outcome]) -> None:
 
 
 def table_of_times(bench: Bench, named: dict[str, Any], lanes: list) -> None:
-    """Print Table III: planning times of each planner for path, speed and both.
+    """Print each planner's times to plan the path, to plan the speed, and to plan both.
 
-    The paper's values are printed in the first row.
+    The first row has the values of Table III of [Qu2022].
     """
     bench.say(
         "",

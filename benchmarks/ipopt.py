@@ -280,7 +280,8 @@ def measure(bench: Bench, name: str, options: Any) -> None:
 def _report_solvers(bench: Bench, name: str, runs: list[Found]) -> list[np.ndarray]:
     """Print a row for each solver: success, costs above the least cost of any solver, and speed.
 
-    Returns how much the planner's costs exceed the least costs, relative: an array for each effort.
+    Returns by what fraction the planner's costs exceed the least costs: an array for each effort
+    ("feasible", "good", "best"), which sets how long the planner searches.
     """
     bench.say(
         "",

@@ -66,7 +66,7 @@ def _add_motion(random: np.random.Generator, head: Any) -> Any:
 
 
 def draw_hits(num: int, seed: int) -> pj.hit.HitCase:
-    """Draw `num` training cases of hits: half as in benchmarks, half with varied numbers.
+    """Draw `num` training cases of hits: usual serves, and as many with varied numbers.
 
     Initial states, balls, rackets, targets and limits are varied.
     """
@@ -121,7 +121,7 @@ def draw_hard_hits(num: int, seed: int) -> pj.hit.HitCase:
 
 
 def draw_catches(num: int, seed: int) -> pj.catch.CatchCase:
-    """Draw `num` training cases of catches: half as in benchmarks, half with varied numbers.
+    """Draw `num` training cases of catches: usual throws, and as many with varied numbers.
 
     All are from the suites `throws` and `hard`, with estimates of the earliest catching times. The
     second half has varied initial states, catching times, nets and limits.
@@ -213,7 +213,7 @@ TASKS = {
 def make_untrained(
     features: np.ndarray, outputs: int, hidden: tuple[int, ...], seed: int = 0
 ) -> StartNetwork:
-    """Return an untrained network, whose output is zero.
+    """Return an untrained network, whose output is zero: no correction of the planner's guess.
 
     Args:
         features: (B, F), F inputs for each of B cases. Their mean and standard deviation scale the
@@ -253,7 +253,10 @@ def to_bytes(network: StartNetwork) -> bytes:
 def train(
     spec: _NetworkSpec, minutes: float, seed: int, say: Callable[[str], None]
 ) -> StartNetwork:
-    """Train a network for `minutes` on a pool of drawn cases; `say` prints the progress."""
+    """Train a network that corrects the planner's initial guess, on a pool of drawn cases.
+
+    The training takes `minutes`, and `say` prints its progress.
+    """
     planner = spec.planner
     pool = jax.device_put(jax.tree.map(jnp.asarray, spec.draw(_POOL, seed)))
     prepare = jax.jit(jax.vmap(planner.prepare))
@@ -308,7 +311,7 @@ def train(
 
 
 def compare(bench: Bench, task: str, num: int) -> None:
-    """Compare plans with and without the shipped network on `num` cases; print the table."""
+    """Compare plans from initial guesses with and without the shipped network, on `num` cases."""
     spec = TASKS[task]
     cases = jax.tree.map(np.asarray, spec.usual(num, _SEED_APART))
     planners = {

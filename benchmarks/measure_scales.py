@@ -181,7 +181,7 @@ def draw_weak_throws(num: int, seed: int) -> pj.catch.CatchCase:
 
 
 def hit_planners() -> dict[str, Any]:
-    """Return planners of hits, by their keys in the file of scales; their scales are guesses."""
+    """Return planners of hits with guessed scales, by their keys in `measured_scales.json`."""
     found = {}
     for pieces in HIT_PIECES:
         first = (0.2,) * (3 * (pieces - 1)) + _FIRST_HIT
@@ -191,7 +191,7 @@ def hit_planners() -> dict[str, Any]:
 
 
 def catch_planners() -> dict[str, Any]:
-    """Return planners of catches, by their keys in the file of scales; their scales are guesses."""
+    """Return planners of catches with guessed scales, by their keys in `measured_scales.json`."""
     found = {}
     for pieces in CATCH_PIECES:
         first = (0.3,) * (3 * (pieces - 1)) + _FIRST_CATCH

@@ -99,7 +99,7 @@ def judge_decision(
 
 
 def measure(bench: Bench, variants: list[str], options: argparse.Namespace) -> None:
-    """Train and judge every variant, and print the table; two untrained methods come first."""
+    """Train and judge every variant, and print the table; the orders best and greedy come first."""
     bench.say(
         f"{options.suite}, {options.decisions:,} decisions, {options.seeds} seeds, judged on "
         f"{options.num} cases of seed {options.seed}, {jax.devices()[0]}",

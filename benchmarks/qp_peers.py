@@ -109,7 +109,7 @@ def osqp_solver(matrices: Mapping[str, np.ndarray]) -> Callable[..., PeerSolutio
 
 
 def _to_sparse(matrices: Mapping[str, np.ndarray]) -> tuple[Any, Any, Any]:
-    """Return as sparse matrices the upper triangle of Q, the matrix of the equalities, and R."""
+    """Return a program's sparse matrices: Hessian (upper triangle), equalities, bounded rows."""
     equalities = np.concatenate([matrices["equalities"], matrices["zeros"]])
     hessian = scipy.sparse.csc_matrix(np.triu(matrices["hessian"]))
     return hessian, scipy.sparse.csr_matrix(equalities), scipy.sparse.csr_matrix(matrices["rows"])

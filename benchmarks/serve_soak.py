@@ -106,7 +106,10 @@ def distance_off(answer: Answer, height: float, gravity: float, ball: np.ndarray
 
 
 class Naps:
-    """Process that sleeps repeatedly, and records when the system woke it too late."""
+    """Process that sleeps repeatedly, and records when the system woke it too late.
+
+    During these gaps the system did not run the server in time either.
+    """
 
     def __init__(self, core: int | None = None) -> None:
         words = [sys.executable, "-S", "-c", SLEEPER, str(NAP), str(GAP)]
@@ -116,7 +119,7 @@ class Naps:
         self.gaps: list[tuple[float, float]] = []
 
     def end(self) -> None:
-        """Stop the process, and read the gaps that it has recorded."""
+        """Stop the process, and read the recorded gaps, in which the system did not run it."""
         self._process.terminate()
         output, _ = self._process.communicate()
         lines = output.splitlines(keepends=True)
@@ -223,7 +226,7 @@ class Soak:
                 break
 
     def count_misses(self, gaps: list[tuple[float, float]]) -> int:
-        """Count the missed deadlines that overlap in time with one of the gaps (start, end) [s]."""
+        """Count missed deadlines during one of the gaps (start, end) [s] of a sleeping process."""
         return sum(any(a < end and b > begin for a, b in gaps) for begin, end in self.missed)
 
     def end(self) -> None:

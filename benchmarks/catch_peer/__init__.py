@@ -1,4 +1,5 @@
-"""A C++ program that plans catches of one ball: the problem of the baseline `PaperCatch`.
+"""A C++ program that plans catches of one ball, with its own L-BFGS and BFGS.
 
-`benchmarks.catch_reference` compares the planners with it. It has its own L-BFGS and BFGS.
+It minimises the objective of the planner `PaperCatch`, which reimplements [Yu2023catch].
+`benchmarks.catch_reference` compares the speed of this library's planners with the program.
 """

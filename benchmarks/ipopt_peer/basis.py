@@ -55,8 +55,8 @@ class Basis:
     def sample(self, columns: Any) -> Any:
         """Return samples of the trajectory with coefficients `columns` (C, 3).
 
-        The result (10, K) has ten components (`PLACES`) of each of K samples. The unit of time is
-        the mean duration of a piece.
+        The result (10, K) has for each of K samples the height, and velocity, acceleration and jerk
+        along x, y and z. The unit of time is the mean duration of a piece.
         """
         sampled = [matrix @ columns for matrix in self._matrices]
         return ca.vertcat(*(sampled[order][:, axis].T for order, axis in PLACES))

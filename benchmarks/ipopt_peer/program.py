@@ -157,10 +157,11 @@ class Program:
         return {n: vector[ends[i] : ends[i + 1]] for i, n in enumerate(self.problem.sizes)}
 
     def _build_ends(self) -> None:
-        """Build the function of the end's variables, its Jacobian, and its weighted Hessian.
+        """Build the function of the variables that describe the trajectory's end.
 
         Its outputs are the boundary conditions by axis, the mean duration of a piece, the cost, and
-        the excesses over limits at the end.
+        the excesses over limits at the end. Also build its Jacobian, and the Hessian of a weighted
+        sum of its outputs.
         """
         problem, planner = self.problem, self.problem.planner
         natural = ca.SX.sym("natural", problem.num_natural)
