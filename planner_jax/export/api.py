@@ -97,7 +97,7 @@ def export(
 
     Raises:
         UnknownName: no format has the name `to`.
-        ArgumentError: an argument breaks a rule, which the message names in one line.
+        ArgumentError: an argument is invalid; the message states which values are valid.
         MissingExtra: a package that the format needs is not installed.
         OSError: the file cannot be written; the exception's `filename` is the path.
     """
@@ -131,10 +131,10 @@ def stream(
     """Send one plan to a UDP port of this machine, in real time; return the number of messages.
 
     Only the format "px4" can be sent. `udp` is the number of the port, and `rate` the number of
-    messages per second [Hz], 100 by default. Other arguments and errors are as for `export`.
+    messages per second [Hz], 100 by default. The other arguments are described at `export`.
 
     Raises:
-        ArgumentError: an argument breaks a rule, or no program listens on the port.
+        ArgumentError: an argument is invalid, or no program listens on the port.
     """
     if _require_name(to) != "px4":
         raise ArgumentError("udp", f"given for {to}, only for px4", udp, verb="not be")

@@ -39,7 +39,7 @@ _COLUMNS = {
 
 
 def write(plan: Plan, rate: float, file: BinaryIO) -> None:
-    """Write the setpoints of a plan at `rate` [Hz], in SI units and the frames ENU and FLU."""
+    """Write setpoints at `rate` [Hz] in SI units, in world frame ENU and body frame FLU."""
     columns = _COLUMNS[robot_of(plan).name]
     setpoints = setpoints_of(plan, rate)
     header = [f"{name} [{unit}]" for _, names, unit in columns for name in names.split()]

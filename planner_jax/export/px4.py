@@ -1,4 +1,4 @@
-"""Export of setpoints for the autopilot PX4, as fields of its message TrajectorySetpoint in NED."""
+"""Export of setpoints for the autopilot PX4: its message TrajectorySetpoint, in the frame NED."""
 
 from typing import BinaryIO
 

@@ -66,7 +66,7 @@ def robot_of(plan: Plan) -> Robot:
 
 
 def require_one(name: str, all_of: str, shape: tuple[int, ...]) -> None:
-    """Raise `ArgumentError` unless the batch shape is (); `all_of` is a name of plans or cases."""
+    """Raise `ArgumentError` unless `shape` is (); the message advises to select from `all_of`."""
     shown = f"a batch of shape {shape}"
     require(shape == (), name, f"one, as pj.take({all_of}, k) gives", shown=shown)
 
@@ -90,7 +90,7 @@ def setpoints_of(plan: Plan, rate: float) -> Setpoints:
 
     Raises:
         ArgumentError: the plan cannot be exported (see `robot_of`) or is not finite; or the rate is
-            not a number, or results in fewer than two setpoints or more than `MOST`.
+            not a number, or results in fewer than two setpoints or more than 100,000.
     """
     end = robot_of(plan).end(plan)
     low, high = 1.0 / end, (MOST - 1) / end

@@ -46,7 +46,7 @@ def replacing(path: str | os.PathLike) -> Iterator[Path]:
 
 
 def new_file_problem(path: str | os.PathLike) -> str:
-    """Return why no new file can be created at a path, such as "a new file" is needed; else ""."""
+    """Return "" if a file can be created at a path, else what it must be, such as "a new file"."""
     place = Path(path)
     if os.path.lexists(place):
         return "a new file"

@@ -112,7 +112,7 @@ def processor() -> str:
 
 
 def as_here(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
-    """Wrap a function so that another thread runs it with the JAX precision of this thread."""
+    """Wrap a function so that other threads run it with this thread's `jax_enable_x64`."""
     import jax  # the command line measures memory without JAX
 
     here = jax.config.jax_enable_x64  # type: ignore[attr-defined]

@@ -1,4 +1,4 @@
-"""Functions of one problem applied to a batch, with the batch axis last, and CUDA kernels."""
+"""Mapping of functions of one problem over a batch, whose axis is last, and CUDA kernels for it."""
 
 from planner_jax.lanes.kernels import with_kernel
 from planner_jax.lanes.over import over_lanes

@@ -1,7 +1,7 @@
 """The functions that have a CUDA kernel for batches, and the switch for all kernels.
 
-A lane is one problem of a batch. `jax.jit` compiles a function that has a kernel under its own
-name, since only this name survives all transformations. `over_lanes` finds a call with that name
+A lane is one problem of a batch. `jax.jit` compiles each function with a kernel under a unique
+name, since only names survive all transformations. `over_lanes` finds a call with such a name
 and calls the kernel for all lanes instead. Kernels are imported when a program for a GPU is traced.
 """
 
@@ -120,7 +120,7 @@ def with_kernel(
         call.__name__ = call.__qualname__ = name
         return jax.jit(call)
 
-    # If JAX differentiated the named function, its derivative would have the same name, and
+    # Differentiate `function`, since a derivative of the compiled function would have its name, and
     # `over_lanes` would replace the derivative by the kernel.
     @jax.custom_jvp
     def call_named(*args: object) -> Results:

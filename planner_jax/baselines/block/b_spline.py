@@ -117,12 +117,12 @@ def _spans(degree: int, num: int) -> int:
 
 
 def _knots(degree: int, spans: int) -> np.ndarray:
-    """Return the knots (spans + 2 degree + 1,) in units of one span: 0, ..., 0, 1, 2, ..."""
+    """Return the knots 0, 1, ..., `spans`; the first and the last occur degree + 1 times."""
     return np.clip(np.arange(spans + 2 * degree + 1) - degree, 0, spans)
 
 
 def _basis(degree: int, num: int, place: np.ndarray) -> np.ndarray:
-    """Return `num` basis functions (..., num) at `place` (...), 0 to the number of knot spans."""
+    """Return the values (..., num) of all basis functions at `place` (...), in knot spans."""
     spans = num - degree
     knots = _knots(degree, spans)
     span = np.minimum(np.floor(place), spans - 1)  # the last span includes its end

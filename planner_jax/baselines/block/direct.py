@@ -27,15 +27,15 @@ _PIECES = 10  # number of polynomial pieces of the straight motions that `end_po
 
 
 def poses_in_time(case: BlockCase, points: int) -> tuple[EndPoses, Array]:
-    """Return the poses in which the arm meets the ball, and the quickest motions' durations.
+    """Return end poses in which the shield meets the ball, and bang-bang motions' durations.
 
     Args:
         case: one case.
         points: number of points of the ball's trajectory, each with eight end poses.
 
     Returns:
-        C = 8 * points end poses, and durations (C,) [s] of the quickest motions to them. A duration
-        is infinite if the arm would arrive after the ball, or if the pose does not exist.
+        C = 8 * points end poses, and durations (C,) [s] of the quickest bang-bang motions to them.
+        A duration is infinite if the arm would come after the ball, or if the pose does not exist.
     """
     poses = end_poses(case, flight_of(case), points, _PIECES)
     limits = case.limits
@@ -48,7 +48,7 @@ def poses_in_time(case: BlockCase, points: int) -> tuple[EndPoses, Array]:
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class DirectBlock(Planner):
-    """A planner with bang-bang joint motions; a plan's cost is the motion's duration [s]."""
+    """The planner `direct`, with bang-bang motions; a plan's cost is the motion's duration [s]."""
 
     case_type: ClassVar[type] = BlockCase
     is_sequential: ClassVar[bool] = True
@@ -62,7 +62,7 @@ class DirectBlock(Planner):
         require_settings(self)
 
     def solve(self, case: BlockCase, attempt: Attempt) -> BlockPlan:
-        """Return the plan of one case: the first collision-free motion that arrives in time."""
+        """Return the plan of one case: the first collision-free motion in time for the ball."""
         poses, times = poses_in_time(case, self.points)
         order = jnp.argsort(times)
         num = jnp.minimum(jnp.sum(jnp.isfinite(times)), self.tries)
@@ -76,7 +76,10 @@ class DirectBlock(Planner):
         return dataclasses.replace(best, status=status)
 
     def plan_to(self, case: BlockCase, goal: Array, contact: Array, duration: Array) -> BlockPlan:
-        """Return the bang-bang motion to one end pose as a plan, with its violation.
+        """Return the bang-bang motion to one end pose as a plan.
+
+        The plan's violation is the excess [rad] over a position limit, or 100 times the lack [m] of
+        distance from obstacles, whichever is greater.
 
         Args:
             case: one case.
@@ -91,7 +94,6 @@ class DirectBlock(Planner):
         gaps = least_clearances(case.arm, case.scene, angles)
         # A joint that moves at the start may overshoot its goal and a position limit.
         beyond = jnp.max(jnp.maximum(angles - case.arm.upper, case.arm.lower - angles))
-        # A distance of 1 cm less than the margin counts as a relative violation of 1.
         violation = jnp.maximum(100.0 * (self.margin - jnp.min(gaps)), beyond)
         return BlockPlan(
             motion=motion,

@@ -1,10 +1,10 @@
 """The baseline `epase` of [Natarajan2024]: weighted A* over joint steps, timed by TOPP-RA.
 
 A state of the search is a vector of joint angles. As in the code that the paper's authors
-published, a state's neighbours are 7 degrees away in joints 1 to 4, and 4 degrees away in every
-joint, in both directions. A straight edge to the goal is tried first. States within a grid cell of
-0.05 rad count as one state. The heuristic is the distance to the goal in joint space, and the cost
-is the length of the path from the start.
+published, a neighbour of a state differs from it in one joint: by +-7 degrees in one of joints 1 to
+4, or by +-4 degrees in any joint. A straight edge to the goal, an end pose, is tried first. States
+in a grid cell of 0.05 rad count as one state. The heuristic is the distance to the goal in joint
+space, and the cost is the length of the path from the start.
 
 The paper uses ePA*SE [Mukherjee2022], which evaluates edges in parallel on 64 cores. With a single
 thread, ePA*SE is weighted A*. Here one thread evaluates all edges of a state as one batch. The
@@ -46,7 +46,7 @@ class State:
 
 
 class OpenStates:
-    """The unexpanded states of a search, sorted by path length + weight * distance to the goal."""
+    """The unexpanded states, sorted by path length + weight * distance to the goal, in rad."""
 
     def __init__(self, start: State, goal: np.ndarray, weight: float) -> None:
         self._goal, self._weight = goal, weight
@@ -55,7 +55,7 @@ class OpenStates:
         self._lengths, self._closed = {_cell_of(start.angles): 0.0}, set()
 
     def pop(self) -> State | None:
-        """Remove and return the best state whose grid cell is new; None if no state is left."""
+        """Remove and return the first state whose grid cell has no expanded state; else None."""
         while self._states:
             state = heapq.heappop(self._states)[2]
             if (cell := _cell_of(state.angles)) not in self._closed:
@@ -64,7 +64,7 @@ class OpenStates:
         return None
 
     def steps_from(self, state: State) -> list[State]:
-        """Return a state's neighbours in grid cells without an expanded state or a shorter path."""
+        """Return a state's neighbours, except in cells that are expanded or have a shorter path."""
         neighbours = state.angles + STEPS
         lengths = state.length + np.linalg.norm(neighbours - state.angles, axis=1)
         return [
@@ -75,7 +75,7 @@ class OpenStates:
         ]
 
     def push(self, state: State) -> None:
-        """Add a state, and record its path length for its grid cell."""
+        """Add a state, and record its path length as the shortest to its grid cell."""
         self._lengths[_cell_of(state.angles)] = state.length
         ahead = float(np.linalg.norm(state.angles - self._goal))
         entry = state.length + self._weight * ahead, next(self._number), state
@@ -88,7 +88,7 @@ def _cell_of(angles: np.ndarray) -> tuple[int, ...]:
 
 @dataclasses.dataclass(frozen=True)
 class EpaseBlock(PathThenTime):
-    """The planner `epase`: weighted A* to end poses, one by one; it needs the extra `arm-peers`."""
+    """The planner `epase`: weighted A* to poses that meet the ball; needs the extra `arm-peers`."""
 
     # [s], longest search for one end pose. Few searches that take longer succeed.
     longest: float = 0.05
@@ -97,7 +97,10 @@ class EpaseBlock(PathThenTime):
     def path_to(
         self, case: BlockCase, free: FreeSpace, goal: Goal, left: Clock
     ) -> np.ndarray | None:
-        """Return a collision-free joint path (N, 6) [rad] to the goal, or None if none is found."""
+        """Return joint angles (N, 6) [rad] along a collision-free path to the goal, or None.
+
+        `free` checks collisions, and `left` returns the remaining search time [s].
+        """
         end = np.asarray(goal.angles, float)
         states = OpenStates(State(np.asarray(case.angles, float), 0.0), end, self.weight)
         while left() > 0.0 and (state := states.pop()) is not None:

@@ -40,7 +40,7 @@ def _compile(tree: Hashable, layout: tuple, dtype: np.dtype) -> None:
 
 
 class FreeSpace:
-    """Collision checks of the arm of one case: joint angles within limits, and free of contacts."""
+    """Checks that an arm's joint angles are within limits and keep a distance from obstacles."""
 
     def __init__(self, case: BlockCase, margin: float) -> None:
         """Compile the checks; `margin` [m] is the least obstacle distance of a free pose."""
@@ -52,7 +52,7 @@ class FreeSpace:
         _compile(tree, tuple((leaf.shape, leaf.dtype) for leaf in leaves), self._dtype)
 
     def is_free(self, angles: np.ndarray) -> np.ndarray:
-        """Return whether each of the joint angles (N, 6) [rad] is collision-free, (N,) bool."""
+        """Return which of N poses (N, 6) [rad] are within limits and collision-free, (N,) bool."""
         num, begin, gaps = len(angles), 0, []
         while begin < num:
             size = next((size for size in _BATCHES if size >= num - begin), _BATCHES[-1])
@@ -65,7 +65,7 @@ class FreeSpace:
         return is_within & (np.concatenate(gaps) >= self._margin)
 
     def are_edges_free(self, begins: np.ndarray, ends: np.ndarray) -> np.ndarray:
-        """Return which straight joint motions are collision-free, ends included, (N,) bool.
+        """Return which straight joint motions are free, without testing their starts, (N,) bool.
 
         Motion k leads from `begins[k]`, or from `begins` if its shape is (6,), to `ends[k]` [rad].
         """
@@ -76,7 +76,7 @@ class FreeSpace:
         number = np.arange(len(edge)) - np.repeat(np.cumsum(counts) - counts, counts) + 1
         share = (number / counts[edge])[:, None]
         angles = begins[edge] + share * (ends - begins)[edge]
-        # Ends and every eighth sample are checked first: they reject most colliding motions.
+        # The last and every eighth sample of a motion are checked first: they reject most motions.
         is_first = (number % 8 == 0) | (number == counts[edge])
         found = np.ones(len(ends), bool)
         for some in (is_first, ~is_first):

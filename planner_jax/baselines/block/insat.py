@@ -56,7 +56,7 @@ _UNIT = 0.3  # [rad], unit of the optimiser's variables, which are joint angles
 
 @struct.dataclass
 class Bounds:
-    """Joint limits that a spline must keep."""
+    """Limits of six joints that a spline must keep: angles, velocities and accelerations."""
 
     lower: Array  # (6,) [rad]
     upper: Array  # (6,) [rad]
@@ -66,7 +66,7 @@ class Bounds:
 
 @struct.dataclass
 class Splines:
-    """A splines of joint angles that are optimised at once, with the K iterates of each."""
+    """All K iterates of an optimisation of several (A) splines of joint angles at once."""
 
     points: Array  # (A, K, m, 6) [rad], m control points
     time: Array  # (A, K) [s], duration
@@ -93,7 +93,7 @@ class InsatBlock(PoseByPose):
     def motion_to(
         self, case: BlockCase, free: FreeSpace, goal: Goal, left: Clock
     ) -> HostMotion | None:
-        """Return the motion along the first valid spline to an end pose, or None if none is found.
+        """Return the first collision-free motion along a spline that precedes the ball, or None.
 
         `free` checks collisions, and `left` returns the remaining search time [s].
         """
@@ -114,7 +114,7 @@ class InsatBlock(PoseByPose):
         return None
 
     def lift(self, case: BlockCase, free: FreeSpace, goal: Goal, state: State) -> bool:
-        """Compute the cheapest spline from the start to a state; return False if none is valid."""
+        """Store in a state its cheapest collision-free spline; return False if there is none."""
         found = self.best_spline(case, free, goal, state, rests=False)
         if found is None:
             return False
@@ -124,10 +124,11 @@ class InsatBlock(PoseByPose):
     def best_spline(
         self, case: BlockCase, free: FreeSpace, goal: Goal, state: State, rests: bool
     ) -> tuple[np.ndarray, float, float, np.ndarray] | None:
-        """Return the cheapest collision-free spline to a state within the available time, or None.
+        """Return the cheapest collision-free spline from the start to a state, or None.
 
-        Each candidate extends the spline of one of the state's ancestors. If `rests` is True, the
-        arm must stand still at the end.
+        The cost is [Natarajan2024, eq. 4a]; the spline lasts at most `goal.available` [s]. Each
+        candidate extends the spline of one of the state's ancestors. If `rests` is True, the arm
+        must stand still at the end.
 
         Returns:
             The spline's control points (m, 6) [rad], its duration [s], its length [rad] and its
@@ -181,7 +182,6 @@ def _compile(dtype: np.dtype, config: lbfgs.LbfgsConfig) -> None:
 
 
 def _fit_points(path: np.ndarray, end: np.ndarray, rests: bool) -> np.ndarray:
-    """Fit control points (m, 6) [rad] to a path (N, 6), continued straight to `end` (6,)."""
     straight = path[-1] + _SHARES[1:, None] * (end - path[-1])
     curve = np.concatenate([path, straight])
     lengths = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1)))
@@ -209,7 +209,7 @@ def _optimise(
     bounds: Bounds,
     config: lbfgs.LbfgsConfig,
 ) -> Splines:
-    """Optimise A splines from the same start to the same end, and return all iterates.
+    """Minimise [Natarajan2024, eq. 4a] for A splines between two poses; return all iterates.
 
     Args:
         start: (6,) [rad], joint angles at the start.
@@ -271,16 +271,12 @@ _of_points = jax.jit(functools.partial(b_spline, DEGREE))
 
 
 def _pieces(points: np.ndarray, time: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the coefficients (M, 4, 6) and durations (M,) [s] of a spline's M cubic pieces."""
     spline = _of_points(points, time)
     return np.asarray(spline.coeffs, float), np.asarray(spline.durations, float)
 
 
 def _motion(case: BlockCase, goal: Goal, points: np.ndarray, time: float) -> HostMotion:
-    """Return the motion along a spline.
-
-    If the arm may move at the goal, a wait comes first, so that it arrives together with the ball.
-    """
+    # An arm that may move at the end waits first, so that it arrives together with the ball.
     coeffs, durations = _pieces(points, time)
     if not case.ends_at_rest:
         wait = np.zeros((1, DEGREE + 1, 6))

@@ -45,7 +45,7 @@ class Goal:
 
 @dataclasses.dataclass(frozen=True)
 class HostMotion:
-    """A joint motion of M polynomial pieces; it starts after the delay of its case."""
+    """A joint motion of M polynomial pieces; time 0 is when the arm may start to move."""
 
     coeffs: np.ndarray  # (M, D + 1, 6), of degree D for six joints [rad], lowest power first
     durations: np.ndarray  # (M,) [s], durations of the pieces
@@ -92,7 +92,7 @@ class PoseByPose(Planner, abc.ABC):
         return jax.tree.map(lambda *leaves: np.stack(leaves), *plans)
 
     def plan_of(self, case: BlockCase) -> BlockPlan:
-        """Return the plan of one case: the first motion in time, or else the least late motion."""
+        """Return the plan of one case: the first motion before the ball, else the least late."""
         hopeless, angles, contacts, shares = (np.asarray(x) for x in _list_goals(case, self.points))
         if hopeless != Status.NO_PATH:
             return self._plan(case, Status(int(hopeless)))
@@ -126,7 +126,7 @@ class PoseByPose(Planner, abc.ABC):
         contact: ArrayLike = 0.0,
         tries: int = 0,
     ) -> BlockPlan:
-        """Return a plan of a motion that meets the ball at `contact` [s], or of standstill."""
+        """Return the plan of a motion that meets the ball at `contact` [s]; None is standstill."""
         dtype = np.asarray(case.angles).dtype
         if motion is None:
             stay = np.zeros((1, self.degree + 1, 6))
@@ -161,7 +161,7 @@ def _list_goals(case: BlockCase, points: int) -> tuple[Array, Array, Array, Arra
         angles: (C, 6) [rad], joint angles of the end poses.
         contact: (C,) [s], when the ball arrives at each pose.
         share: (C,), (duration of a bang-bang motion) / (time until the ball arrives); infinite if
-            the motion is too late.
+            the arm arrives after the ball.
     """
     poses, times = poses_in_time(case, points)
     share = times / jnp.maximum(poses.time - case.delay, 1e-6)

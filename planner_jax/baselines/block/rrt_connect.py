@@ -32,7 +32,7 @@ def _ompl() -> tuple[ModuleType, ModuleType]:
 
 @dataclasses.dataclass(frozen=True)
 class RrtConnectBlock(PathThenTime):
-    """The planner `rrt-connect`: RRT-Connect to end poses; it needs the extra `arm-peers`."""
+    """The planner `rrt-connect`, to poses that meet the ball; it needs the extra `arm-peers`."""
 
     packages: ClassVar[tuple[str, ...]] = ("toppra", "ompl")
     reach: float = 1.0  # [rad], greatest length of a tree's edge in joint space
@@ -41,7 +41,10 @@ class RrtConnectBlock(PathThenTime):
     def path_to(
         self, case: BlockCase, free: FreeSpace, goal: Goal, left: Clock
     ) -> np.ndarray | None:
-        """Return a collision-free joint path (N, 6) [rad] to the goal, or None if none is found."""
+        """Return joint angles (N, 6) [rad] along a collision-free path to the goal, or None.
+
+        `free` checks collisions, and `left` returns the remaining search time [s].
+        """
         base, geometric = _ompl()
         space = base.RealVectorStateSpace(6)
         bounds = base.RealVectorBounds(6)

@@ -1,4 +1,4 @@
-"""The baseline `mpp`: minimum-jerk trajectories to sampled states of catches at a fixed height."""
+"""The baseline `mpp`: minimum-jerk trajectories to sampled states of catches at a given height."""
 
 import dataclasses
 from typing import ClassVar
@@ -163,9 +163,9 @@ class MppCatch(Planner):
         )
 
     def times(self, context: CatchContext) -> tuple[Array, Array]:
-        """Return increasing catching times (N,) [s] of N targets, and their excess (N,).
+        """Return increasing catching times (N,) [s] of N targets, and excesses (N,), <= 0 if valid.
 
-        The excess is <= 0 if the target falls through the height, later than the previous target.
+        A time is valid if the target falls through the height then, after the previous target.
         Targets that are absent from the case come last and have the time of the last catch.
         """
         height = jnp.asarray(self.height, context.horizon.dtype)

@@ -47,10 +47,10 @@ COST_UNIT = 1e3  # divisor of the cost, so that the Hessian has moderate entries
 
 
 def limits_excess(motion: Motion, given: tuple[Array, QuadrotorLimits]) -> tuple[Array, ...]:
-    """Return the excess of samples over limits of speed, body rate, thrust, height (eqs 26-28).
+    """Return excesses over limits of speed, body rate, thrust, height [Yu2023catch, eqs 26-28].
 
     Each excess is a difference of squares in SI units; for the height it is a difference [m].
-    `given` has gravity and limits of a case.
+    It is computed at samples of the motion. `given` has gravity and limits of a case.
     """
     gravity, limits = given
     return (
@@ -167,7 +167,7 @@ class PaperCatch(OptimisedPlanner):
         return order_targets(case)
 
     def guesses(self, context: CatchContext, num: int) -> Array:
-        """Return the initial guess (1, n) of the n variables: standstill below each caught ball."""
+        """Return an initial guess (1, n): at each catch, standstill with the net at the target."""
         require(num == 1, "starts", "1", num)
         case, dtype = context.case, context.times.dtype
         durations = jnp.maximum(jnp.diff(context.times, prepend=jnp.zeros((1,), dtype)), 0.05)
@@ -258,7 +258,7 @@ class PaperCatch(OptimisedPlanner):
         )
 
     def objective(self, point: Array, context: CatchContext) -> Evaluation:
-        """Return the paper's cost divided by `COST_UNIT`.
+        """Return the cost [Yu2023catch, eqs 18-28] of variables `point`, divided by `COST_UNIT`.
 
         The reported violation is always zero, so that the solver does not prefer iterates that keep
         the limits, and returns its last iterate.
@@ -271,7 +271,7 @@ class PaperCatch(OptimisedPlanner):
         return Evaluation(cost=cost / COST_UNIT, violation=jnp.zeros_like(cost))
 
     def rules_out(self, context: CatchContext) -> Array:
-        """Return whether some target never comes within the quadrotor's reach, () bool."""
+        """Return whether the quadrotor provably cannot catch some target at any time, () bool."""
         return is_too_far(context)
 
     def decode(self, point: Array, context: CatchContext) -> CatchPlan:

@@ -33,7 +33,10 @@ SOURCE = (
 
 
 def make_table(manifest: Entries) -> RateTable:
-    """Return a table of a run's success rate and optimal time ratio beside published values."""
+    """Return a table of a run's success rate and optimal time ratio beside [Yu2023catch].
+
+    This ratio is the mean relative change of the initial catching times by the optimiser.
+    """
     summary, settings = manifest["summary"], manifest["parameters"]
     planner, names = settings["planner"], list({**SUITES, settings["suite"]: None})
     header = ["suite", "cases", f"{planner} %", "95 % interval", f"{planner} OTR"]

@@ -208,7 +208,7 @@ class BatHit(OptimisedPlanner):
         return impact, hit.defect
 
     def guesses(self, context: HitContext, num: int) -> Array:
-        """Return the initial guess (1, n) of the n variables, with values of Section VI-A."""
+        """Return the initial guess (1, n) of the variables, by [Yu2023bat, Section VI-A]."""
         require(num == 1, "starts", "1", num)
         case, dtype = context.case, context.landing_time.dtype
         stages = self.stage_times if self.transition else self.stage_times[:1]
@@ -225,7 +225,7 @@ class BatHit(OptimisedPlanner):
         return (natural / jnp.asarray(self.scale, dtype))[None]
 
     def primitive_waypoints(self, impact: Impact, case: HitCase) -> Array:
-        """Return W waypoints (W, 3) [m] of the initial guess, on minimum-jerk trajectories."""
+        """Return W initial waypoints (W, 3) [m], on minimum-jerk trajectories to the impact."""
         head, tail, end = case.head_state[:3], impact.tail_state[:3], impact.stroke.time
         shares = np.arange(1, self.num_pieces) / self.num_pieces
         times = end * jnp.asarray(shares, end.dtype)
@@ -264,7 +264,7 @@ class BatHit(OptimisedPlanner):
         return offsets, rows, duration, impact, defect
 
     def _terminal_penalty(self, impact: Impact, defect: Array, case: HitCase) -> Array:
-        """Return the penalty on apex (eq. 21), hitting speed (eq. 24a) and defect of eqs 13-14."""
+        """Return the penalty on apex, hitting speed, defect [Yu2023bat, eqs 21, 24a and 13-14]."""
         limits = case.hit_limits
         excess = jnp.concatenate(
             [
@@ -275,7 +275,7 @@ class BatHit(OptimisedPlanner):
         return self.terminal_weight * (jnp.sum(smooth_hinge(excess, self.hinge_width)) + defect)
 
     def _penalty(self, motion: Motion, duration: Array, case: HitCase) -> Array:
-        """Return the penalty on limits along the trajectory (eq. 18a).
+        """Return the penalty on limits along the trajectory [Yu2023bat, eq. 18a].
 
         It penalises the differences between squared quantities and squared limits, in SI units.
         """
@@ -290,7 +290,7 @@ class BatHit(OptimisedPlanner):
         return self.limit_weight * duration * jnp.sum(hinges * weights[None])
 
     def objective(self, point: Array, context: HitContext) -> Evaluation:
-        """Return the cost of eq. 20, divided by `_COST_UNIT`.
+        """Return the cost [Yu2023bat, eq. 20] of the variables `point`, divided by `_COST_UNIT`.
 
         The reported violation is always zero, so that the solver does not prefer iterates that keep
         the limits, and returns its last iterate.
@@ -307,7 +307,7 @@ class BatHit(OptimisedPlanner):
         return Evaluation(cost=cost / _COST_UNIT, violation=jnp.zeros_like(cost))
 
     def rules_out(self, context: HitContext) -> Array:
-        """Return whether the ball never comes within the quadrotor's reach, () bool."""
+        """Return whether the quadrotor provably cannot hit the ball at any time, () bool."""
         return is_too_far(context)
 
     def decode(self, point: Array, context: HitContext) -> HitPlan:

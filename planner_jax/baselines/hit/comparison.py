@@ -16,20 +16,18 @@ from planner_jax.task.hit.suites import Serves
 
 
 def describe_serves(serves: Serves) -> Entries:
-    """Return the number of distinct balls among serves, and a hash of balls and targets."""
+    """Return the number of distinct balls among serves, and a hash that identifies the serves."""
     balls = np.column_stack([serves.position, serves.velocity])
     digest = hashlib.sha256(np.column_stack([balls, serves.target]).tobytes()).hexdigest()
     return {"distinct": len(np.unique(balls, axis=0)), "sha256": digest}
 
 
 def choose_reference(planner: str) -> str:
-    """Return the name of the published planner to compare with: the same name, or else `bat`."""
+    """Return the published planner to compare with: the planner of the same name, else `bat`."""
     return planner if planner in court.PLANNERS else "bat"
 
 
 def _outcome_column(index: int, planner: str) -> Column:
-    """Return the column of published outcomes of the planner that has this name and index."""
-
     def values(batch: RefereedBatch) -> pa.Array | None:
         if (found := cast(Serves, batch.chunk.origin).published) is None:
             return None

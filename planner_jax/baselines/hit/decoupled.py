@@ -19,7 +19,7 @@ _LEAST_PUSH = 1e-3  # [s], least (change of the ball's velocity) / thrust
 
 @struct.dataclass
 class DecoupledHit:
-    """The solution of eqs 13 and 14 for given racket velocity (y, z) and thrust (x, z)."""
+    """The solution of [Yu2023bat, eqs 13-14] for given racket velocity y, z and thrust x, z."""
 
     ball_vel_after: Array  # (3,) [m/s], velocity of the ball after the impact
     flight_time: Array  # () [s], of the ball from the impact to the target
@@ -36,7 +36,7 @@ def solve_decoupled_hit(
     restitution: Array,
     gravity: Array,
 ) -> DecoupledHit:
-    """Solve eqs 13 and 14 for a hit that sends the ball to the target.
+    """Solve [Yu2023bat, eqs 13-14] for a hit that sends the ball to the target.
 
     Let tau be the thrust, v the ball's velocity before the impact, and g gravity. With
     delta = tau_z / tau_x, xi = target - ball and c = v_z - delta v_x, the flight time t after the

@@ -167,7 +167,7 @@ def _merge(
 
 
 def _list_out_of_play(trials: list[Trial]) -> list[str]:
-    """List the serves that start below the ground or do not land in the quadrotor's half."""
+    """List the serves that start below the ground or land outside the hitting half, x < 0."""
     numbers = np.array([trial.numbers for trial in trials]).reshape(-1, 12)
     height = numbers[:, 2]
     position = np.column_stack([numbers[:, :2], np.where(height > 0.0, height, 1.0)])
@@ -194,7 +194,7 @@ class PublishedRates:
 
 
 def read_published_rates() -> PublishedRates:
-    """Read the success rates of [Yu2023bat]; columns are planners in the order `court.PLANNERS`."""
+    """Read the success rates [Yu2023bat] of `juggle`, `bat-lite` and `bat`, one column each."""
     text = (resources.files("planner_jax.baselines.hit") / "published_rates.csv").read_text(
         encoding="utf-8"
     )

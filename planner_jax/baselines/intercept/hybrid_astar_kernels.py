@@ -177,7 +177,7 @@ def _compute_field(scene, cell):
 
 @njit(cache=True)
 def _list_goal_poses(goal, scene, num):
-    """Return the goal's pose (1, 3), or `num` poses (num, 3) around it if the heading is free."""
+    """Return the goal's pose (1, 3), or poses with `num` headings (num, 3) if it has no heading."""
     back = 0.0 if goal.has_heading else scene.middle
     poses = np.empty((1 if goal.has_heading else num, 3))
     for k in range(poses.shape[0]):
@@ -202,7 +202,7 @@ def _is_blocked(start, goal, scene, field):
 
 @njit(cache=True)
 def _compute_primitives(start_heading, rules):
-    """Compute the arcs that the search tries from a node: longer than the diagonal of a cell."""
+    """Compute the arcs that the search tries from a node, long enough to leave a grid cell."""
     width = TURN / rules.headings
     turns = 2
     while turns * width / rules.curvature <= math.sqrt(2.0) * rules.cell:
@@ -354,7 +354,7 @@ def _enter(tree, node, parent, primitive, x, y, cost, heading_bin):
 
 @njit(cache=True)
 def _expand(node, num, best_cost, start, goal, scene, rules, field, primitives, tree, heap):
-    """Add a node's neighbours to tree and heap; return the new number of nodes of the tree."""
+    """Add neighbours below `best_cost` to tree and heap; return the new number of nodes."""
     x, y, cost, k = tree.place[node, 0], tree.place[node, 1], tree.place[node, 2], tree.bin[node]
     cos, sin = primitives.directions[k, PRIMITIVES // 2, 0]
     last = primitives.moves.shape[1] - 1

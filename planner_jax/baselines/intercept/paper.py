@@ -98,7 +98,7 @@ class PaperIntercept(Planner):
         )
 
     def path(self, case: InterceptCase, poses: Array, curvatures: Array, length: Array) -> Path:
-        """Smooth a searched path, and return a path beside it that the car can drive."""
+        """Smooth a searched path, and return the nearest path without jumps of the curvature."""
         smooth = smooth_path(
             poses,
             curvatures,
@@ -110,7 +110,7 @@ class PaperIntercept(Planner):
             upper=case.upper,
             settings=self.smoothing,
         )
-        # The steering rate limit must allow the initial speed and the mean speed, times `_PACE`.
+        # At 1.2 times the initial or mean speed, the path must keep the limit of the steering rate.
         pace = _PACE * jnp.maximum(case.speed, smooth.length / case.time)
         rate = case.limits.steering_rate / (case.body.wheelbase * pace)
         return path_beside(

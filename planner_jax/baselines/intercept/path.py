@@ -34,7 +34,7 @@ class Path:
 
 
 def path_along(start: Array, length: Array, curvature: Array) -> Path:
-    """Return the path from a pose (3,) with curvatures (N,) [1/m] at equally spaced points."""
+    """Return the path of a length [m] from a pose (3,), with curvatures (N,) [1/m] at points."""
     drive = motion(start, length, jnp.ones_like(curvature), curvature, 1)
     return Path(
         pos=jnp.concatenate([start[None, :2], drive.pos[:, 0]]),
@@ -146,10 +146,10 @@ def path_beside(
 
 
 def nearness(push: Array, miss: float) -> Quadratic:
-    """Return the quadratic model of the squared distances of samples from given positions.
+    """Return the quadratic model of a cost: (distance of a sample from a given point / miss)^2.
 
-    `push` (K, S, 2) is half of the cost's gradient by the positions of S samples in each of K
-    pieces. `miss` [m] is the distance that adds 1 to the cost.
+    `push` (K, S, 2) is (sample - given point) / miss^2, which is half of the cost's gradient, for S
+    samples in each of K pieces. `miss` is in metres.
     """
     num, samples, _ = push.shape
     stiffness = jnp.zeros((4, 4), push.dtype).at[jnp.arange(2), jnp.arange(2)].set(miss**-2)

@@ -111,7 +111,7 @@ def smooth_path(
     def evaluate(share: Array) -> tuple[Array, Array, Array, Array]:
         """Return poses, curvatures and length of a partly smoothed path, and whether it is valid.
 
-        Its points are moved by the fraction `share` of the way to the smooth points.
+        Its points are moved by the fraction `share` of the shift to the smooth points.
         """
         points = given + share * (smooth - given)
         found, bent, total = resample(points, poses[0, 2], poses[-1, 2], poses.shape[0])

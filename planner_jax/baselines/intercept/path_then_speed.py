@@ -114,7 +114,7 @@ class PathThenSpeed(Planner):
 
     @property
     def attempts(self) -> tuple[Search, ...]:
-        """The attempts; the field `paths` of an attempt is the number of paths to try."""
+        """The searches, each with a number `paths` of paths; unsolved cases get the next search."""
         return self.searches
 
     def solve(self, case: InterceptCase, attempt: Search) -> InterceptPlan:
@@ -132,7 +132,8 @@ class PathThenSpeed(Planner):
     ) -> InterceptPlan:
         """Return the plan of one case.
 
-        `layers` () is the number of equal time steps into which the search for paths divides time.
+        `layers` () is the number of equal time steps of the search for paths, by default chosen for
+        the case.
         """
         found = self.source.paths(case, attempt, layers)
         plan = self.best_drive(case, found)
@@ -185,17 +186,18 @@ def lattice(**fields: object) -> PathThenSpeed:
 
 
 def em(**fields: object) -> PathThenSpeed:
-    """Create the planner `em`: the best path, with the speed planner of the EM planner [Fan2018].
+    """Create the planner `em`: the path of least acceleration, with the speed of [Fan2018].
 
-    The speed has as many polynomial pieces as in `lattice`; `fields` are the planner's options.
+    The speed has 20 polynomial pieces, as in `lattice`; `fields` are the planner's options.
     """
     speed = dataclasses.replace(SPEED_PLANNERS["em"], pieces=20, samples=5)
     return PathThenSpeed(**{"tries": 1, "step": SpeedStep(speed=speed), **fields})
 
 
 def constant(**fields: object) -> PathThenSpeed:
-    """Create the planner that drives the best path at constant speed, ignoring moving obstacles.
+    """Create the planner that drives the path of least acceleration at constant speed.
 
-    A short ramp from the initial speed comes first; `fields` are the planner's options.
+    The speed ignores moving obstacles, and starts with a short ramp from the initial speed.
+    `fields` are the planner's options.
     """
     return PathThenSpeed(**{"tries": 1, "step": SpeedStep(speed=None), **fields})

@@ -237,7 +237,6 @@ def _search(
         is_stuck = is_hopeless | (is_added & taken[place])
         length = jnp.where(is_stuck, 0.0, length)
 
-        # Adding or dropping a bound changes the matrices by an outer product of two vectors.
         lost = s.maps[size + loser]
         other = jnp.where(is_added, both, _product(s.maps, lost))
         axis = jnp.where(is_added, move, lost)

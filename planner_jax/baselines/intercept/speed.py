@@ -69,9 +69,9 @@ class SpeedPlanner:
     solver: QpConfig = QpConfig()
 
 
-# Speed planners by name. "trapezoid" has tilted bounds, which are this library's choice;
-# "trapezoid-edges" has the bounds of [Qu2022]. "rectangle" and "em" use only stations that are free
-# during a whole piece. "em" is the speed planner of [Fan2018], whose bounds apply to samples.
+# Speed planners by name. "trapezoid" has bounds with the slope of the reference line, a choice of
+# this library; "trapezoid-edges" has the polygons' edges as bounds [Qu2022]. "rectangle" and "em"
+# use only stations that are free during a whole piece; "em" bounds only samples [Fan2018].
 SPEED_PLANNERS = {
     "trapezoid": SpeedPlanner(),
     "trapezoid-edges": SpeedPlanner(lines="edges"),
@@ -137,10 +137,7 @@ def speed_template(planner: SpeedPlanner) -> QpTemplate:
 
 
 def _rows_of_piece(planner: SpeedPlanner, order: int) -> np.ndarray:
-    """Return the matrix from a piece's control points to bounded values of a derivative.
-
-    The derivative has the given order: 0 station, 1 speed, 2 acceleration.
-    """
+    """Map a piece's control points to its bounded stations, speeds, accelerations (`order` 0-2)."""
     rows = hodograph(planner.degree, order, planner.pieces)
     if planner.samples is None:
         return rows

@@ -174,11 +174,7 @@ def _find_forbidden_edges(problem: StationTimeProblem, grid: StationTimeGrid) ->
 
 
 def _parts_of_cells(num: int, parts: int) -> np.ndarray:
-    """Return the indices of the parts of the path that each cell overlaps, one row per cell.
-
-    The path is divided into `num` equal cells, and also into `parts` equal parts. Rows are filled
-    with their last index.
-    """
+    """Return for `num` equal cells of a path which of `parts` equal parts each cell overlaps."""
     cell = np.arange(num)
     first, last = cell * parts // num, -(-(cell + 1) * parts // num) - 1
     width = (last - first).max() + 1

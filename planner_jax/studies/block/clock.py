@@ -39,7 +39,7 @@ class CountedPlanner(Planner[BlockCase, TimedPlan]):
     allowed: float  # [s] planning time that the delay of every case already contains
 
     def plan_by(self, drive: Drive, cases: BlockCase) -> TimedPlan:
-        """Plan each case, delay motions whose planning took too long, and cut at the contact."""
+        """Plan cases one by one; delay each motion by its planning time's excess over `allowed`."""
         plans, spent = measure_plans(self.planner, cases)
         late = np.maximum(spent - self.allowed, 0.0).astype(cases.delay.dtype)
         met = delay_motion(cases, plans, late)

@@ -49,7 +49,7 @@ def delay_motion(cases: BlockCase, plans: BlockPlan, late: np.ndarray) -> BlockP
     Args:
         cases: a batch of B cases in which the arms start at rest.
         plans: plans of these cases.
-        late: (B,) [s], time >= 0 by which each motion starts later; 0 leaves a plan unchanged.
+        late: (B,) [s], time >= 0 by which each motion starts later; 0 changes no motion.
 
     Returns:
         Plans with two more pieces: one for waiting before the motion, one for braking after it.

@@ -31,7 +31,8 @@ def follow_study(planner: Planner, settings: StudySettings) -> Planner:
     If the settings simulate neither, the planner is returned unchanged.
 
     Raises:
-        ArgumentError: the planner does not work with a camera, or cannot plan repeatedly.
+        ArgumentError: a camera with the planner `library`, or repeated planning with any planner
+            but `online`.
     """
     if settings.perception:
         for name in ("replan", "observe_longer"):
@@ -66,7 +67,7 @@ _TIMED_COLUMNS = leaves_of("plans", ("planning_time", "s", "of this plan"))
 
 
 def columns_of(plans: object) -> list[Column]:
-    """Return a sweep's additional table columns for camera observations or planning times."""
+    """Return the additional columns of a run's table for plans with camera or timing data."""
     return {SeenPlan: _SEEN_COLUMNS, TimedPlan: _TIMED_COLUMNS}.get(type(plans), [])
 
 

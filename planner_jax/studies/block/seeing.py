@@ -52,7 +52,7 @@ class SeeingArms(Planner[BlockCase, SeenPlan]):
     seed: int  # seed of the noise
 
     def plan_by(self, drive: Drive, cases: BlockCase) -> SeenPlan:
-        """Return the executed motions of a batch, up to their contacts with the true balls."""
+        """Return the executed motions, up to contact with the true balls; `drive` is unused."""
         done = self.decide_batch(cases)
         (error, std), (last, _) = (done.fit_errors(place) for place in (0, -1))
         first = take(done.fits, 0)
@@ -84,7 +84,7 @@ class SeeingArms(Planner[BlockCase, SeenPlan]):
         )
 
     def moments(self, cases: BlockCase) -> list[float]:
-        """Return the times [s] when the balls' flights are fitted, until the last ball arrives."""
+        """Return the times [s] at which flights are fitted, while a ball can still be blocked."""
         moments = [self.observe]
         if self.observe_longer:
             num = int(self.observe_longer * self.frame_rate + 1e-6)

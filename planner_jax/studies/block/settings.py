@@ -73,7 +73,7 @@ class StudySettings(SweepSettings):
 
     @property
     def first_motion(self) -> float:
-        """Time [s] from the moment at which an arm may move until its first motion starts."""
+        """Time [s] added to each case's delay: observation and overhead, or the planning budget."""
         if self.perception:
             return self.observe + self.overhead
         return self.planning_budget or 0.0

@@ -6,7 +6,7 @@ for the cells around the given ball, and warps each until it ends where the give
 warp changes all joint angles by a profile in time, such that the end pose becomes a pose that meets
 the ball (by inverse kinematics). A warped motion lasts until the ball arrives. Motions with the
 smallest warp are evaluated first. If no warped motion is collision-free, the warped motions are the
-initial guesses of the least squares of `OnlineBlock`.
+initial guesses of the planner `online`.
 """
 
 import dataclasses
@@ -102,11 +102,11 @@ class AdaptBlock(Planner):
         return self.efforts
 
     def check(self, cases: BlockCase) -> None:
-        """Raise `ArgumentError` unless arm, limits, scene and start of a case fit the library."""
+        """Raise `ArgumentError` unless arm, limits, scene and start of case 0 fit the library."""
         self.stored.check(cases)
 
     def solve(self, case: BlockCase, attempt: Effort) -> BlockPlan:
-        """Return the plan of one case: the first changed (warped) motion that is collision-free."""
+        """Return the plan of one case: the first motion that can be warped to meet the ball."""
         flight = flight_of(case)
         home, fits = self.stored.home_of(case)
         poses = end_poses(case, flight, attempt.points, self.online.pieces)
@@ -134,8 +134,9 @@ class AdaptBlock(Planner):
     ) -> Warped:
         """Return stored motions, changed (warped) such that they end in poses that meet the ball.
 
-        `home` is the index of the motions' start pose, `poses` has eight end poses at each of
-        several points of the ball's trajectory, and `effort` has the numbers of motions.
+        `flight` has the times at which the ball enters both boxes, `home` is the index of the start
+        pose, and `poses` has eight end poses at each of `effort.points` points of the ball's path.
+        The result has `effort.screened` motions.
         """
         online, dtype = self.online, case.angles.dtype
         pieces, num = online.pieces, effort.points
@@ -180,13 +181,13 @@ class AdaptBlock(Planner):
     def neighbours(
         self, case: BlockCase, flight: Flight, home: Array, num: int
     ) -> tuple[Array, Array, Array]:
-        """Return the N = `num` motions from start pose `home` whose cells are nearest to the ball.
+        """Return the N = `num` motions from start pose `home` for the cells nearest to the ball.
 
         Returns:
             steps: (N, K, 6) [rad], rates of the joints at K knots of the motion, times its
                 duration; zero if no motion is stored.
-            away: (N,), sum of the squared distances between the ball and the centres of the
-                motion's two cells, in cell sizes.
+            away: (N,), sum of the squared distances between the centres of the motion's two cells
+                and the points where the ball enters the two boxes, in cell sizes.
             found: (N,) bool, whether a motion is stored.
         """
         table = self.stored.library.table
@@ -209,9 +210,10 @@ class AdaptBlock(Planner):
         return jnp.where(found[:, None, None], row.steps, 0.0), -away, found
 
     def pole_shortfall(self, case: BlockCase, moves: Array, samples: int) -> Array:
-        """Return the required minus the least distance from the pole, (C,) [m], for C motions.
+        """Return the required minus the least distance from arm to pole, (C,) [m], of C motions.
 
-        `moves` (C, K, 6) [rad] has the joints' rates at K knots, times the duration.
+        `moves` (C, K, 6) [rad] has the joints' rates at K knots, times the duration. Distances are
+        computed at `samples` times of each motion.
         """
         shares = tuple(np.arange(1, samples + 1) / samples)
         rest = jnp.zeros_like(case.angles)
@@ -223,11 +225,11 @@ class AdaptBlock(Planner):
 def adapt_planner(file: str | os.PathLike) -> AdaptBlock:
     """Return the adapting planner for a file that `planner-jax library build` wrote.
 
-    The table is read completely and stored on the default device.
+    The library's motions are read completely and stored on the default device.
 
     Raises:
         ArgumentError: the file is not a complete library, or its motions have another number of
-            pieces than the motions of `OnlineBlock`.
+            pieces than the motions of the planner `online`.
     """
     library, own = load_library(file), OnlineBlock().pieces
     if (pieces := pieces_of(library.table.rows)) != own:

@@ -73,7 +73,7 @@ _FEW = 6  # number of planner calls of the small size that take as long as one o
 
 @dataclasses.dataclass(frozen=True)
 class _Motions:
-    """The best motions found so far for P pairs of cells, one on each of two boxes."""
+    """For P pairs of cells, the motions found so far that can block the earliest ball."""
 
     # (P, 6 K + 1): rates of 6 joints at K knots, times the duration [rad]; then the duration [s].
     point: np.ndarray
@@ -194,10 +194,11 @@ def plan_pairs(
 ) -> np.ndarray:
     """Plan motions from one start pose for N pairs of cells; return rows of the library's table.
 
-    A pair is one cell on each of the two boxes around the arm. Motions with all joints in
-    proportion are tried first. For pairs without a motion, or whose ball might enter earlier, the
-    least squares of `BentPair` then start from one initial guess after another. If a pair still has
-    no motion, both steps are repeated with a coarse tolerance.
+    A pair is one cell on each of the two boxes around the arm. `StraightPair` tries motions in
+    which all joints move in proportion. For pairs without a motion, or with a motion that a ball
+    might come too early for, `BentPair` then bends motions around obstacles, from one initial guess
+    after another. For pairs that still have no motion, both steps are repeated with the wider
+    tolerance `COARSE`.
 
     Args:
         setting: arm, limits and scene, with NumPy leaves.
@@ -297,8 +298,6 @@ def _in_parts(array: np.ndarray) -> list[np.ndarray]:
 
 @jax.jit
 def _ends(setting: Setting, home: Array, steps: Array) -> tuple[Array, Array]:
-    """Return the shield's rotations (N, 3, 3) and centres (N, 3) [m] at the ends of N motions."""
-
     def end(steps: Array) -> tuple[Array, Array]:
         angles = angles_at(home, jnp.zeros_like(home), steps, (1.0,))[0]
         return shield_pose(setting.arm, angles)
@@ -334,7 +333,6 @@ def _nearest(setting: Setting, angles: Array) -> Array:
 
 
 def _empty_rows(homes: int, layout: Layout, planner: PairPlanner) -> np.ndarray:
-    """Return the rows of a table without motions; `homes` is the number of start poses."""
     pieces = planner.online.pieces
     rows = np.zeros((homes, layout.num_pairs, 6 * pieces + 10), np.float32)
     rows[..., 6 * pieces] = np.inf

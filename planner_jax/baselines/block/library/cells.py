@@ -216,7 +216,7 @@ def nominal_ball(outer: Array, inner: Array) -> tuple[BallState, Array]:
 
     Returns:
         ball: state of the ball as it enters the outer box.
-        span: () [s], time from the outer to the inner box: their distance divided by `SPEED`.
+        span: () [s], time from the outer to the inner box: their distance / (8 m/s).
     """
     begin = jnp.mean(outer, axis=0)
     path = jnp.mean(inner, axis=0) - begin

@@ -53,7 +53,7 @@ def build_library(
             start pose of the arm.
 
     Raises:
-        ArgumentError: an argument breaks a rule.
+        ArgumentError: an argument is invalid; the message states which values are valid.
     """
     require_one_of(LAYOUTS, "layout", layout)
     require_one_of(REGIMES, "regime", regime)
@@ -86,7 +86,7 @@ def build_library(
 
 
 def show_library(path: str, *, map: str | None = None) -> None:
-    """Print the share of pairs of cells on two boxes with a motion; draw it if `map` is a path."""
+    """Print for which share of pairs of cells a motion is stored; draw a map to the path `map`."""
     library = load_library(path)
     covered = coverage(library)
     _print(path, library, covered)
@@ -96,7 +96,7 @@ def show_library(path: str, *, map: str | None = None) -> None:
 
 
 def check_library(path: str, *, num: int = 2000, seed: int = 0) -> None:
-    """Let the independent referee judge stored motions for `num` random balls per start pose."""
+    """Print how many of `num` random balls the stored motions block, judged by the referee."""
     require_size("num", num)
     require_seed(seed)
     require_memory("num", num, _CASE_BYTES)

@@ -40,7 +40,7 @@ class Coverage:
     is_sure: np.ndarray
 
     def share(self, of: np.ndarray) -> np.ndarray:
-        """Return the fraction (H,) of cell pairs in mask `of` with a motion, by start pose."""
+        """Return for H start poses which fraction (H,) of the pairs in `of` (P,) has a motion."""
         return (self.found & of).sum(axis=1) / of.sum()
 
 
@@ -62,7 +62,7 @@ def coverage(library: Library) -> Coverage:
 
 @jax.jit
 def _farthest(outer: Array, inner: Array, row: Row) -> Array:
-    """Return the greatest distance [m] from shield centre to ball in the shield's plane, (H, P)."""
+    """Return how far [m] from a shield's centre balls of each pair can cross its plane, (H, P)."""
 
     def one(outer: Array, inner: Array, row: Row) -> Array:
         sides = [row.normal, row.edge, jnp.cross(row.normal, row.edge)]
@@ -74,7 +74,7 @@ def _farthest(outer: Array, inner: Array, row: Row) -> Array:
 
 @dataclasses.dataclass(frozen=True)
 class Check:
-    """B random balls through pairs of cells with a stored motion, and the referee's verdict."""
+    """B random balls through pairs of cells with a stored motion, and an independent verdict."""
 
     cases: BlockCase
     pairs: np.ndarray  # (B,) int, index of the pair of cells that each ball passes
@@ -83,7 +83,7 @@ class Check:
 
 
 def check(library: Library, num: int, seed: int = 0, home: int = 0) -> Check:
-    """Let the referee judge whether stored motions block random balls.
+    """Let the referee, an independent check of plans, judge stored motions for random balls.
 
     Each ball passes a random pair of cells, on two boxes, with a stored motion, and leaves just
     enough time for this motion.
@@ -155,6 +155,5 @@ def _throw_balls(
 
 @jax.jit
 def _move_back(balls: BallState, times: Array) -> BallState:
-    """Return the states that B balls without drag had `times` (B,) [s] earlier."""
     gravity = jnp.asarray(GRAVITY, times.dtype)
     return jax.vmap(drag_free_flight, (0, 0, None))(balls, -times, gravity)

@@ -38,8 +38,8 @@ from planner_jax.task.block.end_poses import EndPoses, Flight, face_ball, frame_
 from planner_jax.task.block.motion import angles_at, bump_steps, step_weights
 
 # Greatest distance [m] between ball and shield centre, and greatest angle [rad] between ball
-# direction and shield normal, at the end of a stored motion. COARSE applies if no motion keeps
-# FINE, since a shield that blocks some balls of a pair of cells is better than no shield.
+# direction and shield normal, at the end of a stored motion. COARSE applies if no motion keeps FINE
+# (2 mm, 0.5 degrees), since a shield that blocks some balls is better than no shield.
 FINE, COARSE = STRICT, (0.08, np.deg2rad(20.0))
 # [s], a ball may enter the outer box around the arm at most this time later than if there were no
 # obstacles.
@@ -101,7 +101,7 @@ class PairPlanner(Planner):
     is_sequential: ClassVar[bool] = True
 
     def case_of(self, pair: PairCase, entry: Array) -> tuple[BlockCase, Flight]:
-        """Return the case and flight of a ball that enters the outer box at time `entry` () [s]."""
+        """Return the case of a ball that enters the outer box at `entry`, and when to block it."""
         ball, span = nominal_ball(pair.outer, pair.inner)
         gravity = jnp.asarray(GRAVITY, span.dtype)
         case = BlockCase(
@@ -201,7 +201,7 @@ class PairPlanner(Planner):
         """Return the plan of the motion `point` (6 K + 1,), encoded as `PairPlan.point`.
 
         The ball enters the outer box at time `entry` () [s]. The plan's violation includes balls
-        that pass the pair's two cells but would miss the shield.
+        that pass the pair's two cells but would miss the shield. `steps` are its `iterations`.
         """
         case, flight = self.case_of(pair, entry)
         plan = self.online.finish(case, flight, point, steps)
@@ -286,12 +286,12 @@ class Bends(Attempt):
 
 @struct.dataclass
 class BentPair(PairPlanner):
-    """A planner that bends motions around obstacles by the least squares of `OnlineBlock`.
+    """A planner that bends motions around obstacles by the least squares of the planner `online`.
 
-    The initial guess is a stored guess, or a motion in `PairCase.given`. The planner bisects the
-    time at which the ball enters the outer box around the arm. The lower bound is the time
-    that the quickest motion without obstacles allows. The upper bound is the entry time of the best
-    motion so far, or `_PATIENCE` after the lower bound if no motion has been found.
+    The initial guess is a stored guess, or the motion `PairCase.given`. The planner bisects the
+    time at which the ball enters the outer box around the arm. The lower bound is the time that
+    the quickest motion without obstacles allows. The upper bound is the entry time of the best
+    motion so far, or 0.8 s after the lower bound if no motion has been found.
     """
 
     search: Bends = struct.field(pytree_node=False, default=Bends())
@@ -317,7 +317,7 @@ class BentPair(PairPlanner):
         learned = online.encode_straight(case, poses, place).at[:-1].add(bump.astype(dtype))
         is_given = pair.start < 0
         start = jnp.where(is_given, pair.given, learned)
-        # The motion `given` meets the ball approximately in the middle between the two cells.
+        # The motion `given` meets the ball midway between the cells, half a `span` after its entry.
         span = nominal_ball(pair.outer, pair.inner)[1]
         entry = jnp.where(is_given, pair.given[-1] - 0.5 * span, of_place)
         none = jnp.isinf(pair.best)

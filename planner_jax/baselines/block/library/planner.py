@@ -26,7 +26,7 @@ from planner_jax.task.block.motion import polynomial
 from planner_jax.task.block.plan import BlockPlan
 from planner_jax.trajectory.polynomial import PiecewisePolynomial
 
-# [rad] and [rad/s], greatest difference of the arm's joints from a start pose of the library.
+# Greatest difference of joint angles [rad] from a start pose, and of joint rates [rad/s] from 0.
 _SAME_START = 1e-4
 
 
@@ -55,7 +55,7 @@ class LibraryBlock(Planner):
         return (Attempt(),)
 
     def check(self, cases: BlockCase) -> None:
-        """Raise `ArgumentError` unless arm, limits, scene and start of a case fit the library."""
+        """Raise `ArgumentError` unless arm, limits, scene and start of case 0 fit the library."""
         first = jax.tree.map(lambda leaf: np.asarray(leaf), cases)
         if cases.batch_shape:
             first = jax.tree.map(lambda leaf: leaf[0], first)
@@ -119,8 +119,8 @@ def _plan_from_answer(table: Table, case: BlockCase, home: Array) -> BlockPlan:
     start = jnp.asarray(table.homes)[home].astype(dtype)
     motion = polynomial(start, jnp.zeros_like(start), steps, duration)
     waits = jnp.zeros_like(motion.coeffs[:1]).at[0, 0].set(start)
-    # `status_of` allows a small relative violation. A motion that is late is never allowed, hence
-    # the factor.
+    # `status_of` accepts a violation up to FEASIBILITY_TOLERANCE. The factor cancels the tolerance,
+    # since a motion that ends after the ball's arrival does not block the ball.
     early = (1.0 + FEASIBILITY_TOLERANCE) * duration / jnp.maximum(contact - case.delay, 1e-6)
     beside = jnp.stack(answer.beside)
     angle = jnp.arccos(jnp.clip(answer.cosine, -1.0, 1.0))

@@ -142,7 +142,7 @@ def lookup(table: Table, ball: BallState, gravity: Array, home: Array | int = 0)
     passes = enters & hits & is_first & is_last & (inside > outside)
     pair = jnp.where(passes, first * layout.num_inner + last, 0)
     row = unpack_rows(table.rows[home, pair])
-    # The distance to the shield's plane is a parabola in time; take its earlier root.
+    # The distance from the shield's plane is a parabola in time; take the root where it decreases.
     middle, normal, edge = (tuple(each) for each in (row.middle, row.normal, row.edge))
     away = _dot(normal, _minus(place, middle))
     toward = -_dot(normal, velocity)
