@@ -96,7 +96,7 @@ class CatchEnv(Env):
         """Plan the cases from the policy's actions, compute the rewards, and draw new cases.
 
         `action` is (B, 2 N) for B cases, two components for each of N targets, where N is the
-        greatest number of targets in any suite. Surplus components are ignored.
+        greatest number of targets in any suite. Cases with fewer targets ignore the surplus.
         """
         key, own = jax.random.split(state.info["key"])
         num = action.shape[0]
@@ -211,7 +211,8 @@ def evaluate_actions(cases: CatchCase, actions: Array, iterations: int) -> dict[
         "caught": caught,
         "violation": violation,
     }
-    # Clip the terms, so that one case with huge or undefined terms cannot spoil a whole update.
+    # Clip the terms to -2 to 2, and replace NaN by 2. Otherwise one case with huge or undefined
+    # terms could spoil a whole update of the policy.
     return {
         name: jnp.clip(jnp.nan_to_num(jnp.asarray(term, jnp.float32), nan=2.0), -2.0, 2.0)
         for name, term in terms.items()

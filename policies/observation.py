@@ -72,7 +72,7 @@ def choice_of(case: CatchCase, table: Timetable, action: Array) -> CatchChoice:
     times = choice.times * jnp.exp(STRETCH * action[choice.order, 1])
     taken = choice.taken[choice.order]
     times = jnp.where(taken, jnp.minimum(times, case.horizon[choice.order]), times)
-    # Make the times of the catches increase by at least INSTANT [s] from one to the next.
+    # Make the times increase by at least INSTANT [s], the least time from one catch to the next.
     steps = jnp.asarray(INSTANT * np.arange(times.size), times.dtype)
     rising = lax.cummax(times - steps) + steps
     return dataclasses.replace(choice, times=rising)

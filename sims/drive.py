@@ -157,8 +157,8 @@ def _one_frame(world: World, drive: DriveState, until: Array) -> tuple[DriveStat
         over = car.saturation(physics, command)
         physics = step(world, physics, command, jnp.zeros(0, dtype))
         after = car.state(physics)
-        # A measured pose is one latency old. Its difference from the pose that is estimated for the
-        # same time corrects all later estimates.
+        # A measured pose is one latency old. A fraction of its difference from the pose that is
+        # estimated for that time corrects all later estimates.
         seen = car.sense(dataclasses.replace(true, pose=shown[0]), noise, drive.pose_stds)
         correction = _TRUST * (seen.pose - believed[0])
         next_pose = _advance_estimate(car, believed[-1], true, after, span) + correction

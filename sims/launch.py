@@ -174,8 +174,9 @@ def watch_ball(
         duration: [s], how long the ball has been in flight at the start of the plan (static).
 
     Returns:
-        The last L true positions (L, 3) [m], which are observed later because of the latency; and
-            the estimates one planning period before the plan's start, and at its start.
+        The last true positions (L, 3) [m], which are observed later because of the latency of L
+            observation periods; and the estimates one planning period before the plan's start, and
+            at its start.
     """
     sensing, dtype = loop.sensing, drag.dtype
     gravity = jnp.asarray(loop.world.gravity, dtype)

@@ -36,7 +36,6 @@ _FEW = 1024  # largest batch for which compiling takes longer than the flights t
 
 
 def _fly_to_observation(loop: Loop, pilot: Pilot, flight: FlightState, drag: Array) -> FlightState:
-    """Simulate a flight up to the next observation, and update the estimates by it."""
     world, robot, dtype = loop.world, loop.world.robot, flight.time.dtype
     key, noise_key, look_key = jax.random.split(flight.key, 3)
     noise = jax.random.normal(noise_key, robot.noise_shape, dtype)
@@ -98,7 +97,7 @@ def _update_estimates(loop: Loop, estimates: Estimate, seen: Array) -> Estimate:
 
 
 def predict_balls(loop: Loop, estimates: Estimate, ahead: Any) -> BallState:
-    """Return the predicted states of N balls at `ahead` [s] from now, leaves (N, 3)."""
+    """Return the states of N balls predicted for `ahead` [s] from now, leaves (N, 3)."""
     dtype = estimates.drag.dtype
     gravity = jnp.asarray(loop.world.gravity, dtype)
     span = jnp.asarray(ahead + loop.sensing.latency, dtype)

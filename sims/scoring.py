@@ -82,7 +82,7 @@ def passage(
         reference: (3,) [m], planned position of the robot at `time`, for its tracking error.
 
     Returns:
-        (N,) bool, whether each ball passes, and the passages, leaves (N, ...), valid where it does.
+        (N,) bool, whether each ball passes, and the passages (N, ...), valid for balls that pass.
     """
 
     def gap(at: Moment) -> Array:

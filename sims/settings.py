@@ -100,10 +100,7 @@ class FlySettings:
 
     @property
     def rate(self) -> float:
-        """The rate of replanning [Hz]; by default the task's own rate, or 0 if it cannot replan.
-
-        Only the first of a task's planners can replan.
-        """
+        """The rate of replanning [Hz]; by default `RATE` for the task's first planner, else 0."""
         if self.replan is not None:
             return self.replan
         return self.RATE if self._is_first else 0.0
@@ -386,7 +383,7 @@ class BlockFly(FlySettings):
         return super().flight()
 
     def check_rate(self) -> None:
-        """Raise `ValueError` unless the flights can replan at `rate` and the drives are valid."""
+        """Raise `ValueError` unless the drives are valid and `rate` is 0, or >= 0 with perception."""
         rule = ">= 0, and 0 without perception: a block is planned once"
         most = math.inf if self.perception else 1e-9
         require(0.0 <= self.rate < most, "replan", rule, self.rate)

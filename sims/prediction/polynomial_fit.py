@@ -19,8 +19,8 @@ def fit_polynomial(
     """Fit a polynomial in time to observed positions by least squares [Qu2022, eqs 9 and 10].
 
     The paper solves the normal equations (eq. 11). Here a QR decomposition by Gram-Schmidt is used
-    instead, with times scaled to -1 to 1, since it has smaller rounding errors. If there are fewer
-    observations than coefficients, the degree is reduced to what the observations determine.
+    instead, with times scaled to -1 to 1, since it has smaller rounding errors. If fewer
+    observations are present than coefficients, the degree is reduced accordingly.
 
     Args:
         times: (L,) [s], times of L observations.

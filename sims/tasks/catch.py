@@ -258,7 +258,7 @@ class CatchFlight(BallFlightTask):
         )
 
     def fly(self, cases: Throws, record: bool) -> CatchFlights:
-        """Plan and simulate some flights by the settings, and return the result."""
+        """Plan and simulate the flights of `cases`, with the planner and rates of the settings."""
         settings = self.settings
         return fly_catches(
             self.loop(record),

@@ -314,7 +314,7 @@ class HitFlight(BallFlightTask):
         )
 
     def fly(self, cases: Volleys, record: bool) -> HitFlights:
-        """Plan and simulate some flights by the settings, and return the result."""
+        """Plan and simulate the flights of `cases`, with the planner and rates of the settings."""
         name = self.settings.planner
         planner = None if name == "exact" else hit_planner(name)
         return fly_hits(self.loop(record), cases, self.settings.seed, planner=planner)

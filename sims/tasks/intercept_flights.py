@@ -172,7 +172,7 @@ class InterceptFlight(FlightTask):
         return found
 
     def reachable(self, index: int) -> Sequence[tuple[float, np.ndarray]]:
-        """Return times [s], each with the P points (P, 2) [m] where the car could be then."""
+        """Return times [s], each with the points (P, 2) [m] where the car could be at that time."""
         return reach_layers(jax.tree.map(jnp.asarray, self._case(index)))
 
     def _case(self, index: int) -> InterceptCase:
@@ -221,7 +221,7 @@ def _add_height(points: np.ndarray, height: float) -> np.ndarray:
 
 
 def reach_layers(case: InterceptCase) -> list[tuple[float, np.ndarray]]:
-    """Return pairs: a time [s], and the grid points (P, 2) [m] where the car could be at that time.
+    """Return pairs of a time [s] and grid points (P, 2) [m] where the car could be at that time.
 
     The car starts as in `case`, keeps its limits and avoids the obstacles; see `search_reach`.
     """

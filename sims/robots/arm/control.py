@@ -75,7 +75,7 @@ def reference_at(course: Course, time: Array) -> JointReference:
 def control(
     state: JointState, reference: JointReference, arm: Arm, gains: Gains, gravity: float
 ) -> Array:
-    """Return the commanded joint torques (6,) [N m]; `arm` is the controller's arm model."""
+    """Return joint torques (6,) [N m] that track a planned state, by the dynamics of `arm`."""
     angle_error, rate_error = reference.angles - state.angles, reference.rates - state.rates
     wanted = (
         reference.accelerations

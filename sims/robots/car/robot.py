@@ -115,7 +115,7 @@ class Car:
         return jnp.stack([command[0], rate]), forces
 
     def saturation(self, physics: Physics, command: Array) -> Array:
-        """Return whether the commands of drive and steering exceed their limits, (2,) bool."""
+        """Return whether drive force, and steering angle or rate, exceed limits, (2,) bool."""
         vehicle = self.vehicle
         rate = (command[1] - physics.act[1]) / vehicle.steering_lag
         fast = jnp.abs(rate) > vehicle.steering_rate

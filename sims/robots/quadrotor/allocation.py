@@ -21,7 +21,7 @@ def rotor_thrusts(rotors: Rotors, thrust: Array, torque: Array, spare: float) ->
         spare: [N], greatest increase of a rotor's thrust in favour of a torque.
     """
     least, most = rotors.min_thrust, rotors.max_thrust
-    # Each rotor's fraction of a thrust without torque, times 4; 1 if all fractions are equal.
+    # Each rotor's fraction of a thrust that causes no torque, times 4: 1 for symmetric rotors.
     share = jnp.asarray(4.0 * rotors.shares, torque.dtype)
     inverse = jnp.asarray(rotors.mixer, torque.dtype)
     turning = jnp.matmul(inverse[:, 1:3], torque[:2], precision=lax.Precision.HIGHEST)

@@ -24,7 +24,7 @@ class Reference:
     vel: Array  # (3,) [m/s]
     acc: Array  # (3,) [m/s^2]
     jerk: Array  # (3,) [m/s^3]
-    # () [m/s^2], addition to the commanded thrust that compensates the rotors' lag.
+    # () [m/s^2], addition to the commanded thrust per mass that compensates the rotors' lag.
     thrust_lead: Array
     angular_acc: Array  # (3,) [rad/s^2], body frame
     # (3,) [rad/s^2], addition to the angular acceleration that compensates the rotors' lag.
