@@ -383,7 +383,7 @@ class BlockFly(FlySettings):
         return super().flight()
 
     def check_rate(self) -> None:
-        """Raise `ValueError` unless the drives are valid and `rate` is 0, or >= 0 with perception."""
+        """Raise `ValueError` if the drives are invalid, or `rate` is not 0 without perception."""
         rule = ">= 0, and 0 without perception: a block is planned once"
         most = math.inf if self.perception else 1e-9
         require(0.0 <= self.rate < most, "replan", rule, self.rate)

@@ -128,7 +128,7 @@ class FlightTask(abc.ABC):
         return ()
 
     def reachable(self, index: int) -> Sequence[tuple[float, np.ndarray]]:
-        """Return times [s], each with the points (P, 2) [m] where the robot could be at that time."""
+        """Return times [s], each with points (P, 2) [m] where the robot could be at that time."""
         return ()
 
     def counts(self, rows: Any) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Planning without an earlier plan when a ball comes into sight: its catch and the next catch."""
+"""Plans from scratch, when a ball comes into sight, for its catch and the next ball's catch."""
 
 import dataclasses
 import functools

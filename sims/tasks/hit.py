@@ -140,8 +140,8 @@ class HitPilot:
     ) -> tuple[HitPlan, Array]:
         """Return the found plan, and whether it replaces the current plan.
 
-        It does if the impact is at least `shortest` [s] ahead and no limit is violated by more than
-        the fraction `excess`.
+        The plan is replaced if the impact is at least `shortest` [s] ahead and the found plan
+        violates no limit by more than the fraction `excess`.
         """
         (plan,) = found
         left = asked.previous.stroke.time - outlook.elapsed
