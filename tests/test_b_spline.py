@@ -41,7 +41,7 @@ def test_the_basis_is_a_partition_of_unity_and_gives_the_curve(degree, num):
     assert (values >= 0.0).all()
     np.testing.assert_allclose(values.sum(axis=-1), 1.0, atol=1e-14)
     np.testing.assert_array_equal(basis(degree, num, np.arange(2)), np.eye(num)[[0, -1]])
-    # The position may be a single number or an array of any shape.
+    # The curve parameter may be a single number or an array of any shape.
     single, grid = basis(degree, num, 0.3), basis(degree, num, np.full((1, 1), 0.3))
     np.testing.assert_allclose(single, grid[0, 0])
 

@@ -44,7 +44,7 @@ def test_the_distance_of_a_polygon_is_the_distance_to_its_boundary(float64):
     step = 1e-6
     for axis in range(2):
         slope = (measure(points + step * np.eye(2)[axis])[0][0] - distance[0]) / step
-        # Differences are wrong where the nearest edge changes.
+        # Finite differences are wrong where another edge becomes the nearest one.
         assert np.isclose(slope, away[axis][0], atol=1e-4).mean() > 0.99
 
 
