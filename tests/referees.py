@@ -54,7 +54,6 @@ def add(value):
 
 
 def failure(leaves, excess=None, time=None, *accepted, **found):
-    """Return a bad plan, the expected failure, and options of `judge` that accept the plan."""
     return leaves, {"excess": excess, "time": time, **found}, accepted
 
 

@@ -70,8 +70,6 @@ def ball_through(outer, inner, speed=8.0, before=0.6):
 def test_a_point_of_a_cell_is_in_that_cell(name):
     layout, scene, tunnel = LAYOUTS[name], paper_scene(), tunnels_of(LAYOUTS[name])
     rng = np.random.default_rng(0)
-    # Every cell of the outer box lies on the outer side of this inner box's face, so that a ball
-    # can come through every whole cell.
     behind: Any = Box(np.array([3.0, 0.0, 0.0]), np.array([4.0, 1.0, 1.0]))
     whole = tunnels(dataclasses.replace(layout, inner=(Face(0, -1, (1, 1)),)), behind, scene.outer)
     sides = (

@@ -335,7 +335,7 @@ def solids_of(angles):
 
 
 def brute_clearances(angles, scene):
-    """Return the least distances [m] from floor, pole, rig, base and itself, over all solids."""
+    """Return the arm's least distances [m] from floor, pole, rig, base and itself, by name."""
     arm = solids_of(angles)
     pole = (np.array([*scene.pole[0], 0.0]), [np.array([0.0, 0.0, 5.0])], scene.pole_radius[0])
     rods = zip(scene.beam_ends[0], scene.beam_radius[0], strict=True)

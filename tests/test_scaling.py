@@ -44,7 +44,7 @@ def test_curvature_is_the_diagonal_of_the_gauss_newton_matrix():
 
 
 def test_scale_is_one_over_the_root_of_twice_the_curvature_in_any_unit():
-    """`measure_scale` sums the curvature H at guess and solution, hence the scale 1 / sqrt(2 H)."""
+    """`measure_scale` adds the curvatures H at first guess and solution, hence 1 / sqrt(2 H)."""
     cases = Bowl(centre=jnp.array([[1.0, 0.5], [-2.0, 0.1], [0.3, 0.0]]))
     scale = measure_scale(BowlPlanner(), cases, residuals, floor=0.0)
     np.testing.assert_allclose(scale, 1.0 / np.sqrt([8.0, 2e4]), rtol=1e-5)
