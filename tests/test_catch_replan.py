@@ -49,7 +49,7 @@ def ahead(cases, elapsed, noise=0.0):
 
 
 def assert_same_flight(old, new, elapsed, until, atol):
-    """Assert that `new` plans continue the `old` ones at `elapsed` for `until` [s]."""
+    """Assert that new plans fly for `until` [s] as the old ones do from `elapsed` [s] on."""
     for share in np.linspace(0.0, 1.0, 23):
         found = states_at(new.trajectory, share * until)
         expected = states_at(old.trajectory, elapsed + share * until)

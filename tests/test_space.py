@@ -63,7 +63,7 @@ def segments(rng, kind):
 
 
 def pairs(name, kind, seed=0):
-    """Draw NUM pairs of bodies, with segments of one kind, as float32."""
+    """Draw NUM pairs of bodies (float32), with segments of a kind such as "points" or "along"."""
     rng = np.random.default_rng(seed)
     ends = segments(rng, kind)
     place, middle = rng.uniform(-0.7, 0.7, (NUM, 2)), rng.uniform(-0.3, 0.3, (NUM, 3))

@@ -47,7 +47,7 @@ def plan_at(point, case: MeetCase) -> tuple:
 
 
 def excess(acc: Array, case: MeetCase) -> Array:
-    """Return relative excesses (2,) of both ends' accelerations, one of which is the greatest."""
+    """Return relative excesses (2,) over the limit at both ends, one of which is the greatest."""
     return jnp.sqrt(jnp.sum(acc**2, axis=1) + 1e-12) / case.most - 1.0
 
 
