@@ -23,7 +23,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     flags: dict[str, str] = {}  # options of the command by argument name, such as "num": "--num"
     try:
-        # Print warnings of other packages, such as a task that is not imported, in one line each.
+        # Print a warning, such as that another package's task cannot be imported, in one line.
         with warnings.catch_warnings():
             warnings.simplefilter("always")
             warnings.showwarning = lambda text, *_, **__: print(

@@ -62,7 +62,7 @@ def _is_run_time(value: object) -> bool:
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class Fixed:
-    """A planner's attempt as a static argument: JAX compiles one more program for each attempt."""
+    """An attempt (settings of a search) as a static argument, for which JAX compiles a program."""
 
     attempt: object
 

@@ -130,7 +130,7 @@ class Planner(Generic[CaseT, PlanT]):
         raise NotImplementedError
 
     def solve_lanes(self, cases: CaseT, attempt: PyTree, /) -> PlanT:
-        """Return a batch's plans by one attempt (search), in turn on CPUs if `is_sequential`."""
+        """Return a batch's plans by one attempt (search), one by one on CPUs if `is_sequential`."""
         if not self.is_sequential:
             return self.solve_at_once(cases, attempt)
         in_turn = functools.partial(solve_in_turn, lambda case: self.solve(case, attempt))
@@ -153,7 +153,7 @@ class Planner(Generic[CaseT, PlanT]):
         raise NotImplementedError
 
     def starts_long(self, cases: CaseT) -> bool:
-        """Return whether the first attempt (search) takes long, as `DecidedPlanner` must know."""
+        """Return whether already the first attempt (search) takes long; see `DecidedPlanner`."""
         return False
 
     def replanner(self) -> "Planner":

@@ -101,7 +101,7 @@ def outcome(cost: Array, violation: Array, *, stationary: Array | bool = True) -
     Args:
         cost: (), the planner's own objective.
         violation: (), largest relative excess over a limit that the planner checks.
-        stationary: () bool, whether another attempt could not change the plan.
+        stationary: () bool, whether a further search would not change the plan.
     """
     return {
         "cost": cost,
@@ -119,7 +119,7 @@ class Plan:
     """
 
     cost: Array  # (), the planner's own objective
-    # (), largest relative excess over a limit that the planner checks; feasible if <= 0
+    # (), largest relative excess over a limit that the planner checks; at most 5e-4 is accepted
     violation: Array
     iterations: Array  # () int32
     status: Array  # () int32, a `Status`
@@ -166,7 +166,7 @@ def require_settings(planner: PyTree) -> None:
 
 
 def require_attempts(name: str, value: object, kind: type) -> None:
-    """Raise `ArgumentError` unless a setting is a tuple of one or more attempts of a class."""
+    """Raise `ArgumentError` unless a setting is a tuple of one or more attempts of class `kind`."""
     if not isinstance(value, tuple) or not all(isinstance(each, kind) for each in value):
         raise ArgumentTypeError(name, f"a tuple of {kind.__name__}", value)
     if not value:
@@ -178,7 +178,7 @@ class Attempt:
     """Settings of one search for cases that earlier attempts left unsolved; static under jit."""
 
     starts: int = 1  # number of starting points from which each case is solved
-    # Greatest violation of a case's plan with which the attempt is made; None means no bound.
+    # The attempt is made only at cases whose plan has at most this violation; None means at all.
     within: float | None = dataclasses.field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:

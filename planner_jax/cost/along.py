@@ -1,4 +1,4 @@
-"""Penalties integrated along trajectories with pieces of fixed proportions [Yu2023catch, eq. 26].
+"""Penalties integrated along trajectories with pieces of fixed time ratios [Yu2023catch, eq. 26].
 
 This is the innermost part of every search. On a GPU one CUDA kernel computes it (`along_kernel`),
 which keeps the samples of a trajectory in registers. Further kernels compute derivatives. On other

@@ -50,7 +50,7 @@ def recovery_from(
     """Plan a trajectory from a state to standstill; return it, and whether it keeps the limits.
 
     `state` has the rows position, velocity, acceleration and jerk. The result starts with `pieces`
-    pieces of zero duration in the place of a plan.
+    pieces of zero duration, so that it has as many pieces as the course of a plan.
     """
     path = _stand_still(pieces, state[0])
     path.coeffs[-1, :4] = state / np.array([[1.0], [1.0], [2.0], [6.0]])

@@ -72,7 +72,7 @@ class Stroke(abc.ABC, Generic[CaseT, PlanT]):
         self._case = dataclasses.replace(self.case, limits=jax.tree.map(np.asarray, limits))
         self.flight, self.drag = flight, drag
         self._planner, self._replanner = planners
-        # Functions (optimiser's settings, planner, case) -> plan: to plan, and to plan again.
+        # Functions (optimiser's settings, planner, case) -> plan, called by `first` and `again`.
         self._solve_first, self._solve_again = solvers
         self.pieces = self._planner.num_pieces  # number of polynomial pieces of a plan
 

@@ -69,7 +69,7 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
     shipped_name: ClassVar[str] = "exact"  # first part of the scales' names in the package
     num_end_variables: ClassVar[int]  # K, for each segment
     guess_table: ClassVar[np.ndarray]  # one row for each starting point, best first
-    # Numbers of intervals of a piece in the check of a finished plan: with one segment, with more.
+    # Intervals of a piece in the check of a finished plan: of one segment, of several segments.
     # With a small thrust between two catches, the body rate can have narrow peaks.
     decode_nodes: ClassVar[tuple[int, int]] = (32, 48)
     proportions: tuple[float, ...] = (1.0,) * 6  # relative durations of a segment's pieces
@@ -191,7 +191,8 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
 
         Returns:
             Boundary rows (N, 8, 3), scaled states at both ends of the segments; mean durations of a
-            piece (N,) [s]; a part of the cost (); and the greatest excess at the ends ().
+            piece (N,) [s]; the cost () of time, ends, and energy without waypoint offsets; and the
+            greatest excess at the ends ().
         """
         ends = self.meet(natural, context)
         durations = ends.durations / self.num_pieces

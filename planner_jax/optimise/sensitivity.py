@@ -32,7 +32,7 @@ from planner_jax.optimise.settings import Curvature, Evaluation, Round, Settings
 Quantity = str | Callable[[PyTree], Array]
 Product = Callable[[Array], Array]  # product of a matrix with a vector (n,)
 _CURVATURES = ("products", "whole")
-# Default number of iterations of conjugate gradients, chosen for about 40 scaled unknowns.
+# Number of iterations of conjugate gradients, by the setting `curvature`, for about 40 unknowns.
 _STEPS = {"products": 40, "whole": 1}
 _DAMPING = 1e-9  # damping of the preconditioner for products; negligible beside the Hessian
 _SMALL = 1e-11  # squared relative residual at which conjugate gradients stop

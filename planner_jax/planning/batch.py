@@ -130,7 +130,7 @@ def plan_batch(
     devices: Sequence[jax.Device] | None,  # pyright: ignore[reportInvalidTypeForm]
     watch: Watch,
 ) -> tuple[PyTree, PyTree]:
-    """Return plans of a batch, by attempts that are each made at the cases still unsolved.
+    """Return plans of a batch, by attempts (searches), each made at the cases still unsolved.
 
     Args:
         planner: planner that makes the attempts.

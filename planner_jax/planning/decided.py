@@ -21,9 +21,8 @@ class DecidedPlanner(PlannerAround[CaseT, PlanT]):
 
     `decision` proposes several choices for each case, and `planner` plans the case with every
     choice. The solved plan with the least `decision.rank` is selected, or the plan with the least
-    violation if none is solved. The planner's last attempt, the longest, is made only for cases
-    that no choice has solved. If the first attempt is long, too, every later attempt is made only
-    for such cases.
+    violation if none is solved. The planner's last attempt (search), the longest, is made only for
+    cases that no choice has solved. If `starts_long`, so is every attempt after the first.
     """
 
     decision: PyTree  # a `Decision`

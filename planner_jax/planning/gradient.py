@@ -44,7 +44,7 @@ def gradient(
     plans of `plan`. If the solver stops before the optimum, the theorem's formula is evaluated
     where it stopped: the result may have the wrong sign, or be NaN.
 
-    In float32 the gradients of the contact times of 1,024 serves have a median relative error of
+    In float32 the gradients of the contact times of 1,024 hits have a median relative error of
     0.01 %, and at most 0.7 % in 99 of 100 cases. For catches these errors are 0.02 % and 3.1 %. The
     reference is the optimum in float64, where `optimal_plan` is exact but slow.
 

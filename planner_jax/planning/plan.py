@@ -96,7 +96,7 @@ def plan(
         if not resident:
             require_sound(cases)
     plans, _ = Driver(chunk, devices, watch)(planner, cases)
-    # To save time, a single case is checked only if its plan has the status BAD_INPUT.
+    # To save time, a single case's numbers are checked on the host only after the status BAD_INPUT.
     if alone and not resident and int(plans.status) == Status.BAD_INPUT:
         require_sound(cases)
     if not alone and resident and not is_resident(plans):

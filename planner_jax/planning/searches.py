@@ -32,7 +32,7 @@ _CPU_LANES, _GPU_LANES = 16, 8192
 
 
 def divide_one(planner: Planner, attempt: Attempt, case: PyTree) -> PyTree:
-    """Return the plan, in NumPy arrays, that an attempt finds for one case by all its searches."""
+    """Return one case's best plan over an attempt's searches from all starts, in NumPy arrays."""
     batch = jax.tree.map(lambda leaf: np.asarray(leaf)[None], case)
     planner, mesh = on_devices(planner, jax.local_devices()[:1])
     size = 1 if is_one_cpu(mesh) else _GPU_LANES
@@ -40,7 +40,7 @@ def divide_one(planner: Planner, attempt: Attempt, case: PyTree) -> PyTree:
 
 
 def divide_batch(planner: Planner, attempt: Attempt, mesh: Mesh, cases: PyTree) -> PyTree:
-    """Return the plans, in NumPy arrays, that an attempt finds for a batch by all its searches."""
+    """Return each case's best plan over an attempt's searches from all starts, in NumPy arrays."""
     is_cpu = mesh.devices[0].platform == "cpu"
     return _plan(planner, attempt, mesh, _CPU_LANES if is_cpu else _GPU_LANES, cases)
 

@@ -115,9 +115,9 @@ def referee_blocks(
         cases: object with the fields of `BlockCase`, for B cases; gravity > 0.
         plans: object with the fields of `BlockPlan`, for B plans of M polynomial pieces of degree
             D: coefficients (B, M, D + 1, 6), durations (B, M).
-        tolerance: relative tolerance of velocities, accelerations, the case's offset and its tilt;
-            absolute tolerance of the start and of jumps between pieces [rad], [rad/s], and of joint
-            angles beyond their limits [rad].
+        tolerance: relative tolerance of velocities, accelerations, and the case's `offset` and
+            `tilt` at the contact; absolute tolerance of the start and of jumps between pieces
+            [rad], [rad/s], and of joint angles beyond their limits [rad].
         contact_tolerance: [m], greatest distance of the ball from the shield's square face at the
             contact, and greatest depth of the arm in an obstacle. The ball must be blocked inside
             the outer box, before it enters the protected inner box. The outer box is enlarged,

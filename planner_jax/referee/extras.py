@@ -28,9 +28,9 @@ class ExtraLimit(Protocol):
 # Number of intervals between samples that are searched more finely, and number of their
 # refinements. Each refinement reduces an interval to a quarter of its length.
 _REFINED, _REFINEMENTS = 6, 4
-# Slope of a line that is missing in `_worst_excess`: no two samples are before a piece's first
-# interval, or (with a minus sign) after its last one. So steep a line bounds nothing, and the
-# bound is the other line, through the two samples on the other side.
+# Slope that replaces the first line (see `_worst_excess`) in a piece's first interval, which has
+# no two samples before it. In the last interval minus this number replaces the second line. So
+# steep a line bounds nothing, and the excess is bounded by the other line alone.
 _STEEP = 1e9
 
 

@@ -108,7 +108,7 @@ _PRODUCT, _SEARCHED = 250_000, 1024
 
 
 def intervals_of(num_pieces: int) -> int:
-    """Return the number of sampled intervals in a piece, for `num_pieces` up to a contact."""
+    """Return in how many intervals each piece is sampled, if `num_pieces` precede a contact."""
     return max(math.ceil(_INTERVALS / num_pieces), _FEWEST_INTERVALS)
 
 

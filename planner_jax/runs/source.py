@@ -79,7 +79,7 @@ class DrawnSource(Source):
 
 
 def fill_in(settings: SweepSettings, num: int, batch: int) -> Entries:
-    """Return settings, `num`, `batch` for a `Source`; the arguments replace settings of None."""
+    """Return settings with `num` and `batch` in place of None, and both numbers, for a `Source`."""
     num, batch = settings.num or num, settings.batch or batch
     rule = f"at most {_MOST_PARTS * batch:,} with a batch of {batch}, as each batch is a file"
     require(num <= _MOST_PARTS * batch, "num", rule, num)

@@ -65,7 +65,10 @@ def ball_path(
 
 
 def draw_case(axes: Axes, row: Row, second: int, setting: Entries, drag_after: bool) -> None:
-    """Draw the paths of ball and quadrotor in the plane of x and axis `second` (1: y, 2: z)."""
+    """Draw the paths of ball and quadrotor in the plane of x and axis `second` (1: y, 2: z).
+
+    `drag_after` is whether the drawn ball has drag after the impact.
+    """
     good, gravity, drag = row["success"], setting["gravity"], setting["drag"]
 
     def line(path: np.ndarray, colour: str, width: float, alpha: float, dash: str = "-") -> None:
