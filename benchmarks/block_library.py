@@ -133,7 +133,9 @@ def referee(bench: Bench, library: Library, num: int, name: str) -> None:
 def block_rates(bench: Bench, library: Library, regime: str, num: int) -> None:
     """Report the shares of balls of the suites `pole` and `short` that stored motions block.
 
-    `num` balls are drawn for each suite. `regime` names the joint limits of the arm.
+    In both suites a pole stands in front of the arm. The balls of `pole` are thrown from 6 to 12 m
+    away, the balls of `short` from 6 to 8 m. `num` balls are drawn for each suite. `regime` names
+    the joint limits of the arm.
     """
     planner = LibraryBlock(library)
     for suite in ("pole", "short"):

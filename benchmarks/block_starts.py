@@ -52,7 +52,11 @@ SHARES = tuple(np.arange(1, 33) / 32)  # Sampled times of a motion, divided by i
 
 
 def random_starts(rng: np.random.Generator, num: int) -> tuple[np.ndarray, np.ndarray]:
-    """Draw `num` starting points: bumps (num, 6) [rad] of the joints, ranks (num,) of end poses."""
+    """Draw `num` starting points of the search by least squares.
+
+    Returns bumps (num, 6) [rad], which are the greatest deviations of the joints from a straight
+    motion, and ranks (num,) of end poses in the planner's order.
+    """
     bumps = rng.normal(size=(num, 6)) * SPREAD * rng.uniform(0.3, 1.8, (num, 1))
     return bumps, rng.integers(0, LATER_RANKS, num)
 
@@ -129,7 +133,7 @@ def try_in_parts(
     """Run `try_starts` from N starting points, `lanes` of them in one call.
 
     Point n is for the case with index `index[n]`. Returns whether each point led to a plan (N,),
-    and the fitted bumps (N, 6) [rad].
+    and the greatest deviations of the joints from a straight motion in the results (N, 6) [rad].
     """
 
     def parts() -> Iterator[tuple[np.ndarray, np.ndarray]]:

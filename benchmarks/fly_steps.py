@@ -40,7 +40,8 @@ RUNS = 3
 def report_speed(name: str, steps: int, run: Callable[[], Any]) -> None:
     """Run a simulation several times; print the speed of the fastest run, and the compile time.
 
-    `steps` is the number of physics steps that one call of `run` computes, over all worlds.
+    `steps` is the number of physics steps that one call of `run` computes, summed over all
+    simulated quadrotors.
     """
     began = time.perf_counter()
     jax.block_until_ready(run())

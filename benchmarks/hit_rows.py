@@ -56,7 +56,7 @@ def cases_of(name: str, serves: Serves) -> pj.hit.HitCase:
 
 
 def run_row(bench: Bench, name: str, serves: Serves) -> dict[str, Any]:
-    """Plan the serves of the row `name` of the protocol; return success rate, costs and times.
+    """Plan the serves of the row `name` of the table; return success rate, costs and times.
 
     The successes are added to the run's summary.
     """

@@ -97,7 +97,7 @@ def constant_speed(problem: StationTimeProblem, degree: int = 5) -> BezierCurve:
 
 
 def judge(problems: Any, points: np.ndarray, solved: np.ndarray) -> Judged:
-    """Compute accelerations, errors and clearances of B planned curves, in double precision.
+    """Compute acceleration, error at the end and clearance of B planned curves, in float64.
 
     Args:
         problems: a batch of B problems.

@@ -56,7 +56,10 @@ def _draw_factors(random: np.random.Generator, num: int, low: float, high: float
 
 
 def _add_motion(random: np.random.Generator, head: Any) -> Any:
-    """Add random velocity, acceleration and jerk to half of B initial states (B, 4, 3)."""
+    """Add random velocity, acceleration and jerk to half of B initial states.
+
+    A state (4, 3) has position, velocity, acceleration and jerk.
+    """
     num = len(head)
     sizes = np.array([1.5, 3.0, 15.0])[:, None] * random.uniform(size=(num, 1, 1))
     moving = random.uniform(size=(num, 1, 1)) < 0.5

@@ -69,7 +69,7 @@ class CatchVecEnv(vec_env.VecEnv):
         self._reset, self._step = jax.jit(self.env.reset), jax.jit(self.env.step)
 
     def reset(self) -> np.ndarray:
-        """Draw a case for each environment; return the F observed numbers of each, (LANES, F)."""
+        """Draw a case for each of 100 environments; return F observed numbers of each, (100, F)."""
         self._state = self._reset(self._keys)
         return np.array(self._state.obs)
 

@@ -36,10 +36,10 @@ class PeerSolution:
 def clarabel_solver(matrices: Mapping[str, np.ndarray]) -> Callable[..., PeerSolution]:
     """Return a function that solves quadratic programs with given matrices by Clarabel.
 
-    Clarabel is an interior-point method. `matrices` are the arguments of `qp_template`. The
-    function takes right-hand sides of the equalities, lower bounds and upper bounds. Clarabel is
-    set up anew for every program, because its interface cannot change which bounds are infinite.
-    This is part of the measured time.
+    Clarabel is an interior-point method. `matrices` has the matrices of cost, equalities and
+    bounds, by the names of the arguments of `qp_template`. The function takes right-hand sides of the
+    equalities, lower bounds and upper bounds. Clarabel is set up anew for every program, because
+    its interface cannot change which bounds are infinite. This is part of the measured time.
     """
     clarabel: Any = importlib.import_module("clarabel")
 
@@ -72,9 +72,10 @@ def clarabel_solver(matrices: Mapping[str, np.ndarray]) -> Callable[..., PeerSol
 def osqp_solver(matrices: Mapping[str, np.ndarray]) -> Callable[..., PeerSolution]:
     """Return a function that solves quadratic programs with given matrices by OSQP.
 
-    OSQP is the solver of [Qu2022]. `matrices` are the arguments of `qp_template`. The function
-    takes right-hand sides of the equalities, lower bounds and upper bounds. OSQP is set up once.
-    For every program it gets new bounds, and starts at the solution of the previous program.
+    OSQP is the solver of [Qu2022]. `matrices` has the matrices of cost, equalities and bounds, by
+    the names of the arguments of `qp_template`. The function takes right-hand sides of the
+    equalities, lower bounds and upper bounds. OSQP is set up once. For every program it gets new
+    bounds, and starts at the solution of the previous program.
     """
     osqp: Any = importlib.import_module("osqp")
 
