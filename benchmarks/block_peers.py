@@ -153,8 +153,9 @@ def run_planner(planner: Any, cases: Any, warm: Any, *, lasts: bool) -> Outcome:
     """Plan throws one by one, judge the plans, and compute their times and torques.
 
     `warm` are throws that are planned before the measurement. `lasts` is true if the planner's
-    motions always end at the contact, so that any planning time would make them late. It then plans
-    a second time, for an arm that starts later by the 90 % quantile of its planning times.
+    motions always end at the contact, so that any planning time would make them late. The planner
+    then plans a second time, for an arm that starts later by the 90 % quantile of its planning
+    times.
     """
     # Every call advances the random generator of RRT-Connect. The number of calls before the
     # measurement is therefore constant, so that the measured paths are reproducible.

@@ -242,7 +242,10 @@ def hit_rows(args: Any) -> None:
 
 
 def make_ablations(whole: Loop) -> dict[str, Loop]:
-    """Return the control loop `whole`, and copies without filter, drag estimate or re-planning."""
+    """Return the control loop `whole`, and copies that each lack one part, by name.
+
+    The parts are the Kalman filter, the drag estimate and re-planning.
+    """
     return {
         "everything": whole,
         "no Kalman filter": dataclasses.replace(whole, kalman=False),

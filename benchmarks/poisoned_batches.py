@@ -91,7 +91,10 @@ def compare(task: Any, num: int, every: int, seed: int) -> dict[str, int]:
 
 
 def measure(bench: Bench, options: argparse.Namespace) -> None:
-    """Plan a batch with and without invalid cases; print how many are marked, and changed plans."""
+    """Plan a batch with and without invalid cases, and print the counts of `compare`.
+
+    The counts are how many invalid cases are marked, and how many plans of other cases are equal.
+    """
     task = pj.task_named(options.task)
     found = compare(task, options.num, options.every, options.seed)
     bench.row(task=options.task, num=options.num, **found)

@@ -99,7 +99,10 @@ def judge_decision(
 
 
 def measure(bench: Bench, variants: list[str], options: argparse.Namespace) -> None:
-    """Train and judge every variant, and print the table; the orders best and greedy come first."""
+    """Train and judge every variant of the training, and print the table.
+
+    The first two rows are the methods `best` and `greedy`, which need no training.
+    """
     bench.say(
         f"{options.suite}, {options.decisions:,} decisions, {options.seeds} seeds, judged on "
         f"{options.num} cases of seed {options.seed}, {jax.devices()[0]}",

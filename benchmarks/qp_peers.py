@@ -37,9 +37,10 @@ def clarabel_solver(matrices: Mapping[str, np.ndarray]) -> Callable[..., PeerSol
     """Return a function that solves quadratic programs with given matrices by Clarabel.
 
     Clarabel is an interior-point method. `matrices` has the matrices of cost, equalities and
-    bounds, by the names of the arguments of `qp_template`. The function takes right-hand sides of the
-    equalities, lower bounds and upper bounds. Clarabel is set up anew for every program, because
-    its interface cannot change which bounds are infinite. This is part of the measured time.
+    bounds, by the names of the arguments of `qp_template`. The function takes right-hand sides of
+    the equalities, lower bounds and upper bounds. Clarabel is set up anew for every program,
+    because its interface cannot change which bounds are infinite. This is part of the measured
+    time.
     """
     clarabel: Any = importlib.import_module("clarabel")
 
@@ -110,7 +111,10 @@ def osqp_solver(matrices: Mapping[str, np.ndarray]) -> Callable[..., PeerSolutio
 
 
 def _to_sparse(matrices: Mapping[str, np.ndarray]) -> tuple[Any, Any, Any]:
-    """Return a program's sparse matrices: Hessian (upper triangle), equalities, bounded rows."""
+    """Return sparse matrices of a quadratic program: Hessian, equalities and bounded rows.
+
+    Only the upper triangle of the symmetric Hessian is returned.
+    """
     equalities = np.concatenate([matrices["equalities"], matrices["zeros"]])
     hessian = scipy.sparse.csc_matrix(np.triu(matrices["hessian"]))
     return hessian, scipy.sparse.csr_matrix(equalities), scipy.sparse.csr_matrix(matrices["rows"])

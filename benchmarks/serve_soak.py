@@ -108,7 +108,7 @@ def distance_off(answer: Answer, height: float, gravity: float, ball: np.ndarray
 class Naps:
     """Process that sleeps repeatedly, and records when the system woke it too late.
 
-    During these gaps the system did not run the server in time either.
+    Deadlines that the server misses during these gaps are attributed to the operating system.
     """
 
     def __init__(self, core: int | None = None) -> None:
