@@ -68,7 +68,7 @@ class LibraryPlanner(pj.Planner):
 
 @dataclasses.dataclass(frozen=True)
 class NumpyPlanner(pj.Planner):
-    """A planner in NumPy, which steps 0.5 towards the goal, and in its second attempt 1."""
+    """A planner in NumPy that steps by 0.5 towards the goal, and by 1 in its second attempt."""
 
     attempts: ClassVar[tuple[Attempt, ...]] = (Attempt(1), Attempt(2))
     case_type: ClassVar[type] = Place
