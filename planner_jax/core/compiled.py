@@ -1,7 +1,7 @@
 """Run-time numbers of compiled programs, and the platform for which a program is traced.
 
-An attempt of a planner, such as a number of iterations from a starting point, is mostly numbers. If
-these are arguments of a compiled program, all attempts of a planner share one program.
+The settings of a planner's attempt (search), such as its number of iterations, are mostly numbers.
+If these are arguments of a compiled program, all attempts of a planner share one program.
 """
 
 import contextlib

@@ -108,12 +108,12 @@ class Planner(Generic[CaseT, PlanT]):
     def divides(self, attempt: PyTree, /) -> bool:
         """Return whether `pj.plan` runs an attempt's search from each start as its own problem.
 
-        Only an `OptimisedPlanner` has such attempts.
+        Only an `OptimisedPlanner` has such attempts (settings of a search).
         """
         return False
 
     def compiles_quickly(self, attempt: PyTree, /) -> bool:
-        """Return whether a CPU compiles an attempt's program for one case with `QUICK_OPTIONS`.
+        """Return whether a CPU compiles the search of an attempt for one case by `QUICK_OPTIONS`.
 
         These options save compile time, but the program may run slower. By default all planners use
         them except those with `is_sequential`.
@@ -239,7 +239,7 @@ def require_planner(planner: object) -> None:
 
 
 def require_fit(planner: Planner, cases: object) -> None:
-    """Raise unless `planner` is a pytree with at least one attempt, for cases of this class."""
+    """Raise unless `planner` is a pytree with an attempt (search), for cases of this class."""
     require_planner(planner)
     if jax.tree_util.all_leaves([planner]) and planner.kind is not Kind.HOST:
         rule = "a pytree: put @jax.tree_util.register_static over its frozen dataclass, or make it "

@@ -1,4 +1,4 @@
-"""Plans and their statuses, the rule that selects the best plan, attempts, and decisions."""
+"""Plans and their statuses, the rule that selects the best plan, attempts (searches), decisions."""
 
 import dataclasses
 import enum
@@ -68,7 +68,7 @@ def is_solved(status: Numbers | int) -> Array:
 
 
 def is_unsolved(status: Numbers | int) -> Array:
-    """Return where a status is INFEASIBLE, MAX_STEPS or OUT_OF_REACH: another attempt may help."""
+    """Return where a status is INFEASIBLE, MAX_STEPS or OUT_OF_REACH: another search may help."""
     worth = (status == Status.INFEASIBLE) | (status == Status.MAX_STEPS)
     return worth | (status == Status.OUT_OF_REACH)  # type: ignore[return-value]
 
@@ -146,7 +146,7 @@ def require_settings(planner: PyTree) -> None:
     """Raise unless every field of a planner, a dataclass, has the kind of its default value.
 
     Sizes are whole numbers >= 1, or >= 0 if the default is 0. Weights and times are finite, and >=
-    0 unless the default is negative. There must be at least one attempt.
+    0 unless the default is negative. There must be at least one attempt (search).
     """
     defaults = {field.name: field.default for field in dataclasses.fields(planner)}
     for name, value in fields_of(planner).items():
@@ -166,7 +166,7 @@ def require_settings(planner: PyTree) -> None:
 
 
 def require_attempts(name: str, value: object, kind: type) -> None:
-    """Raise `ArgumentError` unless a setting is a tuple of one or more attempts of class `kind`."""
+    """Raise `ArgumentError` unless `value` is a tuple of one or more objects of class `kind`."""
     if not isinstance(value, tuple) or not all(isinstance(each, kind) for each in value):
         raise ArgumentTypeError(name, f"a tuple of {kind.__name__}", value)
     if not value:
@@ -178,7 +178,7 @@ class Attempt:
     """Settings of one search for cases that earlier attempts left unsolved; static under jit."""
 
     starts: int = 1  # number of starting points from which each case is solved
-    # The attempt is made only at cases whose plan has at most this violation; None means at all.
+    # The search is made only at cases whose plan has at most this violation; None means at all.
     within: float | None = dataclasses.field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
@@ -187,7 +187,7 @@ class Attempt:
             require_number("within", self.within, POSITIVE)
 
     def is_due(self, plans: "Plan") -> Array:
-        """Return which plans need this attempt, bool: unsolved, and violation <= `within`."""
+        """Return which plans need this search, bool: unsolved, and violation <= `within`."""
         unsolved = is_unsolved(plans.status)
         return unsolved if self.within is None else unsolved & (plans.violation <= self.within)
 

@@ -1,7 +1,7 @@
 """The tasks of live planning (`planner-jax serve`): to hit or to catch the observed ball.
 
 Each class plans from scratch, or improves the previous plan with the newest estimate of the ball.
-To save time, a plan is a single attempt of the optimiser, in one compiled call. The next call
+To save time, a plan is a single short search of the optimiser, in one compiled call. The next call
 continues from its result.
 """
 

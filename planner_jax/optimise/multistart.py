@@ -207,8 +207,8 @@ class Searches:
 def count_guesses(rounds: Sequence[Round], stage: Stage) -> int:
     """Return how many guessed starting points the program for one stage (search) must compute.
 
-    It is the greatest number that a round uses whose first stage has these settings. Later stages
-    start where the stage before them ends.
+    It is the greatest number that a round (attempt) uses whose first stage has these settings.
+    Later stages start where the stage before them ends.
     """
     begun = [each for each in rounds if each.all_stages[0].settings == stage.settings]
     return max((each.first + each.starts for each in begun if each.is_divided), default=0)
@@ -286,7 +286,7 @@ def divide_round(
 
 
 def solve_divided(planner: "OptimisedPlanner", attempt: Round, cases: PyTree) -> PyTree:
-    """Return each case's best plan from all starts of a round, by one compiled program; pure."""
+    """Return each case's best plan from all starts of a round (attempt), by one program; pure."""
 
     def search(
         stage: Stage, cases: PyTree, index: Array, points: Array | None

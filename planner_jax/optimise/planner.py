@@ -104,7 +104,7 @@ class OptimisedPlanner(Planner[CaseT, PlanT], abc.ABC):
     def rules_out(self, context: PyTree) -> Array:
         """Return whether it is proven that the case has no plan, () bool; false by default.
 
-        Such a case, if unsolved, has the status `TOO_FAR`, and no further attempt is made.
+        Such a case, if unsolved, has the status `TOO_FAR`, and no further search is made.
         """
         return jnp.zeros((), bool)
 
@@ -134,7 +134,7 @@ class OptimisedPlanner(Planner[CaseT, PlanT], abc.ABC):
         return (solve_divided if attempt.is_divided else solve_batch)(self, attempt, cases)
 
     def divides(self, attempt: Round) -> bool:
-        """Return whether `pj.plan` runs a round's search from each start as its own problem."""
+        """Return whether `pj.plan` runs the searches of a round (attempt) as separate problems."""
         return attempt.is_divided
 
     def settle(

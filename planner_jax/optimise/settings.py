@@ -1,4 +1,4 @@
-"""Types of objectives, and settings of searches: solvers, preliminary stages and rounds."""
+"""Types of objectives, and settings of rounds (attempts), which are searches in several stages."""
 
 import dataclasses
 import functools
@@ -148,7 +148,7 @@ class Stage:
 @with_run_time_numbers()
 @dataclasses.dataclass(frozen=True)
 class Round(Attempt):
-    """One attempt of a planner that minimises: its solver, settings and preliminary searches."""
+    """One attempt (search) of a planner that minimises: solver, settings, preliminary searches."""
 
     solver: Solver = LbfgsConfig()
     settings: Settings = ()  # values of planner fields during this attempt
@@ -162,15 +162,16 @@ class Round(Attempt):
 
     @property
     def all_stages(self) -> tuple[Stage, ...]:
-        """The preliminary stages, and the round's own search as the last stage."""
+        """The preliminary searches of the round, and its own search as the last stage."""
         return (*self.stages, Stage(self.solver, self.settings))
 
     @property
     def is_divided(self) -> bool:
         """Whether the search from each starting point of a case is a problem of its own.
 
-        This is so for several starting points, a `first` > 0, or `settings` of the round. Rounds
-        with equal settings then share a compiled program, for any number of starting points.
+        This is so for several starting points, a `first` > 0, or a round (attempt) with
+        `settings`. Rounds with equal settings then share a compiled program, for any number of
+        starting points.
         """
         return self.starts > 1 or self.first > 0 or bool(self.settings)
 

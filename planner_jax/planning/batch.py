@@ -1,7 +1,7 @@
 """Plan batches of cases, for `plan`, in chunks of a few fixed sizes on all devices.
 
-A lane is one case of a batch. The cases that an attempt leaves unsolved are gathered into a smaller
-batch for the planner's next attempt. Each device solves its lanes in its own loop and waits for no
+A lane is one case of a batch. The cases that an attempt (search) leaves unsolved are gathered into
+a smaller batch for the next attempt. Each device solves its lanes in its own loop and waits for no
 other device. A `Watch` reports progress to the caller and ends the attempts at the time limit.
 """
 
@@ -73,7 +73,7 @@ class Watch:
     """The clock of one call of `plan`: it reports progress and knows when the time limit passes.
 
     Args:
-        time_limit: [s] time after the construction at which attempts end; None: no limit.
+        time_limit: [s] time after the construction from which no search starts; None: no limit.
         progress: function that receives a `Progress` for each report; None: no reports.
 
     Raises:
@@ -105,7 +105,7 @@ class Watch:
         return self._limit is not None and time.monotonic() - self._start >= self._limit
 
     def report(self, planner: Planner, attempt: Attempt, tried: int, cases: int) -> None:
-        """Report progress at the start and end of an attempt, and else at most once a second."""
+        """Report progress at the start and end of a search, and else at most once a second."""
         if self._progress is None:
             return
         seconds, rounds = time.monotonic() - self._start, tuple(planner.attempts)
@@ -181,7 +181,7 @@ def _try_in_turn(
     watch: Watch,
     try_lanes: Callable[[Attempt, np.ndarray, PyTree], PyTree],
 ) -> tuple[PyTree, int]:
-    """Return plans of `num` cases after all attempts in order, and the number of unsolved plans.
+    """Return plans of `num` cases after all attempts (searches), and the number of unsolved plans.
 
     `try_lanes` makes one attempt at the cases with given indices. It takes the plans so far (None
     before the first attempt), and returns them with improvements at those indices.
@@ -215,7 +215,6 @@ class _Batch:
     def try_lanes(
         self, cases: PyTree, attempt: Attempt, lanes: np.ndarray, plans: PyTree
     ) -> PyTree:
-        """Return all plans, in NumPy arrays, after one attempt at the cases of indices `lanes`."""
         calls = self._calls(attempt, lanes)
         found, tried = [], 0
         self.watch.report(self.planner, attempt, 0, lanes.size)
@@ -393,7 +392,7 @@ def _cut_unsolved(
 
 @functools.partial(jax.jit, static_argnames=("mesh", "within"))
 def _mark_due(mesh: Mesh, within: float, plans: PyTree) -> tuple[Array, Array]:
-    """Mark plans with a violation above `within` as solved, so that the attempt skips them.
+    """Mark plans with a violation above `within` as solved, so that the next search skips them.
 
     Return the marked statuses, and the number of cases to be tried on each device, (devices,).
     """

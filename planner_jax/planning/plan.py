@@ -50,8 +50,8 @@ def plan(
     another point, rarely with another status.
 
     Args:
-        planner: a planner such as `pj.hit.planner("exact")`; its attempts are made in order, each
-            at the cases that are still unsolved.
+        planner: a planner such as `pj.hit.planner("exact")`; its attempts (searches) are made in
+            order, each at the cases that are still unsolved.
         cases: one case of the planner's task, or a batch, which has one more leading axis.
         chunk: cases that a device solves in one compiled call. The default suits the device.
         devices: devices that share a batch. By default all local ones, `jax.local_devices()`.
@@ -147,7 +147,7 @@ def require_batch(cases: Case) -> int:
 def solve(planner: Planner[CaseT, PlanT], cases: CaseT) -> PlanT:
     """Plan cases as a pure function, for compiled functions, `vmap` and `scan`.
 
-    Each attempt after the first is made at all cases of the batch if at least one is unsolved.
+    Each attempt (search) after the first is made at all cases of a batch if one is unsolved.
     `plan` removes solved cases from the batch, and is faster where few cases are left.
 
     Args:
@@ -201,7 +201,7 @@ class Driver:
     def __call__(
         self, planner: Planner, cases: PyTree, attempts: Sequence[Attempt] | None = None
     ) -> tuple[PyTree, PyTree]:
-        """Plan by the listed attempts, or all; return plans, and a mask or count of unsolved."""
+        """Plan by `attempts` (searches), or all; return plans, and a mask or count of unsolved."""
         if planner.kind is Kind.COMPOSITE:
             plans = planner.plan_by(self, cases)
             return plans, is_unsolved(plans.status)
@@ -232,7 +232,7 @@ class Driver:
 
 
 def _plan_one(planner: Planner, attempts: Sequence[Attempt], case: PyTree, watch: Watch) -> PyTree:
-    """Return the plan of one case: make attempts until one solves the case or the time is over."""
+    """Return the plan of one case: make searches until one solves the case or the time is over."""
     best: PyTree = None
     for attempt in attempts:
         if best is not None and not attempt.is_due(best):
@@ -255,11 +255,11 @@ def _plan_one(planner: Planner, attempts: Sequence[Attempt], case: PyTree, watch
 
 
 def _plan_purely(planner: Planner, attempts: Sequence[Attempt], cases: PyTree) -> PyTree:
-    """Return plans as jax arrays; while any case is unsolved, attempts are made at all cases."""
+    """Return plans as jax arrays; while any case is unsolved, searches are made for all cases."""
     require_pure(planner)
     plans: PyTree = None
     pairs = [(attempt, planner.load_attempt(attempt, cases)) for attempt in attempts]
-    # Consecutive attempts whose pytrees have equal structure are iterations of one compiled loop.
+    # Consecutive attempts (searches) with pytrees of equal structure share one compiled loop.
     for _, same in itertools.groupby(pairs, lambda pair: jax.tree.structure(pair[1])):
         group, loaded = zip(*same, strict=True)
         solve_by = functools.partial(_solve_by, planner, cases, loaded)

@@ -1,4 +1,4 @@
-"""Compiled programs that make one attempt at one case, or at a batch spread over all devices.
+"""Compiled programs that make one attempt (search) at one case, or at a batch on all devices.
 
 A lane is one case of a batch. A batch is divided equally among the devices, and each device cuts
 its lanes into chunks of a few fixed sizes, so that a new batch size compiles no new program.
@@ -39,14 +39,14 @@ LANES = PartitionSpec("lanes")
 
 @dataclasses.dataclass(frozen=True)
 class Sizes:
-    """The numbers of lanes (cases) that the calls of one attempt may have on each device."""
+    """Numbers of lanes (cases) that the calls of one attempt (search) may have on each device."""
 
     most: int  # greatest number of lanes of a call
     busy: int  # least number of lanes that keeps a GPU busy
     least: int = BUCKETS[0]  # least number of lanes of a call
 
     def next(self, num: int) -> int:
-        """Return the size of the next call (its number of lanes) when `num` lanes are unsolved.
+        """Return the size of the next call (its number of lanes, cases) for `num` unsolved lanes.
 
         It is the smallest size in `BUCKETS` that holds `num` lanes, at most `most`. If the lanes
         fill at most half of it, the next smaller bucket is used if that still keeps a GPU busy.
@@ -80,7 +80,7 @@ def sizes_of(planner: Planner, attempt: Attempt, chunk: int | None, mesh: Mesh) 
         return Sizes(chunk, busy)
     if mesh.devices[0].platform != "cpu":
         return Sizes(max(_GPU_LEAST, _GPU_CHUNK // attempt.starts), busy, _GPU_LEAST)
-    # If a core solves one case after another, small chunks keep all cores busy until the end.
+    # If a core solves cases one after another, small chunks of cases keep all cores busy.
     if planner.is_sequential:
         return Sizes(BUCKETS[0], busy)
     starts = 1 << (attempt.starts - 1).bit_length()  # number of starts, up to a power of two
@@ -120,7 +120,7 @@ def put_number(mesh: Mesh, value: int) -> Array:
     """Return an integer as an array on every device; cached, because each transfer takes time."""
     if mesh.size == 1:
         # JAX compiles another program for arrays that are committed to a device. The arrays of most
-        # users are uncommitted, and with an uncommitted number all attempts run one program.
+        # users are uncommitted, and with an uncommitted number all searches run one program.
         with jax.default_device(mesh.devices[0]):
             return jnp.asarray(value, jnp.int32)
     return jax.device_put(np.int32(value), replicated_sharding(mesh))
@@ -164,8 +164,8 @@ FEW = 256
 def solve_cases(planner: Planner, cases: PyTree, loaded: PyTree) -> PyTree:
     """Return the plans of one case, or of a batch with a leading axis on every leaf; pure.
 
-    `loaded` is an attempt as `Planner.load_attempt` returns it. All compiled programs call this
-    function. It gives the status `BAD_INPUT` to every case with an invalid number, such as NaN.
+    `loaded` is an attempt (settings of a search) from `Planner.load_attempt`. All compiled programs
+    call this function. Cases with an invalid number, such as NaN, get the status `BAD_INPUT`.
     """
     require_shapes(cases)
     attempt = loaded.attempt if isinstance(loaded, Fixed) else loaded
@@ -190,7 +190,7 @@ class PerDevice:
         )
 
     def __call__(self, mesh: Mesh, static: Hashable, *trees: PyTree) -> PyTree:
-        """Return the function's results, with the lanes of all devices."""
+        """Return the function's results, with the lanes (cases) of all devices."""
         if mesh.size == 1:
             return self._alone(mesh.devices[0].platform, static, *trees)
         return self._together(*trees, mesh=mesh, static=static)

@@ -26,8 +26,8 @@ from planner_jax.planning.programs import (
     on_devices,
 )
 
-# Number of searches in one call on each device, for a batch. Few lanes keep a CPU from waiting for
-# its slowest search; a GPU takes as long for fewer lanes.
+# Number of searches in one call on each device, for a batch. Few searches keep a CPU from waiting
+# for its slowest search; a GPU takes as long for fewer searches.
 _CPU_LANES, _GPU_LANES = 16, 8192
 
 
