@@ -55,7 +55,7 @@ def keep_compiled_programs() -> Path | None:
 
 def _delete_oldest(folder: Path) -> None:
     checked = folder / "checked"  # its time of change is the time of the last check
-    with contextlib.suppress(OSError):  # a folder that cannot be written, or another process
+    with contextlib.suppress(OSError):  # the folder is read-only, or another process deletes files
         if checked.exists() and time.time() - checked.stat().st_mtime < _CHECKED_EVERY:
             return
         checked.touch()

@@ -79,7 +79,7 @@ def usable_cores() -> int:
     """Return the number of cores that this process may use; the machine may have more."""
     try:
         return len(os.sched_getaffinity(0))
-    except AttributeError:  # another system than Linux
+    except AttributeError:  # only Linux has this function
         return os.cpu_count() or 1
 
 
@@ -103,7 +103,7 @@ def processor() -> str:
         for line in text.splitlines():
             name, _, value = line.partition(":")
             entries.setdefault(name.strip().lower(), value.strip())
-    except OSError:  # another system than Linux
+    except OSError:  # only Linux has this file
         pass
     name = entries.get("model name") or platform.processor() or platform.machine()
     known = (entries.get("flags") or entries.get("features") or "").split()

@@ -33,7 +33,7 @@ Kernel = Callable[[Sequence[Array]], Sequence[Array] | None]
 
 
 class Kernels(enum.Enum):
-    """The use of the library's own CUDA kernels in programs; the values are texts for users."""
+    """Whether programs use the library's own CUDA kernels; the values are texts for users."""
 
     ON = "on"
     OFF = f"off, by {SWITCH}"

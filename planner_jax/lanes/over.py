@@ -144,8 +144,8 @@ def _by_kernel(
         results = kernel(leaves)
         if results is None:
             return by_operations(*leaves)
-        # A `vmap` within a lane adds a leading axis to all results of the kernel. Results that are
-        # constant along this axis do not have it in the call, so that its first entry is taken.
+        # A `vmap` within a lane adds a leading axis to all results of the kernel. Where a result is
+        # constant along this axis, the call's result lacks the axis, and the first entry is taken.
         pairs = zip(results, shapes, strict=True)
         results = [result[(0,) * (result.ndim - len(shape))] for result, shape in pairs]
         as_called = all(r.shape == shape for r, shape in zip(results, shapes, strict=True))

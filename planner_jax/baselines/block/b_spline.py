@@ -122,7 +122,7 @@ def _knots(degree: int, spans: int) -> np.ndarray:
 
 
 def _basis(degree: int, num: int, place: np.ndarray) -> np.ndarray:
-    """Return the values (..., num) of all basis functions at `place` (...), in knot spans."""
+    """Return the values (..., num) of all basis functions at positions (...) in knot spans."""
     spans = num - degree
     knots = _knots(degree, spans)
     span = np.minimum(np.floor(place), spans - 1)  # the last span includes its end

@@ -48,7 +48,7 @@ def poses_in_time(case: BlockCase, points: int) -> tuple[EndPoses, Array]:
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class DirectBlock(Planner):
-    """The planner `direct`, with bang-bang motions; a plan's cost is the motion's duration [s]."""
+    """The planner `direct`: bang-bang joint motions to end poses; the cost is the duration [s]."""
 
     case_type: ClassVar[type] = BlockCase
     is_sequential: ClassVar[bool] = True

@@ -55,7 +55,7 @@ class OpenStates:
         self._lengths, self._closed = {_cell_of(start.angles): 0.0}, set()
 
     def pop(self) -> State | None:
-        """Remove and return the first state whose grid cell has no expanded state; else None."""
+        """Remove and return the cheapest state in a cell without an expanded state, or None."""
         while self._states:
             state = heapq.heappop(self._states)[2]
             if (cell := _cell_of(state.angles)) not in self._closed:
@@ -64,7 +64,7 @@ class OpenStates:
         return None
 
     def steps_from(self, state: State) -> list[State]:
-        """Return a state's neighbours, except in cells that are expanded or have a shorter path."""
+        """Return a state's neighbours, except in grid cells expanded or with a shorter path."""
         neighbours = state.angles + STEPS
         lengths = state.length + np.linalg.norm(neighbours - state.angles, axis=1)
         return [

@@ -66,7 +66,7 @@ class PoseByPose(Planner, abc.ABC):
     pieces: ClassVar[int]
     degree: ClassVar[int]
     points: int = 12  # number of points of the ball's trajectory, each with eight end poses
-    budget: float = 2.0  # [s], search time of each case, as in the paper
+    budget: float = 2.0  # [s], search time of each case [Natarajan2024]
     # [s], search time of one pose in the first pass over all poses; each next pass doubles it.
     longest: float = 0.25
     patient: bool = True  # whether the search continues after a motion that arrives too late
@@ -92,7 +92,7 @@ class PoseByPose(Planner, abc.ABC):
         return jax.tree.map(lambda *leaves: np.stack(leaves), *plans)
 
     def plan_of(self, case: BlockCase) -> BlockPlan:
-        """Return the plan of one case: the first motion before the ball, else the least late."""
+        """Return one case's plan: the first motion before the ball, else the least late motion."""
         hopeless, angles, contacts, shares = (np.asarray(x) for x in _list_goals(case, self.points))
         if hopeless != Status.NO_PATH:
             return self._plan(case, Status(int(hopeless)))
@@ -126,7 +126,7 @@ class PoseByPose(Planner, abc.ABC):
         contact: ArrayLike = 0.0,
         tries: int = 0,
     ) -> BlockPlan:
-        """Return the plan of a motion that meets the ball at `contact` [s]; None is standstill."""
+        """Return the plan of a motion with the contact time `contact` [s], or of standstill."""
         dtype = np.asarray(case.angles).dtype
         if motion is None:
             stay = np.zeros((1, self.degree + 1, 6))

@@ -1,8 +1,8 @@
 """The baseline `rrt-connect` of [Natarajan2024]: a path by RRT-Connect, timed by TOPP-RA.
 
 RRT-Connect [Kuffner2000], of the library OMPL, grows two trees of joint poses, from start and goal.
-The greatest length of an edge is the value in the code that the paper's authors published. The
-search uses one thread.
+An edge is at most 1 rad long, as in the code that the paper's authors published. The search uses
+one thread.
 """
 
 import dataclasses
@@ -32,7 +32,7 @@ def _ompl() -> tuple[ModuleType, ModuleType]:
 
 @dataclasses.dataclass(frozen=True)
 class RrtConnectBlock(PathThenTime):
-    """The planner `rrt-connect`, to poses that meet the ball; it needs the extra `arm-peers`."""
+    """The planner `rrt-connect`: paths to poses that meet the ball; needs the extra `arm-peers`."""
 
     packages: ClassVar[tuple[str, ...]] = ("toppra", "ompl")
     reach: float = 1.0  # [rad], greatest length of a tree's edge in joint space

@@ -172,8 +172,7 @@ class MppCatch(Planner):
         find = lambda target, end: falling_time(target, height, end, self.time_nodes)  # noqa: E731
         fall, found = jax.vmap(find)(context.targets, context.horizon)
         before = jnp.concatenate([jnp.zeros_like(fall[:1]), fall[:-1]])
-        # If a target falls earlier than the previous one, the time between both catches is short,
-        # but > 0.
+        # If a target falls before the previous target, the time between the catches is `_SHORTEST`.
         duration = jnp.maximum(fall - before, _SHORTEST)
         times = jnp.cumsum(jnp.where(context.active, duration, 0.0))
         late = jnp.maximum(_SHORTEST - (fall - before), jnp.where(found, -1.0, 1.0))

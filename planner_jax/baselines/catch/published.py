@@ -14,7 +14,7 @@ class PublishedRates(NamedTuple):
     """
 
     success: float | None = None  # [%], success rate of the paper's planner
-    time_ratio: float | None = None  # mean relative change of the decided times by the optimiser
+    time_ratio: float | None = None  # mean relative change of the catching times by the optimiser
     mpp_success: float | None = None  # [%], success rate of the planner MPP (motion primitives)
 
 

@@ -192,7 +192,7 @@ class BatHit(OptimisedPlanner):
         return prepare_hit(case, self.num_table_nodes)
 
     def impact(self, natural: Array, context: HitContext) -> tuple[Impact, Array]:
-        """Return the impact from the last five variables, and the defect of eqs 13-14.
+        """Return the impact from the last five variables, and the defect [Yu2023bat, eqs 13-14].
 
         `natural` (5,) has the logarithm of the impact time, y and z of the racket's velocity [m/s],
         and x and z of the thrust per unit mass [m/s^2]. The defect is > 0 if no hit is possible.

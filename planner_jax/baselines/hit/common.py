@@ -79,9 +79,9 @@ def largest_violation(along: Array, impact: Impact, case: HitCase) -> Array:
 
 
 def motion_excess(motion: Motion, gravity: Array, limits: QuadrotorLimits) -> tuple[Array, ...]:
-    """Return the excess (N,) of N samples over four limits [Yu2023bat, eq. 18a].
+    """Return the excess (N,) of N samples over each of four limits [Yu2023bat, eq. 18a].
 
-    The limits are speed, acceleration, body rate, and the least height above the ground.
+    It is (value / limit)^2 - 1 for speed, acceleration and body rate, and the lack of height [m].
     """
     return (
         speed_excess(motion.vel, limits),

@@ -12,7 +12,7 @@ from planner_jax.ball.aim import aim_drag_free
 from planner_jax.ball.flight import BallState
 
 _LEAST_THRUST_X = 1e-2  # [m/s^2], least size of the thrust's x component
-_LEAST_ROOT = 1e-2  # [m/s], least root of the discriminant of eq. 13c
+_LEAST_ROOT = 1e-2  # [m/s], least root of the discriminant in eq. 13c of [Yu2023bat]
 _LEAST_FLIGHT = 1e-2  # [s], least flight time of the returned ball
 _LEAST_PUSH = 1e-3  # [s], least (change of the ball's velocity) / thrust
 

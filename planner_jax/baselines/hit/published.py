@@ -26,7 +26,7 @@ _SERVE_COLUMNS = ("serve position", "serve velocity", "landing position", "targe
 _HIT_COLUMNS = (("hitting position", 3), ("hitting velocity", 3), ("hitting attitude", 4))
 _LISTED = 5  # greatest number of problems that an error message lists
 
-# Line number -> the serve's twelve numbers and whether it was solved; None if parsing failed.
+# Line number -> `Trial.numbers` and whether the serve was solved; None if parsing failed.
 _Table: TypeAlias = dict[int, tuple[list[float], bool] | None]
 
 
@@ -115,7 +115,6 @@ def _read_file(path: Path, problems: list[str]) -> _Table:
 
 
 def _parse(line: str) -> tuple[list[float], bool]:
-    """Return the twelve numbers of a serve, and whether it was solved, from a trial file's line."""
     cells = [cell.strip() for cell in line.split(",")]
     if len(cells) != 8:
         raise ArgumentError("row", "8 columns between commas", len(cells), verb="have")

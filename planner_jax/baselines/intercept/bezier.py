@@ -116,10 +116,10 @@ def rows_of_pieces(of_piece: np.ndarray, pieces: int) -> np.ndarray:
 
 
 def bounds_of_pieces(lower: Array, upper: Array) -> tuple[Array, Array]:
-    """Convert bounds (K, W) on W values of each of K pieces into bounds on the curve's values.
+    """Convert bounds (K, W) on W values of each of K pieces into bounds (K (W - 1) + 1,).
 
-    The rows of `rows_of_pieces` compute these values. Where two pieces meet, the stricter bound
-    applies.
+    The rows of `rows_of_pieces` compute the bounded values. Where two pieces meet, the stricter
+    bound applies.
     """
 
     def flat(bounds: Array, at_joints: Array) -> Array:

@@ -34,8 +34,7 @@ from planner_jax.core.errors import ArgumentError
 from planner_jax.plane.obstacles import Obstacles, distances, separation
 
 _FINE = 8  # number of samples per piece of the spline, for the computation of its length
-# Fractions of the shift from the given to the smoothed points, tried in turn until a path keeps all
-# limits.
+# Fractions of the shift to the smoothed points, tried in turn until a path keeps all limits.
 _SHARES = (1.0, 0.5, 0.25, 0.0)
 # Relative excess over the curvature limit that is allowed, because of rounding errors.
 _CURVATURE_TOLERANCE = 1e-3
@@ -49,7 +48,7 @@ class Smoothing:
     curvature: float = 0.1  # weight of the cost of curvature above the limit
     smoothness: float = 0.2  # weight of the squared differences of neighbouring steps
     step: float = 0.25  # initial step size of gradient descent
-    reach: float = 0.5  # [m], points nearer to an obstacle than this have a cost; not in the paper
+    reach: float = 0.5  # [m], only points nearer to an obstacle than this distance have a cost
     iterations: int = 100  # number of gradient steps
     stride: int = 4  # number of poses of the given path from one moving point to the next
     margin: float = 0.01  # [m], least distance from walls, since only poses are checked

@@ -20,8 +20,7 @@ from planner_jax.baselines.intercept.station_time import Blocked, StationTimePro
 from planner_jax.plane.obstacles import Obstacles
 from planner_jax.robot.car import CarBody, CarLimits
 
-# Slopes that are tried for the edges of a quadrangle, in units of (range of path lengths) /
-# (duration).
+# Slopes tried for the edges of a quadrangle, in units of (range of path lengths) / (duration).
 _SLOPES = np.linspace(-2.0, 2.0, 17)
 _BEFORE = 0.05  # fraction of the horizon by which the projected time is extended at both ends
 
@@ -203,10 +202,7 @@ def _cover_run(
     right = jnp.clip(finish - middle, -0.5 * width, 0.5 * width)
 
     def edge(side: float) -> Array:
-        """Return the lowest line above all rectangles (side 1), or the highest below (side -1).
-
-        The result has the line's stations at the start and the end of each slab of time.
-        """
+        """Return stations (slabs, 2) [m] of lines above (side 1) or below (-1) all rectangles."""
         height = side * station + half_step
         highest = jnp.max(jnp.where(is_in, height, -jnp.inf), axis=1)
         lowest = jnp.min(jnp.where(is_in, height, jnp.inf), axis=1)

@@ -220,8 +220,7 @@ def _search(
         reached = jnp.sum(normal * s.point)
         side = jnp.where(low[row] - reached > reached - high[row], 1.0, -1.0).astype(dtype)
         gap = jnp.maximum(low[row] - reached, reached - high[row])
-        # Direction in which the point moves while the bound is added, and the rates at which the
-        # multipliers decrease.
+        # Direction in which the point moves, and rates at which the multipliers decrease.
         both = _product(s.maps, side * normal)
         move, fall = both[:size], both[size:]
         freedom = jnp.sum(move**2)

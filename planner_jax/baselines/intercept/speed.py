@@ -137,7 +137,10 @@ def speed_template(planner: SpeedPlanner) -> QpTemplate:
 
 
 def _rows_of_piece(planner: SpeedPlanner, order: int) -> np.ndarray:
-    """Map a piece's control points to its bounded stations, speeds, accelerations (`order` 0-2)."""
+    """Return the matrix from a piece's control points to the values that have bounds.
+
+    These values are stations for `order` 0, speeds for 1, and accelerations for 2.
+    """
     rows = hodograph(planner.degree, order, planner.pieces)
     if planner.samples is None:
         return rows

@@ -161,7 +161,7 @@ def _find_forbidden_edges(problem: StationTimeProblem, grid: StationTimeGrid) ->
     below, above = jnp.where(is_shared, below, jnp.inf), jnp.where(is_shared, above, -jnp.inf)
     is_met = (station > below[..., None]) & (station < above[..., None])
 
-    # Least speed limit on the part of the path along which an edge leads.
+    # Least speed limit on the part of the path that an edge of the grid passes.
     limit = jnp.min(
         problem.speed_limit[_parts_of_cells(num, problem.speed_limit.shape[-1])], axis=1
     )

@@ -55,7 +55,7 @@ class Aim:
 
     offset: float  # [m] greatest distance of the contact from the shield's centre
     at_rest: bool = False  # whether the arm must be at rest at the contact
-    edge: float = 0.0  # [m] cut from both ends of the path on which a ball may be met
+    edge: float = 0.0  # [m] cut from both ends of the path on which the shield may meet a ball
 
 
 # Requirements on a contact in the order in which they are tried, the strictest first. Each is tried
@@ -84,10 +84,10 @@ class Decided:
 def plan_with_aims(
     planner: Planner, cases: BlockCase | Replanning, aims: Sequence[Aim] = AIMS
 ) -> BlockPlan:
-    """Plan cases with estimated balls, for which `aims` are tried in this order.
+    """Plan cases with estimated balls, with the requirements `aims` tried one after another.
 
-    An aim is a set of requirements on the contact. Each case gets the plan for the first aim that
-    can be met, or else the best failed plan.
+    An aim limits the contact's distance from the shield's centre, and may require standstill. Each
+    case gets the plan for the first aim that can be met, or else the best failed plan.
     """
     cases, plans = jax.tree.map(np.asarray, cases), None
     lanes = np.arange(cases.batch_shape[0])
@@ -95,7 +95,7 @@ def plan_with_aims(
         some = take(cases, lanes)
         is_again = isinstance(some, Replanning)
         aimed = cautious(some.case if is_again else some, **dataclasses.asdict(aim))
-        # Use NumPy arrays, because JAX has compiled the programs for NumPy arrays only.
+        # The programs are compiled for NumPy arrays; JAX would compile them again for JAX arrays.
         aimed = jax.tree.map(np.asarray, aimed)
         asked = dataclasses.replace(some, case=aimed) if is_again else aimed
         found = jax.tree.map(np.array, plan(planner, asked))

@@ -102,7 +102,10 @@ class AdaptBlock(Planner):
         return self.efforts
 
     def check(self, cases: BlockCase) -> None:
-        """Raise `ArgumentError` unless arm, limits, scene and start of case 0 fit the library."""
+        """Raise `ArgumentError` unless arm, limits, scene and start of case 0 fit the library.
+
+        Other cases of a batch that do not fit get plans with the status BLOCKED.
+        """
         self.stored.check(cases)
 
     def solve(self, case: BlockCase, attempt: Effort) -> BlockPlan:

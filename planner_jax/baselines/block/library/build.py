@@ -195,8 +195,8 @@ def plan_pairs(
     """Plan motions from one start pose for N pairs of cells; return rows of the library's table.
 
     A pair is one cell on each of the two boxes around the arm. `StraightPair` tries motions in
-    which all joints move in proportion. For pairs without a motion, or with a motion that a ball
-    might come too early for, `BentPair` then bends motions around obstacles, from one initial guess
+    which all joints move in proportion. For pairs without a motion, and pairs in which an earlier
+    ball might be blocked, `BentPair` then bends motions around obstacles, from one initial guess
     after another. For pairs that still have no motion, both steps are repeated with the wider
     tolerance `COARSE`.
 
@@ -306,7 +306,7 @@ def _ends(setting: Setting, home: Array, steps: Array) -> tuple[Array, Array]:
 
 
 def _is_free(setting: Setting, home: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """Return which of N motions (table rows) keep the least distance from obstacles, (N,) bool."""
+    """Return which of N motions (table rows) stay a margin away from obstacles, (N,) bool."""
     online = OnlineBlock()
     if not len(rows):
         return np.zeros(0, bool)

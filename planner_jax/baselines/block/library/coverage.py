@@ -24,8 +24,7 @@ from planner_jax.referee.block import BlockVerdict, referee_blocks
 from planner_jax.task.block.case import ANYWHERE, BlockCase
 
 _SPEEDS = (7.0, 10.0)  # [m/s], range of random balls' mean speed from outer to inner box
-# [s], time from the end of the stored motion to a random ball's entry into the outer box around the
-# arm.
+# [s], time from the end of a stored motion to a random ball's entry into the box around the arm.
 _SPARE = 2e-3
 
 

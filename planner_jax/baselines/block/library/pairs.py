@@ -41,8 +41,7 @@ from planner_jax.task.block.motion import angles_at, bump_steps, step_weights
 # direction and shield normal, at the end of a stored motion. COARSE applies if no motion keeps FINE
 # (2 mm, 0.5 degrees), since a shield that blocks some balls is better than no shield.
 FINE, COARSE = STRICT, (0.08, np.deg2rad(20.0))
-# [s], a ball may enter the outer box around the arm at most this time later than if there were no
-# obstacles.
+# [s], longest time by which obstacles may delay a ball's entry into the outer box around the arm.
 _PATIENCE = 0.8
 # [rad], greatest angle of the shield's edge from horizontal, if it must block all possible balls.
 _ROLL = np.deg2rad(1.0)
@@ -127,9 +126,10 @@ class PairPlanner(Planner):
 
         Returns:
             End poses. Their `time` [s] is the duration of the quickest motion with all joints in
-            proportion. Their `effort` [s] is the time at which the ball may enter the outer box if
-            the arm moves so. The effort is `_TOUCHING` greater if the arm touches something in this
-            pose, and infinite if the pose does not exist or does not block as required.
+            proportion. Their `effort` [s] is the time at which the ball may enter the outer box so
+            that this motion blocks it. The effort is `_TOUCHING` greater if the arm touches
+            something in this pose, and infinite if the pose does not exist or does not block as
+            required.
         """
         online, arm, limits = self.online, self.setting.arm, self.setting.limits
         ball, span = nominal_ball(pair.outer, pair.inner)

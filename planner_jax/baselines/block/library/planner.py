@@ -1,4 +1,4 @@
-"""The planner `LibraryBlock`, which looks up a stored motion in a library's table."""
+"""The planner `LibraryBlock`, which looks up the stored arm motion that blocks a given ball."""
 
 import os
 from typing import ClassVar
@@ -55,7 +55,10 @@ class LibraryBlock(Planner):
         return (Attempt(),)
 
     def check(self, cases: BlockCase) -> None:
-        """Raise `ArgumentError` unless arm, limits, scene and start of case 0 fit the library."""
+        """Raise `ArgumentError` unless arm, limits, scene and start of case 0 fit the library.
+
+        Other cases of a batch that do not fit get plans with the status BLOCKED.
+        """
         first = jax.tree.map(lambda leaf: np.asarray(leaf), cases)
         if cases.batch_shape:
             first = jax.tree.map(lambda leaf: leaf[0], first)

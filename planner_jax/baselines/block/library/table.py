@@ -198,7 +198,8 @@ def library_of(
 ) -> Library:
     """Create a library from H start poses `homes` (H, 6) [rad] and the motions that start there.
 
-    `rows` (H, P, W) has the motions for P pairs of cells, as W numbers from `pack_rows`.
+    `rows` (H, P, W) has the motions for P pairs of cells, as W numbers from `pack_rows`. `layout`
+    has the cells, and `setting` the arm, limits and scene for which the motions were planned.
     """
     scene = setting.scene
     table = Table(rows=rows, homes=homes, inner=scene.inner, outer=scene.outer, layout=layout)
