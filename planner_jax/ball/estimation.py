@@ -84,7 +84,7 @@ def ekf_predict(
 
     The covariance P becomes F P F^T + Q. F is the Jacobian of the flight; Q is the covariance that
     a white acceleration causes during `duration`. With `linear_drag_flight` this is [Yu2023catch,
-    eq. 10], except that the paper adds only velocity times duration to the position.
+    eq. 10], except that the paper neglects the acceleration when it predicts the position.
     """
 
     def transition(mean: Array) -> Array:

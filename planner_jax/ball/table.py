@@ -89,7 +89,6 @@ def _check_times(times: ArrayLike) -> np.ndarray:
 
 
 def _check_values(name: str, value: ArrayLike, num: int) -> Numbers:
-    """Check that `value` has vectors (..., num, 3); make it float64 unless it is traced by JAX."""
     if shape_of(name, value)[-2:] != (num, 3):
         raise ArgumentError(name, f"the shape (..., {num}, 3)", np.shape(value), verb="have")
     if isinstance(value, Tracer):

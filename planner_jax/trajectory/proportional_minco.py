@@ -175,7 +175,7 @@ def boundary_rows(head_state: Array, tail_state: Array, piece_duration: Array) -
     """Return boundary rows (2s, 3) of states (s, 3) at a spline's start and end.
 
     Row d of each state, the d-th derivative of the position, is multiplied by h^d, with the mean
-    duration h [s] of a piece. The rows are then independent of the spline's duration.
+    duration h [s] of a piece. The rows are derivatives by time in units of h.
     """
     scale = jnp.stack([piece_duration**k for k in range(head_state.shape[0])])[:, None]
     return jnp.concatenate([head_state * scale, tail_state * scale])
@@ -184,7 +184,7 @@ def boundary_rows(head_state: Array, tail_state: Array, piece_duration: Array) -
 def sample_motion(
     maps: ProportionalMinco, nodes: int, columns: Array, piece_duration: Array, orders: int = 4
 ) -> polynomial.Motion:
-    """Sample position, velocity, acceleration and jerk at `nodes` intervals of each piece.
+    """Sample position to jerk at the ends of `nodes` equal intervals of each piece of a spline.
 
     Args:
         maps: constant maps of M pieces.
@@ -207,8 +207,8 @@ def by_pieces(
     """Apply a function to the motion of each piece, one piece after another to save memory.
 
     The function takes the motion at `nodes` + 1 samples of a piece, and the piece's duration [s].
-    The results of the M pieces are stacked on a leading axis. See `sample_motion` for the other
-    arguments.
+    The results of the M pieces are stacked on a leading axis. `columns` (C, 3) are boundary rows
+    (scaled end states), then waypoint offsets. `piece_duration` () [s] is the mean of the pieces.
     """
     each = np.stack([maps.sample_matrix(nodes, d) for d in range(4)])
     indices = np.arange(maps.num_pieces)[:, None] * nodes + np.arange(nodes + 1)

@@ -37,7 +37,7 @@ def planner(name: str = "online", **options: object) -> Planner[BlockCase, Block
 
 
 def judge(cases: BlockCase, plans: BlockPlan, **settings: object) -> BlockVerdict:
-    """Judge one plan, or a batch of plans, by the arm's kinematics and collisions and the ball.
+    """Judge one plan, or a batch, by collisions of the arm and the shield's contact with the ball.
 
     See `pj.hit.judge` for arguments, result and errors, and `referee_blocks` for the settings.
     """

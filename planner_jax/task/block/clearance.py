@@ -175,7 +175,6 @@ def _pairs(arm: Arm, scene: Scene, poses: _Poses) -> list[_Pairs]:
     thick, plate, shield, half = radius[:, None], (middle, edges), _SHIELD_LINK, _HALF_THICKNESS
     to_pole = thick[turning] + pole
 
-    # Pairs of the base's box with the capsules of links 3 to 6 and with the shield's edges.
     boxed = jnp.concatenate([poses.ends[:, :, swung], outline], axis=2)
     boxed_radius = jnp.concatenate([thick[swung], jnp.full((4, 1), half, thick.dtype)])
     boxed_link = np.append(link[swung], np.full(4, shield))

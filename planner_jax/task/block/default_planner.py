@@ -57,7 +57,7 @@ _GROUP, _WIDTH = 4, 2
 @with_run_time_numbers("straight", "tries", "first", "kept", "in_turn")
 @dataclasses.dataclass(frozen=True)
 class Search(Attempt):
-    """An attempt: check motions straight in joint space, then run least squares from several."""
+    """An attempt: check some straight joint motions, then run least squares from several starts."""
 
     starts: int = 8
     straight: int = 48  # number of straight joint motions to check
@@ -291,12 +291,15 @@ class OnlineBlock(Planner):
     def refine(
         self, case: BlockCase, flight: Flight, start: Array, solver: LevenbergConfig
     ) -> BlockPlan:
-        """Return the plan that least squares find from the unknowns `start`."""
+        """Return the plan that least squares find from a start: joint rates and time of contact."""
         end = levenberg.least_squares(lambda point: self.model(point, case, flight), start, solver)
         return self.finish(case, flight, end.point, end.steps)
 
     def encode_straight(self, case: BlockCase, poses: EndPoses, index: Array) -> Array:
-        """Return the unknowns of the straight motion to one of `poses`, which meet the ball."""
+        """Return the unknowns, joint rates and time of contact, of a straight motion to a pose.
+
+        The pose is the entry `index` of `poses`, in which the shield meets the ball.
+        """
         time = poses.time[index]
         duration = jnp.maximum(time - case.delay, 1e-3)
         turned = poses.angles[index] - coast(case, duration, self.pieces)
@@ -338,7 +341,6 @@ class OnlineBlock(Planner):
         lifts, short = lax.optimization_barrier((slopes * active[:, None], short))
         grams = jnp.einsum("riw,rjw->wij", lifts, lifts, precision=_HIGHEST)
         pushes = jnp.einsum("riw,rw->wi", lifts, short, precision=_HIGHEST)
-        # The derivatives by the time of contact are zero: distances do not depend on it.
         grams, pushes = jnp.pad(grams, ((0, 0), (0, 1), (0, 1))), jnp.pad(pushes, ((0, 0), (0, 1)))
         contact = contact_terms(case, flight, angles[-1], point[-1], self.weights)
         rows, row_slopes, contact_excess = contact
@@ -364,9 +366,9 @@ class OnlineBlock(Planner):
         )
 
     def finish(self, case: BlockCase, flight: Flight, point: Array, steps: Array) -> BlockPlan:
-        """Return the plan of the unknowns `point`, with the limits checked at `checked` samples.
+        """Return the plan of the unknowns `point`, which are joint rates and time of contact.
 
-        `steps` is the number of steps of least squares that led to the unknowns.
+        Limits are checked at `checked` samples. The plan reports `steps` as its iterations.
         """
         moves, first, duration = self.decode(case, point)
         joints = motion.joint_terms(case, moves, first, duration, self.weights, 1.0 - self.slack)

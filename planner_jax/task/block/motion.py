@@ -201,10 +201,12 @@ def append_braking(case: BlockCase, motion: PiecewisePolynomial) -> PiecewisePol
 
 @functools.cache
 def profiles(pieces: int, ends_at_rest: bool) -> np.ndarray:
-    """Return P speed profiles, each of which turns a joint by 1 rad from rest, as steps (P, K).
+    """Return P speed profiles (P, K), each of which turns a joint by 1 rad from standstill.
 
-    The rate rises linearly, is then constant and, if the motion ends at rest, falls linearly. The
-    ramps last 1 to K / 2 pieces, or 1 to K pieces if the motion need not end at rest.
+    A profile has the joint's rates at the ends of K = `pieces` pieces, times the duration [rad].
+
+    The rate rises linearly, is then constant and, with `ends_at_rest`, falls linearly to zero. The
+    ramps last 1 to K / 2 pieces, or 1 to K pieces without `ends_at_rest`.
     """
     knots = np.arange(1, pieces + 1)
     shapes = []

@@ -142,7 +142,6 @@ class ReplanBlock(Planner):
 
 @jax.jit
 def _state(case: BlockCase, plan: BlockPlan, elapsed: Array) -> tuple[Array, Array]:
-    """Return angles (6,) [rad] and rates (6,) [rad/s] at a time [s] since the motion's start."""
     motion = append_braking(case, plan.motion)
     is_over = elapsed >= jnp.sum(motion.durations)
     elapsed = jnp.minimum(elapsed, jnp.sum(motion.durations))

@@ -101,7 +101,6 @@ def is_too_far(context: CatchContext) -> Array:
 
 
 def _greatest_acceleration(target: BallPath | HarmonicPath, horizon: Array) -> Array:
-    """Return an upper bound () [m/s^2] on a target's acceleration up to its horizon () [s]."""
     if isinstance(target, HarmonicPath):
         return jnp.sqrt(jnp.sum(target.amplitude**2)) * target.rate**2
     fastest = jnp.sqrt(jnp.sum(target.ball.vel**2)) + target.gravity * horizon

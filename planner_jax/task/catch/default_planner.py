@@ -158,14 +158,17 @@ class ExactCatch(ChainPlanner[CatchCase, CatchPlan]):
         return order_targets(case)
 
     def guess_ends(self, context: CatchContext, num: int) -> Array:
-        """Return the 12 variables of each of N catches for `num` starting points, (num, N, 12)."""
+        """Return the variables of N catches for `num` starting points, (num, N, 12).
+
+        They are log duration, catch point (2,) in the net, velocity, acceleration and jerk (3,).
+        """
         rows = _GUESSES[:num].copy()
         rows[0, 3] = self.lift
         rows = jnp.asarray(rows, context.times.dtype)
         return jax.vmap(lambda guess: self._guess(context, guess))(rows)
 
     def load_attempt(self, attempt: Round, cases: CatchCase) -> PyTree:
-        """Return an attempt as a pytree, with the number of iterations that the cases need."""
+        """Return an attempt as a pytree; its iterations suit the number of targets and starts."""
         return super().load_attempt(self._for_start(attempt, cases), cases)
 
     def starts_long(self, cases: CatchCase) -> bool:
@@ -226,10 +229,11 @@ class ExactCatch(ChainPlanner[CatchCase, CatchPlan]):
         )
 
     def meet(self, natural: Array, context: CatchContext) -> ChainEnds:
-        """Return the N catches that their 12 variables each describe, as ends of the segments.
+        """Return N catches as ends of the trajectory's segments, from their variables (N, 12).
 
-        The excess (2, N) has two rows: relative excess of the net's angle, and of the catch's time
-        over the latest allowed time.
+        The variables are log duration, catch point (2,) in the net, velocity, acceleration and jerk
+        (3,). The excess (2, N) has two rows: relative excess of the net's angle, and of the catch's
+        time over the latest allowed time.
         """
         case, net = context.case, context.case.net
         durations = jnp.exp(natural[:, 0])
@@ -275,7 +279,8 @@ class ExactCatch(ChainPlanner[CatchCase, CatchPlan]):
         across = jnp.stack(jax.vmap(tangent_basis)(axis), axis=1)  # (N, 2, 3)
         share = jnp.sum(across * miss[:, None], axis=2) / (_RIM * net.radius)
         squared = jnp.sum(share**2, axis=1, keepdims=True)
-        # At the hoop's rim the catch point hardly moves with its two variables: keep it inside.
+        # At the hoop's rim even large changes of its two variables hardly move a catch point, so
+        # that a search could not change it: keep the point inside.
         share *= jnp.minimum(1.0, _ENCODED_RIM / jnp.sqrt(jnp.maximum(squared, 1e-12)))
         place = share / jnp.sqrt(1.0 - jnp.sum(share**2, axis=1, keepdims=True))
         natural = jnp.concatenate(

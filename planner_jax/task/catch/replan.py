@@ -136,7 +136,6 @@ class ReplanCatch(OptimisedPlanner):
         )
 
     def _start(self, task: Replanning, context: CatchContext) -> Array:
-        """Return a starting point: the previous plan's remainder, fitted to the new targets."""
         planner, net = self.planner, task.case.net
         trajectory = task.previous.trajectory
         segments, times = _segments(task)

@@ -110,7 +110,6 @@ def _make_legs(
 
 @jax.jit
 def _clear_unneeded(cases: InterceptCase, plans: InterceptPlan, needed: Array) -> InterceptPlan:
-    """Replace the plans of legs (drives) that are not needed by plans that take no time."""
     num = plans.speed.shape[1]
     zero = jnp.zeros_like(plans.time)
     empty = InterceptPlan(

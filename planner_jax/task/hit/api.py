@@ -70,7 +70,7 @@ def planner(
 
     * `exact`: recommended; every plan satisfies the equations of contact, impact and landing.
     * `bat`: the planner of [Yu2023bat], which optimises impact and trajectory together.
-    * `bat-lite`: `bat` without the state before the impact at which the swing starts.
+    * `bat-lite`: `bat` without its extra state before the impact, at which the swing starts.
     * `juggle`: the baseline of [Yu2023bat]: a motion primitive to a fixed impact, not optimised.
 
     Args:

@@ -184,9 +184,10 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
     def start_network(self, case: HitCase) -> StartNetwork | None:
         """Return the network that predicts a starting point; None if there is no such network.
 
-        One network is for planners with, one for planners without `velocities`; both need default
-        `proportions` and `scale`. There is none for cases with the user's extra terms, such as
-        obstacles: the side on which a search starts decides on which side it ends.
+        There is one network for planners with waypoint velocities as variables, and one for other
+        planners; `proportions` and `scale` must have their defaults. There is none for cases with
+        obstacles or other extra terms: the side of an obstacle on which a search starts decides on
+        which side it ends.
         """
         if not self.learned or not (self.proportions == _PROPORTIONS and not case.extras):
             return None
@@ -230,7 +231,11 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
         return prepare_hit(case, self.num_table_nodes)
 
     def guess_ends(self, context: HitContext, num: int) -> Array:
-        """Return the 8 variables of the impact in the first `num` starting points, (num, 1, 8)."""
+        """Return the variables of the impact in `num` starting points, (num, 1, 8).
+
+        They are the logarithms of the impact time, of the flight time after the impact and of the
+        thrust, two speeds of the racket across its normal, and the jerk (3,).
+        """
         fraction, flight_time, thrust = jnp.asarray(_GUESSES[:num], context.landing_time.dtype).T
         time = fraction * jnp.maximum(context.landing_time, 0.1)
         sizes = (time, flight_time, thrust * context.case.gravity)
@@ -241,7 +246,7 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
         return natural[:, None]
 
     def _set_passing_speed(self, natural: Array, context: HitContext) -> Array:
-        """Set the racket's velocity across its normal in the 8 variables `natural` of an impact.
+        """Set the racket's speeds across its normal in the variables of an impact, (8,).
 
         The velocity is the final velocity of a motion from the start to the impact at constant
         acceleration. Its magnitude is limited to `_PASSING` times the speed limit.
@@ -256,7 +261,7 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
 
     @property
     def held(self) -> np.ndarray | None:
-        """Which variables are velocities at waypoints, (n,) bool; None if no velocities are.
+        """Which of n variables are velocities at waypoints, (n,) bool; None if there are none.
 
         Some stages of a search hold these variables at their starting values.
         """
@@ -266,9 +271,10 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
         return (index >= self._num_places) & (index < 2 * self._num_places)
 
     def meet(self, natural: Array, context: HitContext) -> ChainEnds:
-        """Return the impact that its 8 variables (1, 8) describe, as the end of the trajectory.
+        """Return the impact as the end of the trajectory, from the 8 variables of `guess_ends`.
 
-        The excess (5,) is `apex_excess` (2,) followed by `hitting_speed_excess`.
+        The excess (5,) has two entries for the apex of the returned ball, below and above the
+        limits, and three entries for the racket's speeds along x, y and z.
         """
         impact, limits = self.impact(natural[0], context), context.case.hit_limits
         apex = apex_excess(impact.apex, limits.min_apex, limits.max_apex)

@@ -88,7 +88,6 @@ class ReplanHit(OptimisedPlanner):
         return ReplanHitContext(hit=self.planner.prepare(task.case), start=self._start(task))
 
     def _start(self, task: Replanning) -> Array:
-        """Return the n decision variables for the previous impact, with zero waypoint offsets."""
         planner, stroke = self.planner, task.previous.stroke
         path = task.previous.trajectory
         vel, acc, jerk = (evaluate(path, total_duration(path), order) for order in (1, 2, 3))

@@ -189,7 +189,6 @@ def _aim(distance: np.ndarray, rise: np.ndarray):
     position = np.array([0.0, 0.0, SERVE_HEIGHT])
     slope, time = np.zeros_like(speed), np.zeros((2, *speed.shape))
     for _ in range(_AIM_STEPS):
-        # A second, slightly faster ball yields the derivative by a finite difference.
         pair = np.stack([speed, speed * (1.0 + 1e-5)])
         velocity = np.stack([pair, np.zeros_like(pair), np.broadcast_to(rise, pair.shape)], axis=-1)
         time, point = landing(position, velocity, DRAG, GRAVITY)
@@ -214,7 +213,7 @@ def advance(serves: Serves, delay: float) -> Serves:
 
 
 def uniform_starts(index: np.ndarray, seed: int) -> np.ndarray:
-    """Return random hover positions (N, 3) [m] for the indices (N,) of N serves and a seed."""
+    """Return random hover positions (N, 3) [m] in the half court, by serve indices and seed."""
     starts = np.empty((len(index), 3))
     for block in np.unique(index // _STARTS):
         rows = index // _STARTS == block

@@ -88,7 +88,6 @@ def observe(
 
 @jax.jit
 def _positions_at(paths: PlanePath, times: Array) -> Array:
-    """Return the positions (B, L, 2) [m] of B targets at L times (L,) [s]."""
     return jax.vmap(lambda path: jax.vmap(lambda time: path.at(time).pos)(times))(paths)
 
 

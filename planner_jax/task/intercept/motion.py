@@ -43,7 +43,7 @@ class Motion:
 
 @struct.dataclass
 class Quadratic:
-    """Half the gradient and half the Hessian of a cost, for K pieces with S samples each."""
+    """Half the gradient and Hessian of a cost, by poses at samples and by variables of pieces."""
 
     push: Array  # (K, S, 4), half gradient by x, y, heading and time of every sample
     stiffness: Array  # (K, S, 4, 4), half Hessian by x, y, heading and time of every sample
@@ -99,7 +99,6 @@ def motion(start: Array, time: Array, speed: Array, curvature: Array, samples: i
     whole = angle[:, -1]
     heading = start[2] + (jnp.cumsum(whole) - whole)[:, None] + angle
     direction = jnp.concatenate([jnp.cos(heading), jnp.sin(heading)])
-    # One matrix product computes all integrals that positions and derivatives need.
     sums = jnp.matmul(direction, weights, precision=_HIGHEST).reshape(2, num, 9, samples)
     cos, sin = sums[:, :, 0]
     by_hat = sums[:, :, 1:3]  # (2, K, 2, S), integrals of the direction

@@ -139,8 +139,8 @@ class MotionProblem:
         straight = jnp.round(bins[0] / (2.0 * np.pi)) * 2.0 * np.pi
         after, before = (interpolate(bins, straight, at + half) for half in (0.5, -0.5))
         rate = (after - before) / grid.step
-        # The car starts with its own turn rate instead of the path's, which changes all later
-        # headings. The turn rates at the knots 1 and 2 are changed to compensate for this.
+        # The car starts with its own turn rate instead of the path's turn rate, which would change
+        # all later headings. The turn rates at the knots 1 and 2 compensate for this.
         time = steps * grid.step
         knot = time / self.pieces
         first = case.speed * case.curvature
@@ -239,7 +239,6 @@ class MotionProblem:
             end = least_squares(lambda x: self.build_model(x, *inputs), point, config)
             return (end.point, end.model.violation <= 0.0), end
 
-        # `scan` over the stages, so that one compiled loop serves all stages.
         stacked = jax.tree.map(lambda *each: jnp.stack([jnp.asarray(x) for x in each]), *stages)
         _, ends = lax.scan(run, (guess.point, jnp.asarray(False)), stacked)
         return ends.point, jnp.sum(ends.steps).astype(jnp.int32)

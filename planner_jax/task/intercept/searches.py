@@ -203,7 +203,6 @@ def search_reach(
 def _meeting_cells(
     case: InterceptCase, grid: reach.Grid, found: reach.ReachSet, layer: Array
 ) -> tuple[Array, Array]:
-    """Return the cells around the target at time number `layer`, and which the car can reach."""
     goal = case.target.at((layer.astype(grid.step.dtype) + 0.5) * grid.step).pos
     num = grid.lattice.headings
     width = 2.0 * np.pi / num

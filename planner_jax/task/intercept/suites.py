@@ -115,7 +115,6 @@ def _between(uniform: np.ndarray, low: float | np.ndarray, high: float) -> np.nd
 
 
 def _integer(uniform: np.ndarray, fewest: int, most: int) -> np.ndarray:
-    """Map uniform random numbers of [0, 1) to integers from `fewest` to `most`, inclusive."""
     return np.floor(_between(uniform, fewest, most + 1)).astype(int)
 
 
@@ -287,14 +286,12 @@ def cases_of(draws: Draws, dtype: DTypeLike) -> InterceptCase:
 
 
 def _displace(angle, speed, rate, time) -> np.ndarray:
-    """Return displacements (..., 2) [m] after `time` [s] of targets that turn at a rate [rad/s]."""
     half = 0.5 * rate * time
     direction, chord = angle + half, speed * time * np.sinc(half / np.pi)
     return np.stack([chord * np.cos(direction), chord * np.sin(direction)], axis=-1)
 
 
 def _path(suite: Suite, draws: Draws) -> np.ndarray:
-    """Return positions (B, M, 2) [m] of B targets at M times from 0 to the meeting."""
     times = np.linspace(0.0, draws["time"], round(suite.time / _STEP) + 1, axis=1)
     angle, speed, rate = (draws[name][:, None] for name in ("angle", "speed", "rate"))
     return draws["pos"][:, None] + _displace(angle, speed, rate, times)
@@ -305,7 +302,6 @@ def _is_off_map(suite: Suite, draws: Draws) -> np.ndarray:
 
 
 def _middle(draws: Draws) -> np.ndarray:
-    """Return the middle of the car's body at the start of each of B cases, (B, 2) [m]."""
     return draws["start"] + [BODY_MIDDLE, 0.0]
 
 

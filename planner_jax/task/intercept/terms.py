@@ -181,7 +181,8 @@ def meeting_terms(
 def following_terms(drive: Motion, positions: Array, weights: Weights) -> Array:
     """Compute the penalty on distances of the K pieces' ends from positions (K, 2) [m].
 
-    The result (K, 5, 5) is the matrix `squares` of `meeting_terms` for the end of every piece.
+    The result (K, 5, 5) is the sum of w g g^T over the residuals r with weights w of each end. The
+    vector g holds the derivatives of r by the end's x, y, heading and time, and last r itself.
     """
     x, y = (drive.pos[:, -1] - positions).T
     squares = SumOfSquares(5)
@@ -198,7 +199,9 @@ def obstacle_terms(
     The body is covered by `discs` discs. The fewer discs, the further they extend beyond its sides.
 
     Returns:
-        squares: (K, S, 5, 5), the matrix `squares` of `meeting_terms` for S samples on K pieces.
+        squares: (K, S, 5, 5), for S samples on K pieces the sum of w g g^T over the residuals r
+            with weights w. The vector g holds the derivatives of r by the sample's x, y, heading
+            and time, and last r itself.
         close: (), largest penetration of an obstacle by a disc, or excess of the body's middle
             beyond the map, divided by the body's width.
     """
