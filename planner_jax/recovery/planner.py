@@ -70,7 +70,7 @@ class RecoveryPlanner(ChainPlanner[RecoveryCase, QuadrotorPlan]):
         require_one_of(RECOVERIES, "to", self.to)
 
     def prepare(self, case: RecoveryCase) -> RecoveryContext:
-        """Return the context of a case, which contains only the case."""
+        """Return the data of a case for evaluations of the cost: only the case itself."""
         return RecoveryContext(case)
 
     def guess_ends(self, context: RecoveryContext, num: int) -> Array:
@@ -88,7 +88,7 @@ class RecoveryPlanner(ChainPlanner[RecoveryCase, QuadrotorPlan]):
         return jnp.concatenate([jnp.log(duration), end - pos], axis=1)[:, None]
 
     def meet(self, natural: Array, context: RecoveryContext) -> ChainEnds:
-        """Return duration and final state for variables (1, 4): log duration and displacement."""
+        """Return duration and final state, from log duration and displacement (3,) in `natural`."""
         case, duration = context.case, jnp.exp(natural[:, 0])
         at_rest = case.head_state[:1] + natural[:, 1:] if self.to == "brake" else case.home[None]
         return ChainEnds(

@@ -20,7 +20,7 @@ class PiecewisePolynomial:
 
 @struct.dataclass
 class Motion:
-    """Samples of a trajectory at N times, at which limits are evaluated."""
+    """Height, velocity, acceleration and jerk of a trajectory at N times, to evaluate limits."""
 
     height: Array  # (N,) [m]
     vel: Array  # (N, 3) [m/s]

@@ -77,7 +77,7 @@ class Search(Attempt):
 @with_run_time_numbers("straight")
 @dataclasses.dataclass(frozen=True)
 class StraightSearch(Search):
-    """A search of straight motions alone, without least squares (`tries` is 0)."""
+    """A search that only checks straight joint motions, without least squares (`tries` is 0)."""
 
 
 _LEAST_SQUARES = (
@@ -153,7 +153,7 @@ class OnlineBlock(Planner):
         return self.searches
 
     def load_attempt(self, attempt: Search, cases: BlockCase) -> Search:
-        """Return a search in the form of arguments of a compiled program that all searches share.
+        """Return a search whose numbers are arguments of a compiled program, shared by searches.
 
         For a single case, searches without least squares share a smaller program. It is compiled
         sooner, so that the first plan comes early.
@@ -217,7 +217,7 @@ class OnlineBlock(Planner):
         return dataclasses.replace(plan, status=explain_status(poses, plan.status))
 
     def solve_at_once(self, cases: BlockCase, attempt: Search) -> BlockPlan:
-        """Return the plans of a batch, with the same sequence of computations for every case."""
+        """Return the plans of a batch, by equal sequences of computations, as `jax.vmap` needs."""
         return jax.vmap(lambda case: self._solve_in_step(case, attempt))(cases)
 
     def _solve_in_step(self, case: BlockCase, attempt: Search) -> BlockPlan:
@@ -320,7 +320,7 @@ class OnlineBlock(Planner):
         return steps.at[-1].set(last), case.rates * duration, duration
 
     def model(self, point: Array, case: BlockCase, flight: Flight) -> Model:
-        """Return the cost at the unknowns `point`, a sum of squares, and its quadratic model.
+        """Return the cost, a sum of squares, and its quadratic model by rates and time of contact.
 
         The residuals are the errors of the shield's contact with the ball, excesses over joint
         limits, distances below their margins, and joint accelerations.

@@ -55,8 +55,8 @@ def step_weights(pieces: int, shares: tuple[float, ...]) -> tuple[np.ndarray, np
 def angles_at(start: Array, first: Array, steps: Array, shares: tuple[float, ...]) -> Array:
     """Return the joint angles (N, 6) [rad] of a motion at N times: `shares` of its duration.
 
-    The motion has K pieces and the initial angles `start` (6,) [rad]. `first` (6,) [rad] are the
-    initial rates, and `steps` (K, 6) [rad] the rates after each piece, multiplied by the duration.
+    The motion has K pieces and the initial angles `start` (6,) [rad]. The initial rates are `first`
+    (6,), and the rates after each piece `steps` (K, 6), both multiplied by the duration [rad].
     """
     of_first, of_steps = step_weights(steps.shape[0], shares)
     turned = jnp.matmul(jnp.asarray(of_steps, steps.dtype), steps, precision=lax.Precision.HIGHEST)

@@ -42,7 +42,7 @@ class Warm(Attempt):
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class WarmBlock(Planner):
-    """Planner that refines the motion being executed; it takes results of `ReplanBlock.begin`."""
+    """Planner that refines the motion being executed; its cases come from `ReplanBlock.begin`."""
 
     case_type: ClassVar[type] = Replanning
     is_sequential: ClassVar[bool] = True

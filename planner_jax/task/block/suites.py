@@ -58,7 +58,7 @@ def draw(
 
 
 def _draw_throw(suite: Suite, random: np.random.Generator) -> np.ndarray:
-    """Draw throws until one meets the conditions of `_is_valid`.
+    """Draw throws until one misses the pole and stays in the outer box once it has entered.
 
     The result (2, 3) is the position [m] and the velocity [m/s] of the ball at the launch.
     """
@@ -81,7 +81,7 @@ def _draw_throw(suite: Suite, random: np.random.Generator) -> np.ndarray:
 
 
 def _is_valid(suite: Suite, pos: np.ndarray, vel: np.ndarray, duration: float) -> bool:
-    """Return whether a throw misses the pole, and stays in the outer box after it has entered."""
+    """Return whether a throw misses the pole, and stays in the outer box once it has entered."""
     times = np.linspace(0.0, duration, int(np.ceil(duration / _STEP)) + 1)[:-1]
     path = pos + vel * times[:, None]
     path[:, 2] -= 0.5 * GRAVITY * times**2

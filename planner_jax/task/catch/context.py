@@ -45,7 +45,7 @@ def targets_at(targets: TargetPath, times: Array) -> BallState:
 
 
 def facing_cosine(axis: Array, vel: Array) -> tuple[Array, Array]:
-    """Return the cosine (N,) of the angle between net axis and -`vel`, and which targets move."""
+    """Return cosines (N,) of angles between net axes and -`vel`, and whether `vel` is not zero."""
     speed_squared = jnp.sum(vel**2, axis=1)
     moving = speed_squared > 1e-12
     speed = jnp.sqrt(jnp.where(moving, speed_squared, 1.0))

@@ -243,7 +243,7 @@ class Greedy(CatchDecision):
         return in_several_lengths(case, jax.tree.map(lambda leaf: leaf[None], choice))
 
     def _handicap(self, case: CatchCase, table: Timetable) -> Array:
-        """Return a time [s] for each target, to be added before targets' times are compared."""
+        """Return times (N,) [s] that are added to targets' earliest catches for comparisons."""
         return jnp.zeros_like(case.horizon)
 
 

@@ -172,9 +172,9 @@ class ExactCatch(ChainPlanner[CatchCase, CatchPlan]):
         return super().load_attempt(self._for_start(attempt, cases), cases)
 
     def starts_long(self, cases: CatchCase) -> bool:
-        """Return whether the first round (attempt) has more iterations than usual.
+        """Return whether the first round (attempt) makes more iterations, for many targets.
 
-        It has if more than `_FEW` targets must all be caught.
+        It does so if more than `_FEW` targets must all be caught.
         """
         return self.rounds == _ROUNDS and cases.num_targets > _FEW and not cases.optional
 

@@ -78,7 +78,7 @@ class ReplanCatch(OptimisedPlanner):
 
     @property
     def inner(self) -> ExactCatch:
-        """The planner of the remaining cases, which also plans from scratch."""
+        """The planner of catches that this planner uses, also for plans from scratch."""
         return self.planner
 
     def begin(
@@ -187,7 +187,7 @@ class ReplanCatch(OptimisedPlanner):
 
 
 def _states(coeffs: Array, time: Numbers) -> Array:
-    """Return states (K, 4, 3) of K polynomial pieces, each at its time (K,) [s] since its start."""
+    """Return states (K, 4, 3), position to jerk, of K pieces, each at its time (K,) [s]."""
     factors, powers = polynomial.state_basis(coeffs.shape[1])
     basis = time[:, None, None] ** jnp.asarray(powers, time.dtype)[None]
     basis *= jnp.asarray(factors, time.dtype)[None]

@@ -36,7 +36,7 @@ _PARALLEL = SUITES["hexagon6"].horizon  # [s], latest time of a catch of targets
 
 @dataclasses.dataclass(frozen=True)
 class _Throw:
-    """Ranges from which a thrown ball is drawn."""
+    """Ranges from which landing point and flight time of a ball are drawn; its drag and delay."""
 
     land: tuple[float, float] = (1.0, 0.4)  # [m], half sides of the landing rectangle
     flight: tuple[float, float] = (1.4, 1.78)  # [s], from the launch to the ground

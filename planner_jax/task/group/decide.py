@@ -75,7 +75,7 @@ def _next(
 
 
 def _rank(group: InterceptGroup, table: tuple[Array, Array], order: Array) -> Array:
-    """Return the rank () [s] of an order: time of the last meeting + 10 * sum of all lateness."""
+    """Return the rank () [s] of an order: last meeting's time + 10 * sum of the car's delays."""
 
     def advance(last: _Meeting, target: Array) -> tuple[_Meeting, None]:
         return _select(group.present[target], _next(group, table, last, target), last), None

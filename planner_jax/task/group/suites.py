@@ -53,7 +53,7 @@ def draw(
 def _draw_target(
     suite: str, randoms: list[np.random.Generator], draws: dict[str, np.ndarray]
 ) -> dict[str, np.ndarray]:
-    """Draw one more target for each of B cases until none of the suite's `CAUSES` rejects it."""
+    """Draw one more target for each of B cases until it is on the map and clear of obstacles."""
     spec, pending = SUITES[suite], np.arange(len(randoms))
     turning = np.array([random.random() < 0.5 for random in randoms])
     targets = {name: np.zeros_like(draws[name]) for name in _TARGET}

@@ -48,7 +48,7 @@ _ARGUMENTS = {
 
 @struct.dataclass
 class HitLimits:
-    """Limits on the impact and on the returned ball's flight [Yu2023bat, eqs 18f and 18g]."""
+    """Limits on speed at impact and on the returned ball's apex [Yu2023bat, eqs 18f and 18g]."""
 
     hitting_speed: Array  # (3,) [m/s], greatest speed of the quadrotor at the impact, world axes
     min_apex: Array  # () [m], least height of the apex of the returned ball

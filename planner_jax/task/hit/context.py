@@ -17,7 +17,7 @@ _SLACK = 0.02  # [m], in `is_too_far`, far more than the errors of contacts that
 
 @struct.dataclass
 class HitContext:
-    """One case with quantities that are computed once and used by every evaluation of the cost."""
+    """One case with path and landing time of the ball, for every evaluation of the cost."""
 
     case: HitCase
     path: PathTable  # positions and velocities of the incoming ball at equally spaced times

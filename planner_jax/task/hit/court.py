@@ -41,7 +41,7 @@ SCENARIOS = tuple(
 
 
 def region_bounds(depth: float = HALF_LENGTH) -> np.ndarray:
-    """Return lower and upper bounds of |x| and y for the regions, (4, 2, 2) [m]; |x| <= `depth`."""
+    """Return bounds (4, 2, 2) [m]: four regions, |x| and y, lower and upper; |x| <= `depth`."""
     near, far = (DEAD_ZONE, NEAR_LINE), (NEAR_LINE, depth)
     whole, middle = (DEAD_ZONE, depth), (-LANE_LINE, LANE_LINE)
     left, right = (LANE_LINE, HALF_WIDTH), (-HALF_WIDTH, -LANE_LINE)

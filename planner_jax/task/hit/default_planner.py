@@ -274,7 +274,7 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
         """Return the impact as the end of the trajectory, from the 8 variables of `guess_ends`.
 
         The excess (5,) has two entries for the apex of the returned ball, below and above the
-        limits, and three entries for the racket's speeds along x, y and z.
+        limits, and three entries for the quadrotor's speeds along x, y and z.
         """
         impact, limits = self.impact(natural[0], context), context.case.hit_limits
         apex = apex_excess(impact.apex, limits.min_apex, limits.max_apex)
@@ -290,7 +290,7 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
     def relative_excess(self, excess: Array) -> Array:
         """Return the relative excess (5,) over limits from the result of `meet`.
 
-        For a hitting speed v with the limit v_max, `meet` returns v^2 / v_max^2 - 1, and this
+        For a speed v at the impact with the limit v_max, `meet` returns v^2 / v_max^2 - 1, and this
         method returns v / v_max - 1.
         """
         return jnp.concatenate([excess[:2], Measure.ABOVE.relative(excess[2:])])

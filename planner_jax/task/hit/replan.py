@@ -55,7 +55,7 @@ class ReplanHit(OptimisedPlanner):
 
     @property
     def inner(self) -> ExactHit:
-        """The planner of the remaining cases, which makes the new plans."""
+        """The planner of hits that makes the new plans, from the remainders of cases."""
         return self.planner
 
     def begin(

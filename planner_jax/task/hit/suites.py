@@ -84,10 +84,11 @@ def generate_serves(
 ) -> Serves:
     """Draw random serves with the distribution of the published serves, equally many per scenario.
 
-    Serves come in groups that contain each scenario once, in random order. Serve k of a seed and a
-    list of scenarios is always the same serve. The module's constants, such as `SERVE_HEIGHT`, are
-    the ranges. Landing point p and vertical speed are drawn uniformly. To make the horizontal
-    velocity v uniform, a draw is accepted with a probability proportional to |det (dv / dp)|.
+    A scenario is a set of regions for serve, landing and target. Serves come in groups that contain
+    each scenario once, in random order. Serve k of a seed and a list of scenarios is always the
+    same serve. The ranges are constants of this module, such as `SERVE_HEIGHT`. Landing point p and
+    vertical speed are drawn uniformly. To make the horizontal velocity v uniform, a draw is
+    accepted with a probability proportional to |det (dv / dp)|.
 
     The `scenarios` are names in court.SCENARIOS, by default all. See `pj.hit.draw` for the other
     arguments and the errors.

@@ -109,7 +109,7 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
         cases: InterceptCase,
         plan_of: Callable[[Planner, InterceptCase], InterceptPlan] | None = None,
     ) -> tuple[SmoothIntercept, StartedCase]:
-        """Plan the cases, and return the result of `smooth_near` for these plans.
+        """Plan cases; return a planner and cases by which `pj.gradient` differentiates the plans.
 
         `plan_of(planner, cases)` makes the plans; by default the first search makes them.
         """
@@ -172,7 +172,7 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
         return self._explain(case, attempt, found, plan)
 
     def load_attempt(self, attempt: Search, cases: InterceptCase) -> LoadedSearch:
-        """Return a search as arguments of one compiled program, which all searches share."""
+        """Return a search whose numbers are arguments of a compiled program, shared by searches."""
         if isinstance(attempt, LoadedSearch):
             return attempt
         attempts = self.attempts if attempt in self.attempts else (attempt,)

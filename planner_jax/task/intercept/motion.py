@@ -36,7 +36,7 @@ class Motion:
     # both ends of its piece, the end time of the motion, and the three components of a twist (rigid
     # displacement in the plane) of all earlier pieces.
     slope: Array  # (K, S, 4, 8)
-    # Derivatives of the later pieces' twist by speed and curvature at the piece's end.
+    # Derivatives of the twist (displacement) of later pieces by speed and curvature at this end.
     right: Array  # (K, 2, 3)
     left: Array  # (K, 2, 3), the same derivatives by speed and curvature at the piece's start
 

@@ -61,7 +61,7 @@ def make_plan(
 
 
 def make_straight_plan(case: InterceptCase, pieces: int) -> InterceptPlan:
-    """Make a plan with the status INFEASIBLE in which speed and curvature stay constant."""
+    """Make a plan with the status INFEASIBLE that keeps the case's initial speed and curvature."""
     return InterceptPlan(
         cost=jnp.zeros_like(case.time),
         violation=jnp.full_like(case.time, jnp.inf),

@@ -31,9 +31,9 @@ from planner_jax.task.intercept.searches import Search, Warm, make_field, make_g
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class ReplanIntercept(Planner[Replanning, InterceptPlan]):
-    """Planner of the remainders of interceptions; `SpacetimeIntercept.replanner` makes it.
+    """Planner for `pj.replan` that continues interceptions from the plans that are being driven.
 
-    If less than `shortest` remains until the meeting, the previous plan's remainder is returned.
+    If less than `shortest` [s] remains until the meeting, the remainder of the plan is returned.
     """
 
     case_type: ClassVar[type] = Replanning
@@ -111,7 +111,7 @@ class ReplanIntercept(Planner[Replanning, InterceptPlan]):
         return Replanning(case=remainder, previous=previous, elapsed=elapsed)
 
     def load_attempt(self, attempt: Search | Warm, tasks: Replanning) -> PyTree:
-        """Return an attempt as arguments of the compiled program for attempts of its type."""
+        """Return an attempt whose numbers are arguments of the compiled program of its type."""
         if isinstance(attempt, Search):
             return self.planner.load_attempt(attempt, tasks.case)
         return super().load_attempt(attempt, tasks)

@@ -64,7 +64,7 @@ class Search(Attempt):
 )
 @dataclasses.dataclass(frozen=True)
 class LoadedSearch(Search):
-    """A `Search` converted to arguments of the compiled program that a planner's searches share."""
+    """A `Search` whose numbers are arguments of a compiled program, shared by several searches."""
 
     _: dataclasses.KW_ONLY
     noise: cell_paths.PathNoise  # random numbers that select each path
@@ -76,7 +76,7 @@ class LoadedSearch(Search):
 
 @cached_by_precision
 def load_search(search: Search, searches: tuple[Search, ...], is_apart: bool) -> LoadedSearch:
-    """Return one of a planner's searches in the form of arguments of a compiled program.
+    """Return one of a planner's searches, with its numbers as arguments of a compiled program.
 
     All searches share one program. Its arrays of random numbers, which select the paths, are as
     large as in the search with most paths and most candidates for a path. If `is_apart` is true,

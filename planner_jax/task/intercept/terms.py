@@ -265,7 +265,7 @@ def join_obstacles(walls: Obstacles, movers: Obstacles) -> Obstacles:
 
 
 def ends_of(body: CarBody) -> tuple[Array, Array, Array]:
-    """Return rear and front end of the body ahead of the rear axle, and half its width, () [m]."""
+    """Return positions of the body's ends ahead of the rear axle, and half its width, () [m]."""
     return -body.rear_overhang, body.length - body.rear_overhang, 0.5 * body.width
 
 
