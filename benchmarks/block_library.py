@@ -69,7 +69,7 @@ def time_call(function: Any, *arguments: Any, **how: Any) -> tuple[Any, float]:
 
 
 def build_timed(bench: Bench, path: Path, layout: str, regime: str) -> Library:
-    """Build a library, write it to the file `path`, and report build time and compile time.
+    """Build a library of block motions in the file `path`; report build time and compile time.
 
     `layout` names the division of two boxes around the arm into cells, `regime` the joint limits.
     """

@@ -154,7 +154,10 @@ def measure(bench: Bench, name: str, options: Any) -> dict[str, np.ndarray]:
 
 
 def write_throws(path: Path, results: dict[str, dict[str, np.ndarray]], options: Any) -> None:
-    """Write a CSV file with each throw's position and velocity, and which methods block it."""
+    """Write a CSV file with each throw's position and velocity, and which methods block it.
+
+    A cell of the columns of methods has one digit for each row of the printed table.
+    """
     suites = {ROWS[name][0]: [] for name in results}
     for name in results:
         suites[ROWS[name][0]].append(name)

@@ -201,8 +201,9 @@ def learn(bench: Bench, num: int, tries: int, lanes: int) -> list[dict[str, Any]
     # Otherwise most of them would come from easy throws, which nearly every starting point solves.
     some = [rng.permutation(np.flatnonzero(good & (places == throw)))[:8] for throw in solvable]
     picked = np.concatenate(some)
-    # The initial cluster centres are drawn here and passed to `kmeans2`: its own argument `seed` is
-    # deprecated, and its argument `rng` would draw other numbers than the shipped file used.
+    # Typical deviations are cluster centres of the found deviations. The initial centres are drawn
+    # here: the argument `seed` of `kmeans2` is deprecated, and its argument `rng` would draw other
+    # numbers than the shipped file used.
     first = np.random.RandomState(1).choice(len(picked), min(KINDS, len(picked)), replace=False)
     middles, _ = kmeans2(beside[picked], beside[picked[first]], minit="matrix")
     candidates = np.concatenate([middles, bumps[rng.permutation(picked)[:KINDS]]])

@@ -177,7 +177,7 @@ def report_set(bench: Bench, data: Path, name: str, repeats: int) -> None:
 
 
 def report_peer(bench: Bench, data: Path) -> None:
-    """Print speed and cost of the C++ program `catch_peer` on both sets of throws."""
+    """Print speed and cost of the C++ program `catch_peer` on the easy and the hard throws."""
     with tempfile.TemporaryDirectory(prefix="catch-peer-") as folder:
         program = peer.build(Path(folder))
         if program is None:

@@ -27,7 +27,7 @@ import numpy as np
 import planner_jax as pj
 
 # Every child process imports this module. The function `main` contains the imports that only the
-# main process needs.
+# main process needs, so that child processes start quickly.
 
 
 def _start_process(cores: Sequence[int]) -> ProcessPoolExecutor:

@@ -27,7 +27,7 @@ from planner_jax.task.catch.spec import SUITES
 
 
 def measure(bench: Bench, options: argparse.Namespace) -> None:
-    """Time the environment's steps, and print steps per second and the share of solved plans."""
+    """Time steps of the environment `CatchEnv`; print steps/s and the share of solved plans."""
     env = CatchEnv((options.suite,), (options.iterations,))
     keys = jax.random.split(jax.random.key_data(jax.random.key(options.seed)), options.lanes)
 

@@ -41,7 +41,7 @@ _TIGHT = {"speed": 2.5, "acceleration": 10.0, "body_rate": 3.0}
 
 
 def cases_of(name: str, serves: Serves) -> pj.hit.HitCase:
-    """Convert serves to the cases of the row `name`: its initial positions, delay and limits."""
+    """Convert serves to cases; the row `name` defines initial positions, delay and limits."""
     cases = pj.hit.to_cases(serves, **ROWS[name])
     if name != "tight":
         return cases

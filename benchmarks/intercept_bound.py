@@ -79,7 +79,6 @@ def _limit_steps(scene: Scene) -> np.ndarray:
 
 
 def _draw_polygon(corners: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the cells within `radius` [m] of a polygon: first index (2,), mask of cells (Y, X)."""
     low = np.floor((corners.min(axis=0) - radius) / CELL).astype(int)
     high = np.ceil((corners.max(axis=0) + radius) / CELL).astype(int)
     x, y = (CELL * np.arange(low[k], high[k] + 1) for k in (0, 1))

@@ -50,7 +50,8 @@ PAIRS = (
     ("lattice", "em"),
     ("paper", "em"),
 )
-# Table II of [Qu2022] as printed: "Max Acc." and "Ave. Acc." [m/s^2], and the mean time [ms].
+# Table II of [Qu2022] as printed, for EM and for the paper's own planner ("theirs"): "Max Acc." and
+# "Ave. Acc." [m/s^2], and the mean planning time [ms].
 TABLE_II = {"EM": (0.327, 1.653, 2.883), "theirs": (0.296, 1.559, 2.175)}
 TABLE_III = {
     "path": 150.0,

@@ -305,7 +305,7 @@ def report(
 def report_bound(
     bench: Bench, observed: Observations, truth: InterceptCase, turning: np.ndarray
 ) -> None:
-    """Print the share of first predictions that are within 0.3 m of the target at the case's time.
+    """Print the share of first predictions within 0.3 m of the target at the meeting's time.
 
     Also print this share for the best unbiased predictor, by the Cramer-Rao bound.
     """

@@ -329,7 +329,7 @@ def _report_equal_costs(
     """Print how fast IPOPT reaches the cost of the planner, relative to the planner's own speed.
 
     There is a row for each effort of the planner (how long it searches for a lower cost), each form
-    of IPOPT's problem, and each initial guess.
+    of IPOPT's problem (limits as constraints or penalties), and each initial guess.
     """
     bench.say(
         "",

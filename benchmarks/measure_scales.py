@@ -85,7 +85,7 @@ def measure_scale(
         floor: added to the curvature, so that a variable with almost no effect gets a finite scale.
 
     Returns:
-        (n,) float64.
+        (n,) float64, the scales.
     """
     config = LbfgsConfig(max_steps=30)
     for _ in range(_ROUNDS):

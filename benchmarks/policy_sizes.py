@@ -39,7 +39,10 @@ REWARD = {**WEIGHTS, "solved": 5.0, "last": 10.0, "ratio": -14.0}
 
 
 def train_on_suite(suite: str, options: argparse.Namespace) -> tuple[Policy, float]:
-    """Train a policy on one suite, starting with given weights; return it and the duration [s]."""
+    """Train a policy on one suite, and return it and the duration [s].
+
+    The training starts with the weights in the option --init-from or --policy.
+    """
     training = Training(
         suites=(suite,),
         parts=(Part(options.decisions, (usual_iterations(suite),)),),

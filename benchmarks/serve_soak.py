@@ -212,8 +212,8 @@ class Soak:
             known = self.send(ROBOT, time.monotonic(), tuple(state.ravel()), ball)
             seen = place + self._random.normal(0.0, NOISE, 3)
             answer = self.send(BALL, now, tuple(seen), ball) or known
-            # The robot hovers until the server has answered a packet with its state. After this it
-            # follows the answers.
+            # Until the server first answers a packet with the robot's state, the robot hovers. Then
+            # it follows the setpoints in the answers.
             if answer is None or (state_now is None and known is None):
                 continue
             state_now = answer.setpoints[0, :9].astype(float).reshape(3, 3)
@@ -234,7 +234,7 @@ class Soak:
 
 
 def start_server(options: Any) -> tuple[subprocess.Popen, int, float]:
-    """Start the planning server; return its process, its port and the time [s] of its start."""
+    """Start the planning server; return its process, its port and how long its start took [s]."""
     words = [sys.executable, "-m", "planner_jax", "serve", options.task, "--port", "0", "--report"]
     words += ["--deadline", str(options.deadline), "--rate", str(options.rate)]
     if options.server_core is not None:

@@ -110,8 +110,8 @@ def add_boxes(row: Row, cases: Any, random: np.random.Generator) -> Any:
 def add_planes(row: Row, cases: Any, random: np.random.Generator) -> Any:
     """Add to each case a wall beside a straight line from the start to a point of the plan.
 
-    The plan is the plan without a wall. The wall is parallel to the line, up to 15 cm from it, on a
-    random side.
+    The plan is computed without the wall. The wall is parallel to the line, up to 15 cm from it, on
+    a random side.
     """
     start, place = cases.head_state[:, 0], _point_on_plan(row, cases, random)
     along = place - start

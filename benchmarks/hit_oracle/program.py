@@ -136,10 +136,11 @@ def impact(case: dict, ball: list, impact_time, flight_time, up, norm) -> tuple:
 def path_limits(motion: list, case: dict, allowance) -> tuple[list, Any]:
     """Return the limits at one sample as expressions that must be <= 0, and the body z axis.
 
-    `motion` has position to snap, and `allowance` is 1 + the permitted relative excess. The body
-    rate follows from the Hopf fibration at zero heading: a quotient with the squared thrust as
-    denominator. The limit on it is multiplied by the squared thrust, because with the quotient
-    IPOPT diverges if the thrust is small.
+    The limits are on speed, acceleration, body rate, height and thrust. `motion` has position to
+    snap, and `allowance` is 1 + the permitted relative excess. The body rate follows from the Hopf
+    fibration at zero heading: a quotient with the squared thrust as denominator. The limit on it is
+    multiplied by the squared thrust, because with the quotient IPOPT diverges if the thrust is
+    small.
     """
     pos, vel, acc, jerk = motion[:4]
     gravity = case["gravity"]
@@ -231,7 +232,7 @@ class Program:
         return np.repeat(values, list(self.sizes.values()))
 
     def _build(self, unknown: dict, case: dict, samples: int) -> tuple:
-        """Return cost, expressions that must be 0, and expressions that must be <= 0.
+        """Return the program's cost, and expressions that must be 0 and that must be <= 0.
 
         `unknown` and `case` have the symbols of unknowns and parameters by name, and `samples` is
         the number of samples of a piece.

@@ -32,7 +32,7 @@ COARSE_FLOOR, FINE_FLOOR = -0.01, -0.003  # Lower bounds of the excess before an
 # amount, because halving reduces the excess by at most 0.03.
 REFINED_BELOW = 0.06
 # A solution is refined by halving its pieces only if its excess is lower, by at least this amount,
-# than the excess of every solution whose refinement has failed.
+# than the excess of every solution whose refinement has failed. Others would presumably fail too.
 NEW_BELOW = 0.001
 # A case is abandoned after 4 starting points if the trajectory from each of them exceeds some
 # limit by more than 10 %.
@@ -61,7 +61,8 @@ def worst_ratios(motion: list[np.ndarray], durations: np.ndarray, values: dict) 
     """Return for each of M pieces (M,) the largest ratio of a quantity to its limit.
 
     The quantities are speed, acceleration and body rate. They are evaluated at 41 times of each
-    piece, more densely than in the program.
+    piece, more densely than in the program. `motion` has position to snap at the pieces' starts,
+    `values` the limits by name.
     """
     times = durations[:, None, None] * np.linspace(0.0, 1.0, 41)[:, None]
     _, vel, acc, jerk, _ = advance([part[:, None] for part in motion], times)
