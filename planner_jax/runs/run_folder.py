@@ -192,7 +192,7 @@ class RunRows:
         return shown + others[: max(missing, 0)]
 
     def same_case(self) -> list[tuple[str, Row]]:
-        """Return (planner, row) for each planner's plan of the example case, the run's first."""
+        """Return (planner, row) of each plan for the example case, the run's planner first."""
         own = self.folder.plans.pick([self.manifest["example"]])[0]
         others = self.folder.baselines
         rows = others.read().to_pylist() if others.files() else []
