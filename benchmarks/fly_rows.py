@@ -204,7 +204,10 @@ def exact_rows(args: Any) -> None:
 
 
 def report_contact(flown: Flown) -> None:
-    """Print how far flown contacts are from planned contacts, and the share in 2 cm and 2 ms."""
+    """Print how far flown contacts are from the planned contacts.
+
+    Also print the share of contacts within 2 cm and 2 ms of the plan.
+    """
     places, times = contact_errors(flown)
     met = flown.contact.met[:, 0]
     good = (places <= 0.02) & (times <= 0.002) & met

@@ -32,7 +32,8 @@ COARSE_FLOOR, FINE_FLOOR = -0.01, -0.003  # Lower bounds of the excess before an
 # amount, because halving reduces the excess by at most 0.03.
 REFINED_BELOW = 0.06
 # A solution is refined by halving its pieces only if its excess is lower, by at least this amount,
-# than the excess of every solution whose refinement has failed. Others would presumably fail too.
+# than the excess of every solution whose refinement has failed. The refinement of a worse solution
+# would presumably fail, too.
 NEW_BELOW = 0.001
 # A case is abandoned after 4 starting points if the trajectory from each of them exceeds some
 # limit by more than 10 %.
