@@ -25,7 +25,7 @@ def poly4d(plan: QuadrotorPlan) -> np.ndarray:
 
     Raises:
         ArgumentError: the plan cannot be exported, its degree is above 7, it has more pieces than
-            the memory holds, or its numbers are too large for float32.
+            4,096 bytes hold, or its numbers are too large for float32.
     """
     pieces = pieces_of(plan)
     num, powers, _ = pieces.coeffs.shape

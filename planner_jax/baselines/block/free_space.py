@@ -101,7 +101,6 @@ class FreeSpace:
 
 
 def _sample_pieces(coeffs: np.ndarray, durations: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """Return joint angles (N, 6) at `counts[k]` + 1 equally spaced times of each piece k."""
     piece = np.repeat(np.arange(len(counts)), counts + 1)
     number = np.arange(len(piece)) - np.repeat(np.cumsum(counts + 1) - counts - 1, counts + 1)
     time = (number / counts[piece] * durations[piece])[:, None]

@@ -126,7 +126,7 @@ class PoseByPose(Planner, abc.ABC):
         contact: ArrayLike = 0.0,
         tries: int = 0,
     ) -> BlockPlan:
-        """Return the plan of a motion with the contact time `contact` [s], or of standstill."""
+        """Return the plan of a motion, None for standstill, with the contact time `contact` [s]."""
         dtype = np.asarray(case.angles).dtype
         if motion is None:
             stay = np.zeros((1, self.degree + 1, 6))

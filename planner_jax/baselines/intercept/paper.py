@@ -36,7 +36,7 @@ def paper_speed_step(end_weight: float | None = None) -> SpeedStep:
 
     Args:
         end_weight: weight of the squared distance from the path's end at the meeting time, 300 in
-            the paper for a meeting after 10 s. By default the path's end is reached exactly.
+            [Qu2022] for a meeting after 10 s. By default the path's end is reached exactly.
     """
     speed = dataclasses.replace(SPEED_PLANNERS["trapezoid-edges"], end_weight=end_weight)
     return SpeedStep(speed=speed)

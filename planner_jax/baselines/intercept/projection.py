@@ -148,7 +148,7 @@ def overlap(
         mine = [x * corner[None, :, 0] + y * corner[None, :, 1] for corner in own]
         other = [x * theirs[:, k, :1] + y * theirs[:, k, 1:] for k in range(theirs.shape[1])]
         rate = x * movers.velocity[:, :1] + y * movers.velocity[:, 1:]
-        # Along this axis body and polygon overlap at the times t with -after < rate t < before.
+        # On the axis (x, y), body and polygon overlap at the times t with -after < rate t < before.
         before = _most(mine) - _least(other)
         after = _most(other) - _least(mine)
         is_still = jnp.abs(rate) < 1e-7

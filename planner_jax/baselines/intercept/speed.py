@@ -62,7 +62,7 @@ class SpeedPlanner:
     # With a number they apply to that many samples of each piece, including its end.
     samples: int | None = None
     margin: float = 1e-3  # [m], least distance from polygons
-    # Weight of the curve's squared final distance from the path's end, 300 in the paper for a
+    # Weight of the curve's squared final distance from the path's end, 300 in [Qu2022] for a
     # horizon of 10 s. With None the curve ends exactly there.
     end_weight: float | None = None
     grid: StationTimeGrid = StationTimeGrid()

@@ -136,7 +136,7 @@ def reference_line(
 
 
 def _find_forbidden_edges(problem: StationTimeProblem, grid: StationTimeGrid) -> Array:
-    """Return which edges of the grid are forbidden, as a mask with three axes.
+    """Return which edges of the grid enter a polygon or exceed a speed limit, as a mask.
 
     The axes are the time step of the edge, its rise in station steps, and the station of its end.
     """

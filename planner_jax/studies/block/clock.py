@@ -1,6 +1,6 @@
 """Planning in measured time: a motion whose planning takes too long starts later.
 
-The setting `planning_budget` of a sweep of blocks uses this module.
+The setting `planning_budget` of a sweep, that is a run over many cases, uses this module.
 """
 
 import dataclasses

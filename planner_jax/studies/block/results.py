@@ -1,4 +1,4 @@
-"""Additions to a sweep of blocks that simulates a camera or the planning time.
+"""Additions to a sweep (run over many cases) that simulates a camera or the planning time.
 
 The module wraps the planner, and adds columns, counts and sentences of the report.
 """

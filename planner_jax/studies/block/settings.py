@@ -1,4 +1,4 @@
-"""Settings of sweeps that simulate a camera or the planning time; nothing here imports JAX."""
+"""Settings of runs over many cases that simulate a camera or planning times; without JAX."""
 
 import dataclasses
 import math
@@ -25,7 +25,7 @@ def require_frame_rate(value: float) -> None:
 
 @dataclasses.dataclass(frozen=True)
 class StudySettings(SweepSettings):
-    """Settings of a sweep of blocks that simulates camera observations or the planning time."""
+    """Settings of a sweep (run over many cases) that simulates a camera or the planning time."""
 
     planning_budget: float | None = option(
         None,

@@ -37,8 +37,8 @@ from planner_jax.task.block.plan import BlockPlan, explain_status, make_empty_pl
 from planner_jax.task.block.scene import Box
 
 _HIGHEST = lax.Precision.HIGHEST
-# Weights of the squared changes of six joints by a warp. The wrist joints have low weights, since
-# they carry little mass; the last joint keeps its stored angles.
+# Weights of the squared changes of six joint angles of a stored motion. The wrist joints have low
+# weights, since they carry little mass; the last joint keeps its stored angles.
 _WEIGHTS = np.array([1.0, 1.0, 1.0, 0.3, 0.3, 0.0])
 # [rad^2], penalty weight of the squared distance between the ball and the cells (rectangles on two
 # boxes around the arm) for which a motion was stored, in cell sizes.

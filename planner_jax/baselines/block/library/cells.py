@@ -191,7 +191,7 @@ def tunnels(layout: Layout, inner: Box, outer: Box) -> Tunnels:
 
 
 def _corners(faces: tuple[Face, ...], box: Box) -> tuple[np.ndarray, np.ndarray]:
-    """Return two opposite corners (N, 2, 3) [m] of a box's N cells, and each cell's face (N,)."""
+    """Return two opposite corners (N, 2, 3) [m] of N cells, and the indices (N,) of their faces."""
     lower, upper = np.asarray(box.lower, float), np.asarray(box.upper, float)
     found, of_face = [], []
     for place, face in enumerate(faces):
