@@ -15,7 +15,7 @@ from jax.custom_derivatives import SymbolicZero
 from planner_jax.ball.flight import BallState, fly, gravity_vector
 from planner_jax.core.arithmetic import reciprocal
 
-# Number of Runge-Kutta steps that integrate a flight. After a flight of 2 s the error is 0.2 mm.
+# Number of Runge-Kutta steps that integrate a flight; the position error is 0.2 mm after 2 s.
 _FLIGHT_STEPS = 10
 # Number of Runge-Kutta steps that integrate a flight in the first two Newton steps of `_aim`. With
 # fewer steps, Newton's method diverges for strong drag.

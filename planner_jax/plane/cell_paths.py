@@ -29,7 +29,7 @@ class CellPath:
 
 @struct.dataclass
 class PathNoise:
-    """Gumbel noise that selects D random paths, of which `draw_path` returns the smoothest."""
+    """Gumbel noise that selects D random paths; `draw_path` returns the smoothest of these."""
 
     layers: Array  # (layers + 1,), noise for the choice of the last layer
     ends: Array  # (D, levels, headings, 9), noise for the choice of the last cell

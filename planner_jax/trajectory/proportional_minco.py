@@ -256,7 +256,7 @@ def boundary_energy(maps: ProportionalMinco, rows: Array, piece_duration: Array)
 
 
 def offset_energy(maps: ProportionalMinco, offsets: Array, piece_duration: Array) -> Array:
-    """Return by how much () waypoint offsets (O, 3) raise the integral of |p^(s)|^2.
+    """Return the increase () of the integral of |p^(s)|^2 by waypoint offsets (O, 3).
 
     p(t) is the spline and s = `maps.order`. Without offsets the integral is least.
     """

@@ -2,8 +2,8 @@
 
 The shield may meet a ball anywhere between the outer box and the protected inner box around the
 arm, with the wrist and the elbow on either side. A straight motion turns all joints in proportion
-to one of these end poses. The planner returns the first straight motion that is in time and free of
-collisions. If there is none, Levenberg-Marquardt optimises end pose, time of contact and motion
+to such a pose, the end pose. The planner returns the first straight motion that is in time and free
+of collisions. If there is none, Levenberg-Marquardt optimises end pose, time of contact and motion
 together. It starts from straight motions with an added bump (a detour of the joints), until one
 start leads to a plan that keeps every limit. [Natarajan2024] takes its motions from a library; this
 planner stores only the bumps.

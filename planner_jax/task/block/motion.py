@@ -201,7 +201,7 @@ def append_braking(case: BlockCase, motion: PiecewisePolynomial) -> PiecewisePol
 
 @functools.cache
 def profiles(pieces: int, ends_at_rest: bool) -> np.ndarray:
-    """Return P speed profiles (P, K), each of which turns a joint by 1 rad from standstill.
+    """Return P speed profiles (P, K), which turn a joint by 1 rad from standstill.
 
     A profile has the joint's rates at the ends of K = `pieces` pieces, times the duration [rad].
 

@@ -168,7 +168,7 @@ class ExactCatch(ChainPlanner[CatchCase, CatchPlan]):
         return jax.vmap(lambda guess: self._guess(context, guess))(rows)
 
     def load_attempt(self, attempt: Round, cases: CatchCase) -> PyTree:
-        """Return an attempt as a pytree; its iterations suit the number of targets and starts."""
+        """Return an attempt as a pytree, with iterations that suit the number of targets."""
         return super().load_attempt(self._for_start(attempt, cases), cases)
 
     def starts_long(self, cases: CatchCase) -> bool:

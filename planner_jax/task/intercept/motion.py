@@ -43,7 +43,7 @@ class Motion:
 
 @struct.dataclass
 class Quadratic:
-    """Half the gradient and Hessian of a cost, by poses at samples and by variables of pieces."""
+    """Half the gradient and Hessian of a cost, by samples and by the variables of each piece."""
 
     push: Array  # (K, S, 4), half gradient by x, y, heading and time of every sample
     stiffness: Array  # (K, S, 4, 4), half Hessian by x, y, heading and time of every sample
