@@ -28,7 +28,7 @@ Results = TypeVar("Results")
 Shape = tuple[int, ...]
 Treedef = Any  # a PyTreeDef, whose class JAX hides from type checkers
 # A kernel takes the leaves of a function's arguments, with the lanes (problems) on the last axis.
-# It returns the leaves of the results, or None if it does not support such shapes or types.
+# It returns the leaves of the results, or None if it does not support the leaves' shapes or types.
 Kernel = Callable[[Sequence[Array]], Sequence[Array] | None]
 
 
