@@ -214,9 +214,8 @@ class Scene:
         for trail, path in zip(self.trails, np.moveaxis(self.balls[: at + 1], 1, 0), strict=True):
             trail.set_data_3d(*path.T)
         for k, dot in enumerate(self.dots):
-            place = self.balls[at, k]
-            back = k == 0 and np.isfinite(self.back[at]).all()
-            dot.set_data_3d(*(self.back[at] if back else place)[:, None])
+            is_back = k == 0 and np.isfinite(self.back[at]).all()
+            dot.set_data_3d(*(self.back if is_back else self.balls[:, k])[at, :, None])
         if self.returned is not None:
             self.returned.set_data_3d(*self.back[: (at if back is None else back) + 1].T)
         for part in self.moving:

@@ -17,7 +17,7 @@ from planner_jax.core.registry import Task, all_tasks
 from planner_jax.runs.run_folder import RunFolder
 from planner_jax.sims import loop as sims_loop
 from planner_jax.sims import settings
-from planner_jax.sims.film import film_flights, require_film
+from planner_jax.sims.film import Scene, film_flights, require_film
 from planner_jax.sims.launch import flight_keys, launch_ball, ready
 from planner_jax.sims.loop import begin_compiling, fly_leg
 from planner_jax.sims.loop_state import collect_flights
@@ -72,6 +72,15 @@ def test_a_film_is_written_without_a_display(tmp_path):
     film_flights(path, HitFly().flight(), recording(target=(1.75, 0.0, 0.0)), 1)
     assert path.read_bytes()[:4] == b"GIF8"
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_picture_shows_the_whole_path_of_the_returned_ball():
+    kept = recording(met=0.02, target=(1.75, 0.0, 0.0))
+    kept = dataclasses.replace(kept, balls=np.nan_to_num(kept.balls))
+    scene = Scene(Figure(), HitFly().flight(), kept, 0)
+    for at, back, num in ((4, None, 2), (2, 4, 2), (3, 3, 1)):
+        scene.show(at, back)
+        assert np.isfinite(np.array(scene.returned.get_data_3d())).all(axis=0).sum() == num
 
 
 def test_a_film_that_fails_leaves_nothing_behind(tmp_path, monkeypatch):
