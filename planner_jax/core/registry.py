@@ -138,7 +138,7 @@ def suite_named(name: object, default: str) -> str:
     """Return a suite's name, or the default for None; raise `UnknownName` if it is no text."""
     if name is not None and not isinstance(name, str):
         raise UnknownName("suite", "a name", name)
-    return name or default
+    return default if name is None else name
 
 
 def split_name(
