@@ -128,7 +128,6 @@ def make_page() -> str:
 
 
 def _write_place(file: str, names: set[str]) -> str:
-    """Return the link to a file, followed by the names of its citing functions and classes."""
     listed = ", ".join(f"`{name}`" for name in sorted(names) if name)
     return f"[{file}](../{file})" + (f": {listed}" if listed else "")
 

@@ -59,7 +59,6 @@ def arrays_of(prefix: str, tree: object) -> Row:
 def plan_and_judge(
     name: str, planner: str | None, suite: str | None = None, num: int = NUM, options=None, **draws
 ) -> Row:
-    """Draw `num` cases of a task's suite, and return their plans and verdicts, arrays by name."""
     task = getattr(pj, name)
     cases = task.draw(num, suite, SEED, **draws)
     plans = pj.plan(task.planner(*filter(None, [planner]), **(options or {})), cases)
@@ -67,14 +66,12 @@ def plan_and_judge(
 
 
 def differentiate_hits() -> Row:
-    """Return contact times of hits, and their derivatives by the racket's height, by name."""
     cases = pj.hit.draw(NUM, seed=SEED)
     found = pj.gradient(pj.hit.planner(), cases, of="stroke.time", by="racket_height")
     return arrays_of("gradient", found)
 
 
 def replan(name: str, suite: str | None, changed: str) -> Row:
-    """Return what `pj.replan` at time 0 makes of plans if the field `changed` is passed again."""
     task = getattr(pj, name)
     cases, planner = task.draw(NUM, suite, seed=SEED), task.planner()
     news = {changed: getattr(cases, changed)}
@@ -82,7 +79,6 @@ def replan(name: str, suite: str | None, changed: str) -> Row:
 
 
 def rows() -> Iterator[tuple[str, Callable[[], Row]]]:
-    """Yield the name of every row, and the function that computes it."""
     row = functools.partial
     for name, (default, *others) in PLANNERS.items():
         label = "intercept" if name == "group" else name
@@ -102,7 +98,6 @@ def rows() -> Iterator[tuple[str, Callable[[], Row]]]:
 
 
 def write(folder: Path, names: list[str]) -> None:
-    """Write missing rows (one file each), all or those whose names begin with one of `names`."""
     folder.mkdir(parents=True, exist_ok=True)
     for name, compute in rows():
         path = folder / f"{name}.npz"
@@ -119,7 +114,6 @@ def write(folder: Path, names: list[str]) -> None:
 
 
 def compare(folder: Path, other: Path) -> bool:
-    """Print each row (file of plans) in which two folders differ; return whether all are equal."""
     is_same = True
     for path in sorted(folder.glob("*.npz")):
         if not (other / path.name).exists():

@@ -40,8 +40,6 @@ REGENERATE = "run `python -m tests.layers --write` and commit CONTRIBUTING.md"
 
 @dataclasses.dataclass(frozen=True)
 class Import:
-    """One import statement's module, or one module that a string names, in a source file."""
-
     path: Path
     line: int
     name: str  # dotted, absolute
@@ -61,7 +59,6 @@ class Import:
 
 
 def list_modules() -> list[Path]:
-    """Return the files of all modules and stubs of the library and of the folders OUTSIDE."""
     library = ROOT / "planner_jax"
     inside = [p for p in library.rglob("*.py*") if p.relative_to(library).parts[0] not in OUTSIDE]
     beside = [path for folder in OUTSIDE for path in (ROOT / folder).rglob("*.py*")]
@@ -69,7 +66,6 @@ def list_modules() -> list[Path]:
 
 
 def package_of(path: Path) -> str:
-    """Return the package of `planner_jax`, or its module such as `__main__`, that holds a file."""
     parts = path.relative_to(ROOT).parts
     return parts[0] if parts[0] in OUTSIDE else parts[1].split(".")[0]
 

@@ -6,7 +6,6 @@ from planner_jax.sims.recording import Recording
 
 
 def recording(num=6, met=0.04, target=(np.nan,) * 3):
-    """Return a `Recording` of a quadrotor that rises at 1 m/s and meets a falling ball at `met`."""
     time = 0.01 * np.arange(num)
     pos = np.stack([0.0 * time, 0.0 * time, 1.0 + time], axis=1)
     pos[-1] = np.nan

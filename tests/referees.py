@@ -8,7 +8,6 @@ from numpy.polynomial import Polynomial
 
 
 def tree(leaves, root="", **optional):
-    """Build nested objects from arrays by dotted names, "limits.speed", that start with `root`."""
     inside = {k.removeprefix(root): v for k, v in leaves.items() if k.startswith(root)}
     parts = {k.split(".")[0] for k in inside if "." in k}
     plain = {k: v for k, v in inside.items() if "." not in k}
@@ -17,7 +16,6 @@ def tree(leaves, root="", **optional):
 
 
 def flight(leaves, **optional):
-    """Build one object that has the fields of a quadrotor's case and plan, from arrays by name."""
     case = tree(leaves, extras=(), **optional)
     limits = dict.fromkeys(("acceleration", "min_thrust", "max_thrust", "rotors"))
     case.limits = SimpleNamespace(**limits | vars(case.limits))
@@ -27,7 +25,6 @@ def flight(leaves, **optional):
 
 
 def cut(path, durations, degree=7):
-    """Return coefficients (M, degree + 1, 3) of a path x(t), y(t), z(t) cut into M pieces."""
     coeffs = np.zeros((len(durations), degree + 1, 3))
     for piece, start in enumerate(np.cumsum(durations) - durations):
         for axis, line in enumerate(path):
@@ -75,8 +72,6 @@ def assert_same(left, right):
 
 
 def checks(judge):
-    """Return two functions that assert that `judge` accepts, or rejects, the first plan."""
-
     def assert_good(leaves, **options):
         verdict = judge(leaves, **options)
         assert verdict.success[0], verdict.sentence(0)

@@ -19,12 +19,10 @@ from planner_jax.task.hit.default_planner import ExactHit
 
 
 def quick_hit(**options):
-    """Return the planner of hits with its first round (attempt) alone, so one compiled program."""
     return ExactHit(rounds=ExactHit().rounds[:1], **options)
 
 
 def quick_catch(**options):
-    """Return the planner of catches with one short round (attempt), so one compiled program."""
     rounds = (Round(1, LbfgsConfig(max_steps=20)),)
     return pj.catch.planner(rounds=rounds, **{"decide": "greedy", **options})
 
@@ -45,7 +43,6 @@ def rows_of(out):
 
 
 def stop_after(monkeypatch, sweep, num_chunks):
-    """Make the method `plan` of a class of sweeps raise KeyboardInterrupt after some chunks."""
     calls = iter(range(num_chunks))
 
     def plan(*arguments):
@@ -77,8 +74,6 @@ def write_rows(folder, rows, *, kind="sweep hit", is_finished=True, parameters=(
 
 
 class RunTests:
-    """Tests of the fixture `finished`, a finished sweep; a subclass sets the class attributes."""
-
     sweep: Sweep
     figures: tuple[str, ...]
     other: str  # name of the other planner

@@ -41,7 +41,6 @@ def cases(num=LANES, dtype=np.float32):
 
 @jax.jit
 def sample(columns, durations, given):
-    """Sample segments; return the excess over each limit at each sample, and its penalty."""
     motion = jax.vmap(functools.partial(sample_motion, ALONG.maps, ALONG.nodes))(columns, durations)
     excess = jnp.stack(jax.vmap(lambda segment: motion_excess(segment, *given))(motion), axis=1)
     return excess, smooth_hinge(excess + np.array(ALONG.margins)[None, :, None], ALONG.hinge_width)
@@ -49,8 +48,6 @@ def sample(columns, durations, given):
 
 @jax.jit
 def along_a_line(t, x, direction):
-    """Return the sum of penalties at x + t direction, and its first and second derivative by t."""
-
     def value(t):
         columns, durations, given = jax.tree.map(lambda a, b: a + t * b, x, direction)
         return jnp.sum(integrate_along(ALONG, columns, durations, given)[0])
@@ -135,8 +132,6 @@ def test_worst_has_no_derivative():
 
 
 def reference(mode):
-    """Return the JAX function that the kernel of a mode, such as "slopes", must agree with."""
-
     def value(*x):
         penalties, worst = integrate_along(ALONG, *x)
         return jnp.sum(penalties), (penalties, worst)

@@ -68,7 +68,6 @@ def test_all_derivatives_are_those_of_the_integrated_penalties(name, given):
 
 
 def greedy_catch(suite, num_targets):
-    """Draw one catching case with the greedy order, in arrays with space for `num_targets`."""
     cases = pj.catch.draw(1, suite, 3, num_targets=num_targets)
     return pj.take(first_choice(Greedy(), cases), 0)
 

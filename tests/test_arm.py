@@ -42,8 +42,6 @@ def without_capsules(arm):
 
 @struct.dataclass
 class Everything:
-    """All results of kinematics and dynamics for an arm at N joint positions, leaves (N, ...)."""
-
     frames: tuple
     pose: tuple
     jacobian: jax.Array
@@ -69,7 +67,6 @@ many_at = jax.jit(jax.vmap(everything_at, in_axes=(None, 0, 0, 0)))
 
 
 def everything(arm, angles, velocity=0.0, acceleration=0.0):
-    """Compute `Everything` at up to NUM joint positions, by one program for NUM positions."""
     motion = np.broadcast_arrays(angles, velocity, acceleration)
     rows = (np.resize(each, (NUM, 6)).astype(angles.dtype) for each in motion)
     found = many_at(without_capsules(arm), *rows)
@@ -78,8 +75,6 @@ def everything(arm, angles, velocity=0.0, acceleration=0.0):
 
 @jax.jit
 def move_branches(arm, rotation, middle, velocity, spin):
-    """Return inverse solutions, and their joint rates [rad/s], of N shields that move and turn."""
-
     def move(rotation, middle, velocity, spin):
         solve = lambda rotation, middle: inverse_kinematics(arm, rotation, middle)  # noqa: E731
         turning = jnp.cross(spin, rotation.T).T
@@ -124,7 +119,6 @@ def test_the_jacobian_is_that_of_the_moving_shield(model):
 
 @pytest.fixture(scope="module", params=MODELS.values(), ids=MODELS)
 def simulated(request):
-    """Load an arm in MuJoCo and in this library, and draw angles, rates, accelerations (9, 6)."""
     mujoco = pytest.importorskip("mujoco", reason="the extra `sims` is not installed")
     arm, rng = read_arm(request.param, dtype=np.float64), np.random.default_rng(1)
     motion = some_angles(arm, 9), *rng.normal(scale=(3.0, 20.0), size=(9, 6, 2)).transpose(2, 0, 1)
@@ -169,7 +163,6 @@ def test_the_torques_of_a_motion_are_those_of_mujoco(simulated):
 
 
 def from_the_nearest(at, angles):
-    """Return distances (N,) [rad] of joint angles (N, 6) from the nearest inverse solution."""
     distance = np.max(np.abs(at.branches - angles[:, None]), axis=2)
     return np.min(np.where(at.found, distance, np.inf), axis=1)
 

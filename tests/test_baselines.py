@@ -61,7 +61,6 @@ def serves_gone_wrong():
 
 
 def generic_hits():
-    """Draw 32 impacts: ball, target, racket velocity in y, z [m/s], thrust in x, z [m/s^2]."""
     rng = np.random.default_rng(1)
     ball = BallState(
         pos=rng.uniform([-4.0, -2.0, 0.5], [-1.0, 2.0, 2.5], (32, 3)),

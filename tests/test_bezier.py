@@ -22,7 +22,6 @@ def of_polynomial(polynomial):
 
 @jax.jit
 def values(points, times):
-    """Return the derivatives of order 0 to 3 at M times, (4, M), and their time derivatives."""
     curve = BezierCurve(points=points, horizon=jnp.asarray(HORIZON, points.dtype))
     both = [jax.vmap(jax.value_and_grad(lambda t, k=k: curve.at(t, k)))(times) for k in range(4)]
     return tuple(jnp.stack(each) for each in zip(*both, strict=True))

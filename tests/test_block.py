@@ -227,7 +227,6 @@ def test_plans_of_a_batch_say_what_became_of_each_ball():
 
 
 def test_brisk_motions_end_before_the_ball_is_there():
-    """Check that brisk motions to standstill take the least time, at a limit of the joints."""
     cases = jax.tree.map(np.array, pj.block.draw(8, seed=8))
     cases.ends_at_rest[4] = False
     plans, quick = (pj.plan(dataclasses.replace(STRAIGHT, brisk=b), cases) for b in (False, True))

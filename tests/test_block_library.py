@@ -34,11 +34,6 @@ def setting(regime="R2", **scene):
 
 
 def make_library(layout=TINY, regime="R2", homes=1):
-    """Build a library of block motions without planning.
-
-    Each motion turns all joints by its own small angle, so that tests recognise it. All shields
-    face +x at x = 0.7 m. The last pair of cells has no motion.
-    """
     num = layout.num_pairs
     shape = profiles(PIECES, True)[0]
     turn = 1e-4 * (1.0 + np.arange(homes)[:, None] * num + np.arange(num))
@@ -58,7 +53,6 @@ def tunnels_of(layout):
 
 
 def ball_through(outer, inner, speed=8.0, before=0.6):
-    """Return a ball that passes the points [m] `outer`, at the time `before` [s], and `inner`."""
     outer, inner = np.asarray(outer), np.asarray(inner)
     span = np.linalg.norm(inner - outer) / speed
     vel = (inner - outer) / span + (0.0, 0.0, 0.5 * GRAVITY * span)
@@ -271,7 +265,6 @@ def test_damaged_files_are_rejected_in_one_line(tmp_path, monkeypatch):
 
 @pytest.fixture
 def counted(monkeypatch):
-    """Replace the planning of motions by an invented row for each pair of cells; list the calls."""
     calls = []
 
     def plan_pairs(setting, home, tunnel, pairs, old=None):

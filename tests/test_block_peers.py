@@ -35,10 +35,6 @@ def require_peers(*packages):
 
 @jax.jit
 def quickest(turn, rate, stretch):
-    """Sample (400, 3, 6) a bang-bang motion from rates `rate`, and return the joints' least times.
-
-    The joints turn by the angles `turn` [rad] in `stretch` times the least time of all joints.
-    """
     times = least_times(turn, rate, LIMITS.velocity, LIMITS.acceleration)
     duration = stretch * jnp.max(times)
     motion = bang_bang(jnp.zeros(6), rate, turn, duration, jnp.asarray(LIMITS.acceleration))

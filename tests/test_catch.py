@@ -173,7 +173,6 @@ class Bowl(WellPlanner):
 
 
 def solve(starts, solver, *, settings=(), goals=()):
-    """Run one round of the planner `Bowl`, after stages of the search with other goals."""
     stages = tuple(Stage(SEARCH, (("goal", goal),)) for goal in goals)
     attempt = Round(starts, solver, settings, stages)
     return jax.jit(functools.partial(solve_round, Bowl(), attempt))(np.zeros((), np.float32))

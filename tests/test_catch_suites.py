@@ -48,7 +48,6 @@ def away(pos):
 
 
 def test_a_suite_depends_on_its_name_and_the_seed_alone():
-    """Published results are for cases with these numbers."""
     np.testing.assert_allclose(draw(1, "throws").targets.ball.vel[0, 0, 1], -0.10602945, rtol=1e-5)
     np.testing.assert_allclose(draw(1, "hexagon6").targets.ball.pos[0, 0, 2], 2.3829162, rtol=1e-5)
     heptagon = draw(1, "heptagon7").targets.ball.pos[0, 0]

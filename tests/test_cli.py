@@ -13,7 +13,6 @@ GOOD, GONE = "2.5 -0.3 2,-4.3 0.02 7.3", "2.5 -0.3 2,4.3 0.02 7.3"
 
 
 def trial_file(folder, serve, name="1_1_1_p.csv"):
-    """Write a folder with one file in the format of the published trials, with one serve."""
     folder.mkdir(exist_ok=True)
     row = f"1,{serve},-2.9 -0.3 0,1.75 0 0,failed,failed,failed"
     (folder / name).write_text(f"{HEADER}\n{row}\n")

@@ -355,7 +355,6 @@ def test_workers_of_a_real_cluster_that_hold_shares_of_gpus_make_the_same_rows(
 
 @pytest.mark.slow
 def test_a_bad_case_of_a_worker_of_a_real_cluster_is_one_line_and_leaves_nothing(tmp_path):
-    """Plan so late that serves of a later chunk have landed."""
     pytest.importorskip("ray")
     options = "--num 40 --batch 4 --delay 1.56 --planner juggle --workers ray --out run"
     command = [*SWEEP, *options.split()]

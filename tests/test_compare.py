@@ -16,7 +16,6 @@ OTHER = [0] * 40 + [2] * 9 + [0] * 3 + [1] * 8
 
 
 def write_run(folder, outcomes, *, kind="sweep hit", **settings):
-    """Write the folder of a finished run, whose case k succeeds or fails a limit of `FAILED`."""
     outcomes, num = np.array(outcomes), len(outcomes)
     rows = pa.table(
         {

@@ -30,7 +30,6 @@ LIKE_OTHERS = (
 
 
 def entries(*, only=ENTRIES, on_host=True, slow=()):
-    """Return a decorator that runs a test for planners by name; `slow` ones in slow tests only."""
     rows = [
         pytest.param(entry, id=name, marks=[pytest.mark.slow] if name in slow else [])
         for name, entry in ENTRIES.items()
@@ -120,7 +119,6 @@ def test_every_matrix_product_asks_for_full_precision(entry, monkeypatch):
 
 @pytest.fixture
 def traces(monkeypatch):
-    """Return a function that lists how often JAX traces a planner from now on."""
     found = []
 
     def count(planner):

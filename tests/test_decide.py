@@ -36,19 +36,16 @@ def greedy(case):
 @jax.jit
 @jax.vmap
 def best(case):
-    """Return the six orders, with times, that `Best` estimates to be best, leaves (6, N)."""
     return Best(finalists=6).propose(case)
 
 
 @jax.jit
 @jax.vmap
 def estimate(case, orders):
-    """Return the sum of estimated distances by which targets are missed, for K orders (K, N)."""
     return jax.vmap(lambda order: follow(case, timetable(case), order)[1])(orders)
 
 
 def shortfall(cases, choices):
-    """Return the sum of estimated distances to missed targets for choices, (B,) or (B, K)."""
     shape = choices.order.shape
     orders = choices.order.reshape(shape[0], -1, shape[-1])
     return np.asarray(estimate(cases, orders)).reshape(shape[:-1])
@@ -68,7 +65,6 @@ def hanging(places, horizons):
 
 @pytest.fixture(scope="module")
 def pairs():
-    """Return five pairs of targets: one is farther, due soon, out of reach, too low or rising."""
     places = [(FAR, NEAR), (NEAR, FAR), ((100.0, 0.0, 1.2), NEAR), ((2.0, 0.0, 0.3), NEAR)]
     cases = hanging([*places, (FAR, NEAR)], [(4.0, 4.0), (4.0, 1.15)] + 3 * [(4.0, 4.0)])
     ball = cases.targets.ball
@@ -82,7 +78,6 @@ def triangles():
 
 
 def rank(cases, choices):
-    """Return the time [s] of the last catch, plus 10 s for each metre to missed targets."""
     return np.asarray(choices.times[..., -1]) + 10.0 * shortfall(cases, choices)
 
 
@@ -101,7 +96,6 @@ def test_best_catches_first_what_is_due_first(pairs):
 
 
 def test_times_are_those_of_a_point_that_accelerates_evenly(pairs):
-    """Fly 1 m from standstill at 7 m/s^2, 0.2 s after the start; 64 times in 4 s are tried."""
     found = greedy(pairs)
     arrival = 0.2 + np.sqrt(2.0 * 1.0 / 7.0)
     assert arrival <= found.times[0, 0] <= arrival + 4.0 / 64.0 + 1e-6
@@ -196,7 +190,6 @@ class LongFirst(ExactCatch):
     [(ExactCatch, 2, [(1, 10), (1, 2)]), (LongFirst, 3, [(1, 10), (1, 2), (1, 2)])],
 )
 def test_later_rounds_are_for_cases_without_any_solved_order(kind, num, calls, pairs, monkeypatch):
-    """Plan case 1 again; case 0 is solved in one order, and a target of case 2 is too far away."""
     horizon = np.array(pairs.horizon)
     horizon[1, 1] = 0.7
     pairs = dataclasses.replace(pairs, horizon=horizon)
@@ -247,7 +240,6 @@ def test_fewer_finalists_are_the_first_of_more_and_one_is_needed(triangles):
 
 
 def test_the_time_ratio_is_that_of_the_present_targets(pairs):
-    """Evaluate [Yu2023catch, eq. 29] by hand, without the absent target of the last case."""
     present = np.ones((5, 2), bool)
     present[4, 1] = False
     order = np.array([[0, 1], [1, 0], [0, 1], [1, 0], [0, 1]])
@@ -272,7 +264,6 @@ def test_a_given_order_that_is_no_permutation_is_refused(pairs, order):
 
 
 def test_closest_approach_is_what_the_greatest_speed_leaves(pairs):
-    """Approach a target 100 m away for 4 s at 5 m/s; net and sampling of times add reserves."""
     closest_approach = jax.jit(decisions.closest_approach)
     gap = np.array(closest_approach(pairs))
     left = np.hypot(100.0, 0.2) - 5.0 * 4.0 - (0.2 + 0.125) - 5.0 * 4.0 / 64.0
@@ -295,7 +286,6 @@ def caught(swarm):
 @jax.jit
 @jax.vmap
 def beams(case):
-    """Return the 64 choices that the beam search finds for a case, leaves (64, N)."""
     return beam(case, timetable(case), 64)
 
 

@@ -95,7 +95,6 @@ def without(positions, *rows):
 
 
 def textbook_kalman(mean, covariance, observations, drag, density, std):
-    """Return last mean and covariance of a filter in NumPy for a ball with linear drag."""
     e, K = np.exp(-drag * PERIOD), drag
     ramp = (1.0 - e) / K
     F = np.block([[np.eye(3), np.diag(ramp)], [np.zeros((3, 3)), np.diag(e)]])

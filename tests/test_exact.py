@@ -26,7 +26,6 @@ apex_of = jax.jit(apex_with_drag)
 
 @jax.jit
 def first_guess(case):
-    """Return the planner's prepared data of one case, and the initial guess of its variables."""
     context = PLANNER.prepare(case)
     return context, PLANNER.guesses(context, 1)[0]
 

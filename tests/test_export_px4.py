@@ -87,7 +87,6 @@ def test_a_bag_of_px4_has_a_message_a_setpoint(tmp_path):
 
 
 def assert_are_setpoints(read, fields):
-    """Check that MAVLink messages have the setpoints of a plan, and that no mask ignores fields."""
     assert len(read) == len(fields["timestamp"])
     names = ("x", "y", "z", "vx", "vy", "vz", "afx", "afy", "afz", "yaw", "yaw_rate")
     found = [[getattr(message, name) for name in names] for message in read]

@@ -40,7 +40,6 @@ class Gentle:
 
 
 def having(cases, **changes):
-    """Return cases with five extras, `PLAIN` ones but for changes."""
     given = SimpleNamespace(**PLAIN | changes)
 
     def array(value, *shape):
@@ -64,7 +63,6 @@ def way(plans, k, num=200):
 
 
 def straight(path, vel):
-    """Return a straight trajectory at a velocity (3,) [m/s] with durations as in `path`."""
     coeffs = np.zeros_like(path.coeffs[:1])
     starts = np.cumsum(path.durations[:1], axis=1) - path.durations[:1]
     coeffs[:, :, 0], coeffs[:, :, 1] = starts[..., None] * vel, vel
@@ -72,7 +70,6 @@ def straight(path, vel):
 
 
 def places(plans):
-    """Return positions (NUM, 3) [m] at which plans have covered half the distance to their end."""
     found = []
     for k in range(NUM):
         flown = way(plans, k)
@@ -183,7 +180,6 @@ def test_plans_avoid_obstacles_and_the_referee_rejects_plans_through_them(
 
 
 def fly_straight(hits, free, vel):
-    """Return one case without a floor, and a plan that flies straight at a velocity (3,) [m/s]."""
     one = slice(0, 1)
     limits = dataclasses.replace(hits.limits, min_height=hits.limits.min_height - 9.0)
     head = np.zeros((1, 4, 3), np.float32)

@@ -60,7 +60,6 @@ def least_length(start, meeting):
 
 
 def assert_drivable(path, meeting, polygons=(), start=START):
-    """Assert that a path of allowed arcs leads to the meeting point clear of polygons."""
     assert path.found and not path.blocked
     x, y, heading = path.poses.T
     np.testing.assert_allclose(path.poses[0], start, atol=1e-12)

@@ -109,7 +109,6 @@ def test_a_given_order_is_kept_and_must_be_a_permutation():
 
 @pytest.fixture(scope="module")
 def planned():
-    """Plan groups of two targets, which the last group leaves too little time to meet."""
     groups = draw(6, 4, 2)
     time = np.array([15.0] * 5 + [1.0], np.float32)
     groups = dataclasses.replace(groups, shared=dataclasses.replace(groups.shared, time=time))

@@ -66,7 +66,6 @@ def test_a_round_of_hits_contains_its_kernels(gpu):
 
 @pytest.mark.slow
 def test_a_round_of_catches_contains_its_kernels(gpu):
-    """The kernel of the flight table computes one ball for each case, but a catch has several."""
     held = kernels_in(round_of(ExactCatch()), pj.catch.draw(LANES, "throws"))
     assert held | {"flight_table": 1} == ROUND and "flight_table" not in held
 

@@ -81,7 +81,6 @@ def derivative_row(time, derivative, size):
 
 
 def energy_form(order, durations):
-    """Return the quadratic form of coefficients that is the squared derivative's integral."""
     size = 2 * order
     form = np.zeros((len(durations) * size,) * 2)
     for piece, duration in enumerate(durations):
@@ -93,10 +92,6 @@ def energy_form(order, durations):
 
 
 def dense_solution(head, tail, waypoints, durations):
-    """Return coefficients (M, 2 order, 3) from the Karush-Kuhn-Tucker system of the program.
-
-    The constraints are end states, waypoints, and continuous derivatives below the order.
-    """
     order, pieces = len(head), len(durations)
     size = 2 * order
     rows, values = [], []

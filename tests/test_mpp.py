@@ -80,7 +80,6 @@ def test_the_kept_candidate_is_the_cheapest(throws):
 
 
 def mean_squared_jerk(trajectory):
-    """Return the mean squared jerks (K,) of K trajectories, by quadrature that is exact here."""
     nodes, weights = np.polynomial.legendre.leggauss(5)
     coeffs, durations = (np.asarray(x, float) for x in (trajectory.coeffs, trajectory.durations))
     t = 0.5 * durations[..., None] * (1.0 + nodes)  # (K, 2, 5)

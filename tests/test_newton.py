@@ -31,7 +31,6 @@ def rosenbrock(x, steepness=100.0):
 
 @functools.partial(jax.jit, static_argnames="config")
 def steps_of(matrix, slope, damping, config=WHOLE, kept=None):
-    """Return Newton steps and predicted decrease, preconditioned by the part `kept` of `matrix`."""
     matrix = jnp.asarray(matrix, jnp.float32)
 
     def preconditioner(damping):

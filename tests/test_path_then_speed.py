@@ -51,7 +51,6 @@ def crossing(rng, path, num):
 
 @jax.jit
 def least_distance(path, movers, times, stations):
-    """Return distances [m] (times, stations) of the car from movers, negative in overlaps."""
     place = jnp.linspace(0.0, 1.0, len(path.heading)) * path.length
     x, y, heading = (jnp.interp(stations, place, each) for each in (*path.pos.T, path.heading))
 

@@ -52,7 +52,6 @@ def test_the_smooth_hinge_is_twice_differentiable_never_falls_and_is_never_conca
 
 @float64
 def test_the_steep_hinge_is_as_printed_and_loses_its_slope_at_the_joint():
-    """The hinge is x^3 up to its width eps, and then eps^3 + (x - eps)^2 x / eps^4."""
     x = np.array([-1.0, 0.0, 0.06, 0.1, 0.3])
     printed = [0.0, 0.0, 0.06**3, 1e-3, 1e-3 + 0.2**2 * 0.3 / 1e-4]
     np.testing.assert_allclose(value_slope_bend("steep", x)[0], printed, rtol=1e-12)

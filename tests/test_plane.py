@@ -108,7 +108,6 @@ STEP = 10.0 / 19.5  # [s], from layer to layer
 
 
 def find_layers(target, walls=(), movers=(), velocities=0.0):
-    """Return whether a car can reach a target in each layer of time, bool (layers + 1,)."""
     still = pj.TurningPath(jnp.asarray(target, jnp.float32), jnp.zeros(2), jnp.array(0.0))
     obstacles = {"walls": walls, "movers": movers, "mover_velocities": velocities}
     case = pj.intercept.case(still, 10.0, start=(0.8, 4.0, 0.0), **obstacles)

@@ -101,7 +101,6 @@ def test_without_a_name_the_first_suite_is_drawn(task):
 
 
 def test_a_real_scenario_has_its_two_of_the_court_in_equal_shares():
-    """Scenario S.1 serves from the far region F to N (near) or F, and has its targets in N."""
     cases = jax.tree.map(np.asarray, pj.hit.draw(200, "S.1"))
     assert REAL_SCENARIOS["S.1"] == ("FNN", "FFN")
     _, point = landing(cases.ball.pos, cases.ball.vel, cases.drag, cases.gravity)

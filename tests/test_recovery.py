@@ -255,7 +255,6 @@ def driving(*walls, **settings):
 
 
 def assert_stops(case, whole):
-    """Judge a car's whole drive without a target: its limits, the map, walls and movers."""
     case = dataclasses.replace(case, time=whole.time, tolerance=np.inf, heading_tolerance=np.inf)
     cases, plans = jax.tree.map(lambda leaf: np.asarray(leaf)[None], (case, whole))
     verdict = referee_intercepts(cases, plans)
@@ -302,7 +301,6 @@ def test_movers_move_during_the_recovery():
 
 
 def turning(rates, regime="R1"):
-    """Return the case and plan of an arm that moves at constant rates [rad/s] for 0.1 s."""
     case = pj.block.case((3.0, 0.0, 2.0), (-6.0, 0.0, 2.0), regime=regime)
     case = jax.tree.map(np.asarray, case)
     coeffs = np.stack([case.angles, np.asarray(rates, np.float32)])[None]

@@ -86,7 +86,6 @@ def test_gradient_of_a_quadratic_is_the_closed_form(bowls, options):
 
 
 def test_the_gradient_is_nan_where_the_hessian_is_not_positive(bowls):
-    """Use a negative weight, so that the planner's point is a maximum of the cost."""
     planner = BowlPlanner(weight=-1.0, rounds=(pj.Round(1, pj.LbfgsConfig(max_steps=0)),))
     found = pj.gradient(planner, bowls, of=lambda plan: plan.point[0], by="b")
     assert np.isnan(found.by["b"]).all() and np.isnan(found.residual).all()

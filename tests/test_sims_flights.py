@@ -156,7 +156,6 @@ def test_the_next_ball_is_given_up_only_where_no_limits_admit_both(
 
 
 def in_lab(num_balls):
-    """Return a closed loop with the noise and latency `lab`, which plans again at 100 Hz."""
     world = dataclasses.replace(CATCH_WORLD, num_balls=num_balls)
     return Loop(world, NOISES["lab"], replan=100.0)
 

@@ -158,8 +158,6 @@ class DropPilot:
 
 @dataclasses.dataclass(frozen=True)
 class RisingPilot(DropPilot):
-    """A pilot with two searches: one returns the last plan, the other raises it by a millimetre."""
-
     num: int = 2
 
     def plan_shapes(self, cases):

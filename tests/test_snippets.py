@@ -52,7 +52,6 @@ def command_lines(page: Path) -> list[str]:
 
 
 def without_rounding(printed: str) -> str:
-    """Replace numbers that are rounding errors, such as 1.1e-05."""
     return re.sub(r"\d\.?\d*e-\d\d", "TINY", printed)
 
 

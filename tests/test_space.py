@@ -23,7 +23,6 @@ every_distance = pytest.mark.parametrize("name", DISTANCES)
 
 
 def gap_of(name, bodies):
-    """Return the vector between points of two bodies, first + columns @ x with x in [0, 1]."""
     if name == "segments":
         (a, a_end), (b, b_end) = bodies
         return a - b, [a_end - a, b - b_end]
@@ -63,7 +62,6 @@ def segments(rng, kind):
 
 
 def pairs(name, kind, seed=0):
-    """Draw NUM pairs of bodies (float32), with segments of a kind such as "points" or "along"."""
     rng = np.random.default_rng(seed)
     ends = segments(rng, kind)
     place, middle = rng.uniform(-0.7, 0.7, (NUM, 2)), rng.uniform(-0.3, 0.3, (NUM, 3))

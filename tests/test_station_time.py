@@ -20,7 +20,6 @@ float64 = pytest.mark.usefixtures("float64")
 
 
 def problem(polygons=(), speed_limit=9.0, initial_speed=0.5, acceleration_limit=9.0):
-    """Return a problem of 6 m in 10 s; a polygon is (start, end, lower edge, upper edge)."""
     unused = (20.0, 21.0, (0.0, 0.0), (1.0, 1.0))
     rows = [*polygons, *[unused] * (POLYGONS - len(polygons))]
     start, end, lower, upper = (np.array(each, float) for each in zip(*rows, strict=True))
@@ -35,7 +34,6 @@ def problem(polygons=(), speed_limit=9.0, initial_speed=0.5, acceleration_limit=
 
 
 def draw_problems(num, seed=0):
-    """Draw problems with two parallelograms, a slow middle third and a tight acceleration."""
     rng = np.random.default_rng(seed)
     problems = []
     for _ in range(num):
@@ -66,7 +64,6 @@ def lines():
 
 
 def depth(problems, k, times, station):
-    """Return the depth of stations (M,) at times (M,) inside the polygons of problem k."""
     blocked = jax.tree.map(lambda leaf: leaf[k], problems.blocked)
     deepest = np.full(np.shape(times), -np.inf)
     for p in np.flatnonzero(blocked.present):
@@ -79,7 +76,6 @@ def depth(problems, k, times, station):
 
 
 def best_by_trying(problems, k):
-    """Return the least cost of all sequences of grid stations that are free and keep limits."""
     limits = problems.speed_limit[k]
     times = np.linspace(0.0, 10.0, 10001)
     least = np.inf
@@ -128,7 +124,6 @@ SHARES = np.linspace(0.0, 1.0, 9)
 @jax.jit
 @jax.vmap
 def around(problem, station):
-    """Return corridors of five pieces by kind, and their bounds (5, 9) at `SHARES` of a piece."""
     kinds = {kind: corridor(problem, station, 5, kind) for kind in ("tilted", "edges", "flat")}
     return {kind: (found, found.bounds(SHARES)) for kind, found in kinds.items()}
 

@@ -36,7 +36,6 @@ LIMITS = [field.name for field in dataclasses.fields(CarLimits)]
 
 
 def leaves_of(found, setting):
-    """Return arrays of cases and plans by name, from columns of rows and the manifest's setting."""
     due = found["due_time"]
     leaves = {"time": due, "speed": found["initial_speed"], "curvature": found["initial_curvature"]}
     names = ("start", "tolerance", "end_heading", "heading_tolerance")

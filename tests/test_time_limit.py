@@ -113,7 +113,6 @@ def test_one_case_stops_too(clock):
 
 
 def test_chunks_of_a_round_are_not_begun_after_the_time(clock):
-    """The second round is reported to start at 3 s, and the report takes until 4 s."""
     numbers = np.full(32, 2.0, np.float32)
     found = pj.plan(Rounds(), Task(numbers), chunk=16, time_limit=3.5, progress=clock.progress)
     assert (found.status == pj.Status.OUT_OF_TIME).all()

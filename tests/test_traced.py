@@ -44,7 +44,6 @@ NUMBERS = jnp.ones(3)
 
 
 def call(static=None, numbers=NUMBERS, pair=PAIR, function=scale):
-    """Call the function through a new `Stored`, which holds no program in memory."""
     return traced.Stored(function)("cpu", static, numbers, pair)
 
 

@@ -36,7 +36,6 @@ def run(*arguments: str | Path) -> Ended:
 
 
 def start(*arguments, cwd, module="planner_jax", cache=None, blocks=None, cores=None):
-    """Start `python -m MODULE` on `cores` random cores, with files of at most `blocks` KiB."""
     path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
     environment = {"PYTHONFAULTHANDLER": "1", "PYTHONPATH": path}
     if cache:

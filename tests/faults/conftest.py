@@ -14,7 +14,6 @@ set_hypothesis_home_dir(Path(__file__).resolve().parents[2] / ".cache" / "hypoth
 
 @pytest.fixture(scope="package")
 def runs(tmp_path_factory):
-    """Write the runs of `make_runs`, and let sweeps use quick planners while tests use the runs."""
     place = tmp_path_factory.mktemp("faults")
     with quick_sweeps():
         make_runs(place)

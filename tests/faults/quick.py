@@ -12,7 +12,6 @@ from planner_jax.host import signals
 
 @contextlib.contextmanager
 def quick_sweeps(is_reported: bool = False) -> Iterator[None]:
-    """Let sweeps use quick planners, without figures and a second planner unless `is_reported`."""
     import pytest
 
     from planner_jax.sweep.catch.sweep import CatchSweep
@@ -30,7 +29,6 @@ def quick_sweeps(is_reported: bool = False) -> Iterator[None]:
 
 
 def run() -> None:
-    """Run the command that the process's arguments state, with quick planners."""
     signals.listen()  # as the command itself does, before anything large is imported
     from planner_jax.cli import main as cli
 

@@ -38,7 +38,6 @@ IDENTICAL, REFUSED, MENDED = "identical", "refused", "mended"
 
 
 def make_runs(place: Path) -> None:
-    """Write run folders: two finished sweeps, an interrupted sweep, flights, a training, plans."""
     start_sweep(TASK, SETTINGS, place / "whole", progress=False)
     other = dataclasses.replace(SETTINGS, seed=4)
     start_sweep(TASK, other, place / "other", progress=False)
@@ -53,7 +52,6 @@ def make_runs(place: Path) -> None:
 
 
 def make_flights(out: Path) -> None:
-    """Write a run folder of simulated flights with invented content."""
     manifest = {"kind": "fly catch", "state": "complete", "seed": 0, "device": {}, "loop": {}}
     manifest |= {"parameters": dataclasses.asdict(CatchFly())}
     manifest |= {"times": {"compile_seconds": 0.0, "wall_seconds": 1.0}}
@@ -67,7 +65,6 @@ def make_flights(out: Path) -> None:
 
 
 def make_training(out: Path) -> None:
-    """Write a folder of a policy's training with invented rows of its learning curve."""
     out.mkdir()
     (out / "training.json").write_text(json.dumps(to_write({"suites": ["throws"], "seed": 0})))
     names = ("per_second", "reward", "solved", "last", "ratio", "violation")
@@ -76,11 +73,6 @@ def make_training(out: Path) -> None:
 
 
 def verdict(place: Path, target: str, name: str, random: Any, scratch: Path) -> str:
-    """Damage one file in a copy of a run folder, and return what a reader of the folder does.
-
-    `target` is "RUN:READER" and `name` a pattern of files in the folder. The outcome is IDENTICAL,
-    REFUSED or MENDED; any other behaviour raises `AssertionError`.
-    """
     which, _, reader = target.partition(":")
     shutil.copytree(place / which, scratch)
     path = random.choice(sorted(scratch.glob(name)))

@@ -73,7 +73,6 @@ def turning(num):
 
 @pytest.fixture(scope="module")
 def given(tmp_path_factory):
-    """Provide the names that the calls use, and a folder with files of every kind."""
     folder = tmp_path_factory.mktemp("calls")
     os.mkfifo(folder / "pipe")
     (folder / "empty").touch()
@@ -111,7 +110,6 @@ def given(tmp_path_factory):
 
 
 def refuse(given, call):
-    """Return the one-line error of a call, raised by the library's own argument checks."""
     folder, names = given
     before = os.getcwd()
     os.chdir(folder)

@@ -24,7 +24,6 @@ def files(tmp_path_factory):
 
 
 def refuse(arguments):
-    """Return the error line of a rejected command, which must print no more and write no file."""
     before = {name: os.lstat(name).st_mtime_ns for name in os.listdir()}
     ended = run(*arguments)
     assert is_one_line(ended) and ended.code == 2, ended

@@ -38,7 +38,6 @@ NUMBERS = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
 
 
 def stop_script(script, *numbers, ignored=()):
-    """Send signals to a script when it is ready; return its exit code and output."""
     # Set every handler, because the script would inherit from `nohup` that SIGHUP is ignored.
     heard = {number: "SIG_IGN" if number in ignored else "SIG_DFL" for number in NUMBERS}
     before = "".join(

@@ -27,7 +27,6 @@ class Killed(BaseException):
 
 
 def failing(monkeypatch, number, error):
-    """Let the write number `number` fail before its file is renamed; return a counter of writes."""
     real, count = os.replace, [0]
 
     def replace(*names):

@@ -43,10 +43,6 @@ class Trial(NamedTuple):
 
 
 def kill(name: str, moment: random.Random, num: int, place: Path, base: Path) -> Survived:
-    """Kill a sweep, and the commands that resume it, at `num` random moments.
-
-    Every run that is finished must have the rows of the undisturbed run `base / name`.
-    """
     task, whole, out = SWEEPS[name], rows_of(base / name), place / "run"
     began, tried, took = time.monotonic(), 0, 0.0
     while tried < num or out.exists():
@@ -69,7 +65,6 @@ def kill(name: str, moment: random.Random, num: int, place: Path, base: Path) ->
 
 
 def start_twins(moment: random.Random, num: int, place: Path, base: Path) -> Survived:
-    """Start two sweeps on one folder: one must be refused, and the other have correct rows."""
     for number in range(num):
         out = place / str(number)
         pair = [sweep(*SWEEPS["hit"], "--out", out, cwd=place)]
@@ -84,7 +79,6 @@ def start_twins(moment: random.Random, num: int, place: Path, base: Path) -> Sur
 
 
 def kill_workers(moment: random.Random, num: int, place: Path, base: Path) -> Survived:
-    """Kill a Ray worker at a random moment between the first worker and the last chunk."""
     if find_spec("ray") is None:
         yield False, "ray is not installed"
         return
@@ -114,7 +108,6 @@ def kill_workers(moment: random.Random, num: int, place: Path, base: Path) -> Su
 
 
 def damage_files(what: str, moment: random.Random, num: int, place: Path, base: Path) -> Survived:
-    """Damage files of the kind `what` (a key of TARGETS), and yield the readers' outcomes."""
     from tests.faults.runs import TARGETS, verdict  # needs the simulators
 
     with quick_sweeps():
@@ -127,10 +120,6 @@ def damage_files(what: str, moment: random.Random, num: int, place: Path, base: 
 
 
 def interrupt(moment: random.Random, num: int, place: Path, base: Path) -> Survived:
-    """Send SIGINT, SIGTERM or SIGHUP to sweeps at random moments, in a third of trials thrice.
-
-    Every second sweep compiles its program. Sweeps that end before the signal are not counted.
-    """
     tried = 0
     while tried < num:
         out = place / "run"
@@ -160,7 +149,6 @@ def interrupt(moment: random.Random, num: int, place: Path, base: Path) -> Survi
 
 
 def fill_disk(limits: random.Random, num: int, place: Path, base: Path) -> Survived:
-    """Run sweeps whose files may not exceed a random size, and resume them without this limit."""
     whole = base / "hit"
     largest = max(path.stat().st_size for path in (whole / "plans").iterdir())
     for number in range(num):
@@ -205,7 +193,6 @@ TRIALS = [
 
 
 def make_whole(name: str, base: Path) -> None:
-    """Write the undisturbed run `name` (all small runs for ""), with which trials compare runs."""
     if not name:
         from tests.faults.runs import make_runs  # needs the simulators
 
@@ -217,7 +204,6 @@ def make_whole(name: str, base: Path) -> None:
 
 
 def try_some(place: int, part: int, num: int, base: Path) -> list[Outcome]:
-    """Inject `num` faults of the kind `TRIALS[place]`; `part` seeds their random choices."""
     with tempfile.TemporaryDirectory(prefix="faults-") as folder:
         moment = random.Random(f"{TRIALS[place].name} {part}")
         return list(TRIALS[place].run(moment, num, Path(folder), base))
