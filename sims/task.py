@@ -172,10 +172,10 @@ class BallFlightTask(FlightTask):
 
     @abc.abstractmethod
     def launches(self, cases: Any, flown: Flown) -> Launches:
-        """Return the states of the balls of some flights before and after their simulation."""
+        """Return each ball's state at its start in the simulation, and just after its impact."""
 
     def every_column(self) -> Sequence[Column]:
-        """Return the columns of the contacts with balls, and the task's own columns."""
+        """Return columns of the table of flights: ball contacts, then the task's own columns."""
         return [*_CONTACTS, *self.COLUMNS]
 
     @property
@@ -199,13 +199,13 @@ class BallFlightTask(FlightTask):
         return dataclasses.asdict(self.loop(record=False))
 
     def loop(self, record: bool) -> Loop:
-        """Return the closed loop's settings; `record` is whether it stores states and errors."""
+        """Return the closed loop's settings; with `record` it stores states of robot and balls."""
         settings = self.settings
         sensing = NOISES[settings.noise]
         return Loop(self.world(), sensing, replan=settings.rate, record=record)
 
     def recording(self, cases: Any, flights: Any, lanes: Sequence[int] | np.ndarray) -> Recording:
-        """Return a recording of the flights whose indices in the batch are `lanes`."""
+        """Return a recording for pictures of the flights whose indices in the batch are `lanes`."""
         pick = lambda leaf: np.asarray(leaf)[lanes]  # noqa: E731
         flown = dataclasses.replace(
             flights.flown,

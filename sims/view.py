@@ -35,7 +35,7 @@ def _rgb(colour: str) -> tuple[int, int, int]:
 
 
 def segments(path: np.ndarray) -> np.ndarray:
-    """Return segments (K, 2, 3) between consecutive points of a path (P, 3), without NaN."""
+    """Return finite segments (K, 2, 3) of a path (P, 3); segments with NaN are left out."""
     pairs = np.stack([path[:-1], path[1:]], axis=1)
     return pairs[np.isfinite(pairs).all(axis=(1, 2))]
 

@@ -51,9 +51,9 @@ def float64():
 
 @pytest.fixture(scope="module", autouse=True)
 def strict_arrays(request):
-    """Make JAX raise, in default runs, where it would add axes or convert types implicitly.
+    """Make JAX raise where it would add axes or convert types, unless slow tests run, too.
 
-    Conversions are permitted in the modules of `MIXED`, and in tests of simulations.
+    Types may be converted in modules of `MIXED` and in simulations, whose dependencies do so.
     """
     stem = request.path.stem.removeprefix("test_")
     options = {"jax_numpy_rank_promotion": "raise"}
@@ -71,7 +71,7 @@ def strict_arrays(request):
 
 @pytest.fixture(scope="module")
 def finished(request, tmp_path_factory):
-    """Run a sweep of the test module's TASK and SETTINGS; return its run folder and manifest."""
+    """Plan and judge the problems of the module's SETTINGS; return run folder and manifest."""
     from planner_jax.sweep.run import start_sweep
 
     out = tmp_path_factory.mktemp("runs") / "finished"

@@ -35,12 +35,10 @@ def dubins(start: Array, goal: Array, curvature: Array) -> DubinsPath:
     a, b = start[2] - along, goal[2] - along
     sin_a, cos_a, sin_b, cos_b = jnp.sin(a), jnp.cos(a), jnp.sin(b), jnp.cos(b)
 
-    # A word (sequence of arcs) and its mirror image differ by the sign `side` of the headings'
-    # sines. (x, y) is the vector between the centres of the first and the last circle.
     def same_sense(side: float) -> tuple[Array, Array]:
         x, y = far + side * (sin_a - sin_b), cos_b - cos_a
         straight, heading = _root(x**2 + y**2), jnp.arctan2(y, x)
-        # A straight line of length zero has no heading; both arcs are then one arc (`first`).
+        # A straight line of length zero has no heading, so `first` then contains both arcs.
         is_arc = straight < 8.0 * jnp.finfo(straight.dtype).eps
         first = jnp.where(is_arc, side * (b - a), heading - side * a)
         last = jnp.where(is_arc, 0.0, side * b - heading)

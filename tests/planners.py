@@ -51,7 +51,7 @@ def places(num):
 
 @struct.dataclass
 class LibraryPlanner(pj.Planner):
-    """A planner that selects the nearest of 8 stored points, in its second attempt of 64."""
+    """A planner that selects the stored point nearest to the goal, of 8 points and then of 64."""
 
     points: Array  # (K, 2), stored points
     attempts: ClassVar[tuple[Attempt, ...]] = (Attempt(1), Attempt(2))

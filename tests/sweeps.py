@@ -1,4 +1,4 @@
-"""Quick planners, readers of run folders, and tests that the sweeps of several tasks share."""
+"""Planners that compile quickly, readers of run folders, and tests of runs of several tasks."""
 
 import io
 import json

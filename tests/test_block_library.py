@@ -174,8 +174,7 @@ def test_one_ball_gets_the_answer_of_a_batch():
 
 def test_statuses_name_the_reason_of_a_failure():
     library = make_library()
-    # The first ball passes a pair of cells that has a motion. No motion fits the other balls, for
-    # the reasons in the comments.
+    # A stored motion blocks the first ball. The comments state why each other ball is missed.
     good = ball_through((1.0, 0.05, 1.2), (0.4, 0.05, 0.8))
     shots = [
         good,

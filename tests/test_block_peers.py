@@ -24,7 +24,7 @@ from planner_jax.task.block.spec import TASK
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
 
 LIMITS = REGIMES["R2"].limits
-# Planner options for throws in a scene without a pole, in which the first path is collision-free.
+# Planner options for scenes without a pole: 6 control points, and up to 20 s of search a throw.
 QUICK = {"points": 6, "budget": 20.0, "longest": 20.0}
 
 

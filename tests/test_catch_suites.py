@@ -11,15 +11,15 @@ from tests.trees import assert_same
 NUM = 64
 THROWS = ("throws", "hard", "parabola1", "parabola2")
 PARALLEL = ("square4", "pentagon5", "hexagon6", "heptagon7")
-# Suite -> for each target: half sides of the landing rectangle [m], range of flight times [s], and
-# time [s] from the launch to the start of planning.
+# Name of a suite -> for each target: half sides [m] of the rectangle where it lands, range of its
+# flight time [s], and time [s] from its launch to the start of planning.
 RANGES = {
     "throws": [((1.0, 0.4), (1.4, 1.78), 0.3)],
     "hard": [((2.0, 1.5), (1.4, 1.78), 0.5)],
     "parabola1": [((1.0, 0.4), (1.4, 2.0), 0.3)],
     "parabola2": [((1.0, 0.4), (1.4, 1.6), 0.3), ((1.0, 0.4), (1.7, 2.0), 0.0)],
 }
-# Suite -> greatest horizontal distance of targets from the origin [m], and range of heights [m].
+# Name of a suite -> greatest horizontal distance [m] of targets from the origin, height range [m].
 VOLUMES = {
     "harmonic2": (9.0, (1.0, 3.5)),
     "triangle3": (7.3, (1.5, 2.5)),

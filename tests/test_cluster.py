@@ -1,4 +1,4 @@
-"""Tests of sweeps with a Ray cluster. Only tests of a "real cluster" start one."""
+"""Tests of runs on a Ray cluster. Only tests of a "real cluster" start one, others pretend."""
 
 import dataclasses
 import os

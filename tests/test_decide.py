@@ -56,7 +56,7 @@ def by(decision, planner=PLANNER):
 
 
 def hanging(places, horizons):
-    """Return cases whose targets rest at positions (B, N, 3) [m] for the times (B, N) [s]."""
+    """Return cases whose targets rest at positions (B, N, 3) [m], and are due by (B, N) [s]."""
     pos = jnp.asarray(places, jnp.float32)
     ball = BallState(pos, jnp.zeros_like(pos))
     targets = BallPath(ball, jnp.zeros_like(pos), jnp.zeros(pos.shape[:2]))
@@ -179,7 +179,7 @@ def test_one_case_alone_is_decided_on_and_planned_as_in_its_batch(decide, pairs)
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class LongFirst(ExactCatch):
-    """A planner that makes its first attempt for every order, and later attempts for few orders."""
+    """A planner whose first search tries every order of catches, and later searches only few."""
 
     def starts_long(self, case):
         return True

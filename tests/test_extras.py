@@ -23,7 +23,7 @@ CATCH = pj.catch.planner("exact", decide="given")
 HIT = FREE.with_settings((("rounds", FREE.rounds[1:2]),))  # One attempt needs one program.
 NUM, AT, FAR = 4, np.zeros(3), np.full((4, 3), 50.0)
 TRACES = []
-# Five extras without effect. All tests use five, so that they share one compiled program.
+# Five added limits and costs without effect. All tests add five, to share a compiled program.
 PLAIN: dict[str, Any] = {"centre": FAR, "radius": 1.0, "disliked": FAR, "weight": 0.0}
 PLAIN |= {"acceleration": 99.0, "low": FAR, "size": 1.0, "point": -FAR, "normal": (0.0, 0.0, 1.0)}
 

@@ -56,7 +56,7 @@ def test_compiled_programs_hold_their_kernels(devices, serves):
     attempt = Round(1, LbfgsConfig(max_steps=2))
     hits = jax.jit(lambda cases: solve_batch(ExactHit(), attempt, cases))
     program = hits.lower(jax.device_put(serves, devices[0])).compile().as_text()
-    # One kernel each for the ball's table and the L-BFGS direction, and three for penalties.
+    # One GPU kernel predicts the ball, one computes L-BFGS directions, three integrate penalties.
     assert program.count('custom_call_target="__gpu$xla.gpu.triton"') >= 5
 
 

@@ -22,7 +22,7 @@ def box(left, low, right, high):
     return [(left, low), (right, low), (right, high), (left, high)]
 
 
-# A dead end that opens towards the start.
+# Three walls that form a dead end, which is open towards the car's start.
 TRAP = [box(4.0, 2.5, 4.2, 5.5), box(2.6, 2.5, 4.0, 2.7), box(2.6, 5.3, 4.0, 5.5)]
 
 

@@ -11,7 +11,6 @@ from planner_jax.task.hit.suites import generate_serves, to_cases
 
 PLANNER = ExactHit()
 
-# Changes of one number of a case, for each leaf with a derivative.
 MOVES = {
     "drag": lambda s, d: s.replace(drag=s.drag + d),
     "racket_height": lambda s, d: s.replace(racket_height=s.racket_height + d),

@@ -20,8 +20,8 @@ from planner_jax.task.catch.default_planner import ExactCatch
 from planner_jax.task.hit.default_planner import ExactHit
 
 LANES = 128
-# Number of kernels in one round of the search: one predicts the ball's path, three integrate
-# penalties, one computes L-BFGS directions, one finds the finished plan's greatest excesses.
+# Number of GPU kernels in one search: one predicts the ball's path, three integrate penalties,
+# one computes L-BFGS directions, one finds the plan's greatest violations of limits.
 ROUND = {"flight_table": 1, "integrate_along": 3, "lbfgs_turn": 1, "greatest_along": 1}
 # Number of kernels in a gradient: the ball's path and its derivative, first and second derivatives
 # of the penalties, and one inverse of the preconditioner.

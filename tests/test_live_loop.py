@@ -63,7 +63,7 @@ class Throw:
         self.disturb, self.home = disturb, home
         planner._forget()
         self.answers, self.sequence = [], 0
-        # Answers come at once, and the clock of the sender advances by STEP a packet.
+        # Answers arrive immediately, and the sender's clock advances by STEP [s] with every packet.
         self.now = time.perf_counter()
         planner._arrivals.__init__()
 

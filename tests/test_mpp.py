@@ -101,7 +101,6 @@ def test_targets_are_caught_one_after_the_other_but_for_those_absent_or_in_wrong
     np.testing.assert_array_equal(plans.times[:, 2], plans.times[:, 1])
     assert not plans.trajectory.durations[:, 4:].any()
     assert verdict.success[is_solved(plans.status)].all()
-    # Times that do not rise leave a case unsolved.
     assert set(np.asarray(plans.status)[:2]) == {Status.INFEASIBLE}
     assert (plans.violation[:2] > 0.0).all()
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(plans))

@@ -143,7 +143,7 @@ def test_a_batch_equals_its_lanes_and_stragglers_continue():
     last = solve((0.25, 20, 50))
     np.testing.assert_allclose(last.evaluation.cost, 1.0, atol=1e-3)
     assert last.stationary.all() and (last.iterations <= 3 + 20 * 50).all()
-    # A lane that starts at its optimum does not continue.
+    # The problem with index 3 starts at its optimum, so it gets no further iterations.
     assert last.iterations[3] == lanes.iterations[3]
 
 

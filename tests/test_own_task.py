@@ -91,7 +91,7 @@ def test_the_rows_are_the_leaves_of_case_plan_and_verdict(swept, meet):
     cases, columns = meet.draw(24), {"case.most": "most", "case.target_pos": "target_pos"}
     for name, leaf in columns.items():
         np.testing.assert_array_equal(rows[name].to_pylist(), getattr(cases, leaf).tolist())
-    # Chunks of the sweep's size use the program that the sweep has compiled.
+    # The command `sweep` compiled a program for 16 cases at once, which is used again here.
     plans = pj.plan(meet.planner(), jax.tree.map(np.asarray, cases), chunk=16)
     np.testing.assert_allclose(rows["plan.time"].to_numpy(), plans.time, rtol=1e-4)
     assert max(rows["verdict.miss"].to_pylist()) < 1e-3

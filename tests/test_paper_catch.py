@@ -98,7 +98,7 @@ def test_objective_gradient_agrees_with_finite_differences():
 
     shift = 0.3 * np.random.default_rng(0).normal(size=len(PLANNER.scale))
     assert_gradient_matches_differences(cost, shift, step=1e-6, rtol=1e-6)
-    # The guess has a miss of zero, where the net's distance is not differentiable.
+    # The first guess meets the ball exactly, where the distance from the net has no derivative.
     assert np.isfinite(value_and_gradient(cost)(np.zeros_like(shift))[1]).all()
 
 

@@ -168,7 +168,7 @@ def test_a_distance_field_interpolates_distances_and_returns_its_own_derivatives
     far, *slopes = near(x, y)
     exact = distances(box.vertices(0.0), box.present, x[None], y[None])[0][0]
     outside = exact > 0.1
-    # Near a corner the second derivative of the distance is 1 / distance.
+    # At the distance r from a corner bilinear interpolation errs by at most spacing^2 / (4 r).
     np.testing.assert_allclose(far[outside], exact[outside], atol=0.0625**2 / (4.0 * 0.1))
     assert np.all(far >= exact - 1e-3) and np.all(far[exact < -0.1] < 0.0)
     step = 1e-6

@@ -1,4 +1,4 @@
-"""Parts of batches: `pj.take`, `pj.are_solved`, single verdicts, and draws from a later case on."""
+"""Parts of batches: `pj.take`, `pj.are_solved`, single verdicts, and draws of later cases."""
 
 import jax
 import jax.numpy as jnp

@@ -72,7 +72,7 @@ def test_a_recovery_continues_the_trajectory_to_standstill(hits, braked):
         end = np.asarray(end_state(plan.trajectory))
         np.testing.assert_allclose(states(plan.recovery, 0.0), end, atol=5e-3)
         np.testing.assert_allclose(states(plan.recovery)[1:], 0.0, atol=2e-2)
-    # The contact is the contact of the plan without a recovery.
+    # The appended recovery trajectory does not change the plan's contact time.
     plain = pj.plan(pj.hit.planner("exact"), hits)
     np.testing.assert_allclose(braked.stroke.time, plain.stroke.time, rtol=1e-6)
     np.testing.assert_array_equal(braked.trajectory.durations, plain.trajectory.durations)
@@ -270,7 +270,7 @@ def test_a_car_brakes_on_its_path(here):
     case, plan = driving()
     _, rows = table(pj.export(plan, to="csv", out="a.csv", case=case))
     assert rows[-1, 4] < 0.02 and rows[101, 0] > 1.0
-    # Braking from 1 to 0 m/s takes five steps of 0.25 s, at a mean speed of 0.5 m/s.
+    # Braking from 1 m/s to standstill takes 1.25 s, at a mean speed of 0.5 m/s.
     assert rows[-1, 1] == pytest.approx(2.0 + 0.5 * 5 * 0.25, abs=0.01)
     assert np.abs(rows[:, 5]).max() <= 1.0 and not rows[:, 6].any()
     assert not is_rested(plan)

@@ -306,7 +306,7 @@ def test_a_harmonic_target_is_caught_where_it_swings():
 
 @pytest.mark.parametrize("time", [0.45, 0.999, 1.1, 1.3])
 def test_a_table_is_read_by_cubic_convolution(time):
-    # The kernel reproduces quadratics, so interpolation is exact for a parabola.
+    # Cubic convolution reproduces quadratic functions, so a parabola is interpolated exactly.
     pos, vel = np.array([1.0, 0.3, 2.0]), np.array([-2.0, 0.1, 3.0])
     nodes = (np.arange(30) - 1.0)[:, None] * 0.05
     pull = [0.0, 0.0, -GRAVITY]

@@ -333,7 +333,7 @@ def test_a_racket_is_met_within_its_radius_less_a_margin(radius, off, passes):
     leaves = volley()
     after = leaves["target"][0] - CONTACT
     aside = np.array([-after[1], after[0], 0.0]) / np.hypot(*after[:2])
-    # A shift across the return keeps the apex and the distance from the target.
+    # Ball and target shift sideways by equal amounts, so only the contact error changes.
     edit(leaves, {"ball.pos": add(off * aside), "target": add(off * aside)})
     if radius is not None:
         leaves["racket_radius"] = np.array([radius])

@@ -94,7 +94,7 @@ def change_fields(**fields):
     return yaml.safe_dump(description)
 
 
-# field | value in YAML, ~ removes the field | message
+# Each row has a field, its malformed value in YAML (~ removes the field), and the error message.
 BAD = """
 mass | 800 gg | mass must be in kg, g, got '800 gg'; did you mean g?
 mass | 3 m | mass must be in kg, g, got '3 m'

@@ -1,4 +1,4 @@
-"""Measured scales of decision variables: a closed form, and independence of units."""
+"""Scales of decision variables from a cost's curvature: closed form, independence of units."""
 
 import dataclasses
 

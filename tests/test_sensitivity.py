@@ -1,4 +1,4 @@
-"""Adjoint gradients of plans: closed form, finite differences, and independence of lanes."""
+"""Adjoint gradients of plans: closed form, finite differences, independence within a batch."""
 
 import dataclasses
 import functools

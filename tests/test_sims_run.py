@@ -29,7 +29,7 @@ from planner_jax.sims.task import BallFlightTask, FlightCases, Flights
 from planner_jax.sims.tasks.catch import CATCH_WORLD
 from tests.recordings import recording
 
-# Settings, and the beginning of the message.
+# Each row has invalid settings of a run, and the beginning of the error message.
 BAD = """
 fly_settings("dodge") | task must be one that can be flown (hit, catch, intercept, block), got 'dod
 CatchFly(balls=2, replan=100.0 / 3.0) | replan must be such that its period divides 0.8 s, got 33.3

@@ -1,4 +1,4 @@
-"""`pj.plan` with a toy planner: later rounds for unsolved cases, padded batches and statuses."""
+"""`pj.plan` with a toy planner: new searches for unsolved cases, padded batches and statuses."""
 
 import dataclasses
 

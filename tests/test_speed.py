@@ -1,4 +1,4 @@
-"""Speed along a path: plans avoid every polygon, meet the limits, and have the least cost."""
+"""Speed along a path: plans avoid blocked times and distances, keep limits, cost the least."""
 
 import dataclasses
 

@@ -109,7 +109,7 @@ def test_an_empty_graph_has_the_straight_line_and_a_full_one_has_none():
     wall = problem([(3.0, 4.0, (-1.0, -1.0), (7.0, 7.0))])
     fast = problem(speed_limit=(9.0, 0.2, 9.0))
     cases = pad(free, wall, fast)
-    # `GRID`, with 6 stations and 5 steps, does not contain the straight line; this finer grid does.
+    # This grid contains the distances of uniform motion; `GRID` is too coarse to contain them.
     straight = jax.jit(lambda p: reference_line(p, StationTimeGrid(10, 5, 3)))(free)
     np.testing.assert_allclose(straight.station, np.linspace(0.0, 6.0, 6), atol=1e-12)
     np.testing.assert_allclose(straight.cost, 0.0, atol=1e-12)
@@ -138,7 +138,6 @@ def corridors(lines):
 @pytest.mark.parametrize("kind", ["tilted", "edges", "flat"])
 def test_nothing_between_the_lines_of_a_corridor_is_inside_of_a_polygon(lines, corridors, kind):
     problems, found = lines
-    # Lower bounds are convex and upper ones concave, so that interpolation stays within them.
     fine = np.linspace(0.0, 1.0, 401)
     grid = np.array([np.interp(fine, SHARES, unit) for unit in np.eye(9)])
     lower, upper = (np.clip(bound, 0.0, 6.0) @ grid for bound in corridors[kind][1])

@@ -1,4 +1,4 @@
-"""Sweeps of hits: run folder, resuming, tables, figures, clocks and rates."""
+"""Runs that plan and judge many hits: folder, resuming, tables, figures, clocks and rates."""
 
 import jax
 import jax.numpy as jnp
@@ -132,7 +132,7 @@ def test_resuming_with_another_setting_names_it(finished):
 
 
 def test_a_serve_drawn_late_that_breaks_a_rule_leaves_nothing_behind(tmp_path):
-    # All balls of the first chunk fly for longer than `delay`, but not all balls of later chunks.
+    # The first 4 balls all fly for longer than `delay` [s], but some later balls land before.
     settings = HitSettings(num=40, batch=4, delay=1.56, seed=0)
     open_source(settings.of(TASK), batch=4).check()
     with pytest.raises(pj.ArgumentError, match="delay must be shorter than each serve's flight"):

@@ -1,4 +1,4 @@
-"""Sweeps of catches: rows, tables and figures, resuming, and rejected settings."""
+"""Runs that plan and judge many catches: tables, figures, resuming, and rejected settings."""
 
 import jax
 import numpy as np

@@ -1,4 +1,4 @@
-"""Sweeps of interceptions: rows that hold a case and its drive, figures, counts."""
+"""Runs that plan and judge many interceptions: stored cases and plans, figures, counts."""
 
 import dataclasses
 

@@ -16,7 +16,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 WHOLE = os.environ.get("PLANNER_JAX_WHEEL") == "whole"
-# PYTHONPATH and the folder above would find the checkout instead of the wheel.
+# Without PYTHONPATH, Python imports the installed wheel instead of the repository's sources.
 ENVIRONMENT = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
 
 pytestmark = pytest.mark.slow

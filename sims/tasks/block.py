@@ -1,4 +1,4 @@
-"""Runs of the command `planner-jax fly block`: table of results, recordings and report."""
+"""Simulated blocks of the command `planner-jax fly block`: table, recordings and report."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -100,7 +100,7 @@ class BlockFlight(FlightTask):
         )
 
     def parameters(self) -> dict[str, Any]:
-        """Return the parameters of drives, encoders and control, for the run's manifest."""
+        """Return the parameters of joint drives, encoders and control, for the run's manifest."""
         robot = BLOCK_ARM
         return {
             "drives": dataclasses.asdict(self.settings.drives),
@@ -122,7 +122,7 @@ class BlockFlight(FlightTask):
         )
 
     def fly(self, cases: Throws, record: bool) -> BlockFlights:
-        """Plan and simulate the blocks of some balls; the result always includes all motions."""
+        """Plan and simulate blocks of balls; motions are stored even if `record` is false."""
         settings, planner = self.settings, block_planner(self.settings.planner)
         decided, seconds = None, 0.0
         if settings.perception:
@@ -234,7 +234,7 @@ class BlockFlight(FlightTask):
         }
 
     def findings(self, summary: Mapping[str, Any]) -> list[str]:
-        """Return sentences for the report: shares of blocked balls and contacts, and torques."""
+        """Return sentences on shares of blocked balls and obstacle contacts, and on torques."""
         number = summary["num"]
         planned, blocked, touched, after, late = (
             percent(summary[name], number)
@@ -266,11 +266,11 @@ class BlockFlight(FlightTask):
         return lines
 
     def tables(self, rows: Any) -> Sequence[RateTable]:
-        """Return two tables: the parts of the balls' flight times, and the joints' errors."""
+        """Return two tables: times from a ball's first sight to contact; joint tracking errors."""
         return [budget_table(rows), joint_table(rows)]
 
     def draw(self, folder: Path, rows: Any) -> Sequence[str]:
-        """Draw the parts of the first balls' flight times, and return the file name."""
+        """Draw the times for sensing, planning and motion of up to 32 balls; return file names."""
         draw(folder / "budget.png", budget_figure, (8.0, 5.0), rows)
         return ["budget.png"]
 

@@ -92,8 +92,8 @@ class BlockFlights(Flights):
     clearance_after: np.ndarray  # (B,) [m], least clearance after the contact, while the arm brakes
     planned: np.ndarray  # (B,) bool, whether there was a plan
     motions: np.ndarray  # (B,) int, number of motions that the arm started
-    # (B,) [m], error of the ball's position by the first and the last fit of its flight, halfway
-    # through the time for blocking; NaN if the flight is known without a fit.
+    # (B,) [m], errors of the first and last predicted ball position, midway between its entries
+    # into the outer and the inner box. They are NaN if the ball is known and not observed.
     fit_error: np.ndarray
     last_fit_error: np.ndarray
 
@@ -117,11 +117,11 @@ def throws(
     wide: bool = False,
     delay: float = 0.0,
 ) -> Throws:
-    """Draw throws of a suite, "pole", "open" or "short", by `pj.block.draw`.
+    """Draw random throws: "pole" (a pole before the arm), "open" (no pole) or "short" (6 to 8 m).
 
-    `regime` names the joint limits of plans: "R1", "R2" or "R3" of `robot.arm.REGIMES`. `wide`
-    allows contacts up to 0.1 m from the shield's centre. `delay` [s] is the time from the first
-    sight of a ball until the arm starts.
+    `regime` names joint limits of plans in `robot.arm.REGIMES`, for example "R2". `wide` allows
+    contacts up to 0.1 m from the shield's centre. `delay` [s] is the time from the first sight of a
+    ball until the arm starts.
     """
     cases = draw_throws(num, suite, seed, regime=regime, wide=wide, delay=delay)
     return Throws(index=np.arange(num), cases=jax.tree.map(np.asarray, cases))
@@ -249,7 +249,7 @@ def entry_times(cases: BlockCase) -> np.ndarray:
 
 
 def ball_places(case: dict[str, np.ndarray], times: np.ndarray) -> np.ndarray:
-    """Return positions (3, B, S) [m] of the balls of B cases, `referee_leaves`, at S times [s]."""
+    """Return positions (3, B, S) [m] of B balls at S times [s]; `case` has arrays by field name."""
     pos, vel = case["ball.pos"].T[..., None], case["ball.vel"].T[..., None]
     fall = np.multiply.outer(FALL, case["gravity"])[..., None]
     return pos + vel * times - 0.5 * fall * times**2
@@ -267,7 +267,7 @@ def score(cases: BlockCase, plans: BlockPlan, flown: Executed, budget: Budget) -
         cases: the cases of B flights, leaves (B, ...).
         plans: the plans of the cases.
         flown: the simulated motions.
-        budget: the parts of the times of flight.
+        budget: durations of sensing, planning and motion within the times of flight.
     """
     case, times = referee_leaves(cases), flown.times
     angles = flown.angles.transpose(2, 0, 1)

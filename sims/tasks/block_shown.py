@@ -12,7 +12,7 @@ from planner_jax.task.block.scene import FLOOR, Box, paper_scene
 
 _POLE = 3.0  # [m], height of the drawn pole
 _BARS = 32  # greatest number of balls in the picture of the time budget
-# Descriptions of the parts of a ball's time of flight, by the names of fields of `Budget`.
+# Parts of a ball's time of flight, each a name of a field of `Budget` with its description.
 BUDGET = {
     "sense": "until the ball's flight is known",
     "plan": "wall time of planning",
@@ -53,7 +53,7 @@ def scenery(arm: Arm, has_pole: bool) -> tuple[Part, ...]:
 
 
 def budget_table(rows: Any) -> RateTable:
-    """Make the table of the parts of the flight times [Natarajan2024, eq. 1], in a run's rows."""
+    """Make the table of times for sensing, planning, waiting, moving [Natarajan2024, eq. 1]."""
     planned = np.asarray(rows["planned"])
     parts = {name: 1e3 * np.asarray(rows[f"time_{name}"])[planned] for name in BUDGET}
     parts["flight, the sum"] = np.sum(list(parts.values()), axis=0)
@@ -67,7 +67,7 @@ def budget_table(rows: Any) -> RateTable:
 
 
 def joint_table(rows: Any) -> RateTable:
-    """Make the table of each joint's errors and torques, over all arms that had a plan."""
+    """Make the table of each joint's rms and greatest tracking error and torque, if planned."""
     planned = np.asarray(rows["planned"])
 
     def of(name: str) -> np.ndarray:

@@ -258,7 +258,7 @@ class CatchFlight(BallFlightTask):
         )
 
     def fly(self, cases: Throws, record: bool) -> CatchFlights:
-        """Plan and simulate the flights of `cases`, with the planner and rates of the settings."""
+        """Plan and simulate the flights of `cases`; `record` is whether states are stored."""
         settings = self.settings
         return fly_catches(
             self.loop(record),
@@ -269,15 +269,15 @@ class CatchFlight(BallFlightTask):
         )
 
     def parameters(self) -> dict[str, Any]:
-        """Return the loop's settings, and the rate [Hz] of new decisions on order and times."""
+        """Return the loop's settings, and the rate [Hz] at which the catch order is chosen anew."""
         return {**super().parameters(), "redecide": self.settings.redecide_rate}
 
     def launches(self, cases: Throws, flown: Flown) -> Launches:
-        """Return each ball's state at the start of the plan for it; there are no returned balls."""
+        """Return each ball's state at the start of the plan for it; caught balls do not rebound."""
         begins = INTERVAL * np.arange(self.settings.balls)
         return Launches(cases.balls, cases.drag, begins, SEEN)
 
     @property
     def suite(self) -> str:
-        """The number of balls per flight, as text."""
+        """Name of the set of flights in reports: the number of balls per flight, "2 balls"."""
         return "1 ball" if self.settings.balls == 1 else f"{self.settings.balls} balls"

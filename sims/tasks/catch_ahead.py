@@ -51,7 +51,7 @@ def predict_case(loop: Loop, flights: FlightState, new: Array, horizon: Array) -
         horizon: (B, N) [s] from now, last time at which each ball may be caught.
     """
     robot = loop.world.carrier
-    # The targets are placeholders; the function `one` replaces them by predictions.
+    # These targets are placeholders that the function `one` replaces by predicted balls.
     zeros = jnp.zeros((*horizon.shape, 3), horizon.dtype)
     nowhere = BallPath(BallState(zeros, zeros), drag=zeros, gravity=zeros[..., 0])
     empty = catch_case(
@@ -149,15 +149,13 @@ def with_catch(flights: FlightState, found: CatchPlan, new: Array) -> FlightStat
 
 @dataclasses.dataclass(frozen=True)
 class _EveryAttempt(Driver):
-    """A planning driver that runs all attempts (settings to try) of a planner concurrently."""
+    """A caller of planners that runs all attempts (settings to try) at once, to compile them."""
 
-    # Every thread calls the driver with one attempt. The time limit of 0 s prevents further ones.
     watch: Watch = dataclasses.field(default_factory=lambda: Watch(0.0))
 
     def __call__(
         self, planner: Planner, cases: Any, attempts: Sequence[Attempt] | None = None
     ) -> tuple[Any, Any]:
-        """Run a planner's attempts concurrently, and return the plans of the first attempt."""
         if planner.kind is not Kind.COMPILED:
             return super().__call__(planner, cases, attempts)
         make = functools.partial(super().__call__, planner, cases)

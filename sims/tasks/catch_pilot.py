@@ -32,18 +32,18 @@ LIFT = 0.1  # thrust at every catch in initial guesses: 0 is hover, 1 the greate
 
 @dataclasses.dataclass(frozen=True)
 class CatchPilot:
-    """The part of the closed loop that replans catches, and may decide their order again."""
+    """The part of the closed loop that replans catches in flight, and may change their order."""
 
     # In the last 0.2 s before a catch the plan is not changed. A change would cost more accuracy
     # than new observations of the ball gain.
     planner: ReplanCatch = ReplanCatch(ExactCatch(lift=LIFT), shortest=0.2)
-    # Greatest relative violation of a limit with which a new plan is flown in any case: for one
-    # remaining catch, and for several. Above it, the new plan must not violate limits more than
-    # the old plan. With several catches most of the violation lies in later catches, which will be
-    # planned again; rejecting the new plan would miss the first ball.
+    # Greatest relative violations of a limit with which a new plan is always flown: with one
+    # remaining catch, and with several. A plan that violates a limit more is flown only if the old
+    # plan violates limits as much. The second number is larger, because most of the violation then
+    # lies in later catches, which will be planned again.
     excess: tuple[float, float] = (BORNE, 1.0)
-    # Name of the method that decides order and times of the catches, or "policy:FILE". With "given"
-    # the order and times of the current plan stay, and only the trajectory is planned from scratch.
+    # Method that decides order and times of catches, such as "greedy", or "policy:FILE" for a
+    # neural network. "given" keeps the current order and times, and plans the trajectory anew.
     decide: str = "greedy"
     redecide: float = 100.0  # [Hz], rate of new decisions; divides the replanning rate; 0: never
     search: Round = Round(starts=1, solver=LbfgsConfig(max_steps=25))  # search after a new decision
@@ -60,7 +60,7 @@ class CatchPilot:
     def pose_problem(
         self, case: CatchCase, plan: CatchPlan, outlook: Outlook
     ) -> Replanning[CatchCase, CatchPlan]:
-        """Return the problem of planning the remaining catches of the current plan, `plan`."""
+        """Return the problem of replanning the catches of `plan` that are due after `outlook`."""
         made = plan.times <= outlook.elapsed
         first = jnp.argsort(made, stable=True)  # indices of catches, the remaining catches first
         order, times = plan.order[first], plan.times[first] - outlook.elapsed

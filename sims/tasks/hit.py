@@ -83,17 +83,17 @@ HIT_WORLD = World(
     Quadrotor(PAPER_HITTER),
     GRAVITY,
     scenery=tuple(court_parts()),
-    # Serves start at random points of a region; the machine is drawn in the far region's centre.
+    # The drawn serving machine stands in the centre of the half court beyond the net. Simulated
+    # serves start at random points.
     mouth=(0.5 * (court.NEAR_LINE + DEPTH), 0.0, SERVE_HEIGHT),
 )
 
 
 def smooth_planner() -> ExactHit:
-    """Return an `ExactHit` whose first search has 60 iterations, with drag after the impact.
+    """Return an `ExactHit` that starts with 60 iterations, not 3, and has drag after the impact.
 
-    The limits of a plan do not include angular acceleration. After few iterations, one plan of 150
-    satisfies the limits but needs more torque than the rotors have, so that the ball misses its
-    target by up to 30 cm. A longer search ends with a smoother plan, which avoids this.
+    Limits do not include angular acceleration. A plan after few iterations may need more torque
+    than the rotors have, so that the ball misses its target. A longer search avoids such plans.
     """
     planner = ExactHit(drag_after_impact=True)
     solver = LbfgsConfig(max_steps=60, tolerance=1e-5, patience=6)
@@ -102,11 +102,11 @@ def smooth_planner() -> ExactHit:
 
 @dataclasses.dataclass(frozen=True)
 class HitPilot:
-    """The part of the closed loop that replans a hit from the current plan, every period."""
+    """The part of the closed loop that replans a hit at fixed intervals from the current plan."""
 
     planner: ReplanHit = ReplanHit(ExactHit(drag_after_impact=True))
-    # [s], least time before an impact at which the hit is replanned. After later changes of a plan
-    # there would be too little time for the tracking error to decay.
+    # [s], least time before an impact at which the hit is replanned. After a later change of plan
+    # the tracking error would not decay before the impact.
     shortest: float = 0.3
     # Greatest relative violation of a limit by a new plan that replaces the current plan.
     excess: float = 0.1
@@ -314,13 +314,13 @@ class HitFlight(BallFlightTask):
         )
 
     def fly(self, cases: Volleys, record: bool) -> HitFlights:
-        """Plan and simulate the flights of `cases`, with the planner and rates of the settings."""
+        """Plan and simulate the flights of `cases`; `record` is whether states are stored."""
         name = self.settings.planner
         planner = None if name == "exact" else hit_planner(name)
         return fly_hits(self.loop(record), cases, self.settings.seed, planner=planner)
 
     def launches(self, cases: Volleys, flown: Flown) -> Launches:
-        """Return the serves' states, and the states of the balls that the racket returns."""
+        """Return the balls' states at the start of the plan and just after the racket's impact."""
         truth = cases.cases
         back = _reflect_balls(flown.contact, truth)
         balls = jax.tree.map(lambda leaf: leaf[:, None], truth.ball)

@@ -129,7 +129,7 @@ def predict_scene(
 
     def one(meeting: Meetings) -> tuple[TurningPath, Obstacles]:
         case = meeting.cases
-        # Observations before the start have all arrived; later observations arrive late.
+        # Observations before the start have all arrived. Later ones arrive after a latency.
         shown = (meeting.times <= 0.0) | (meeting.times + sensing.latency <= now + 1e-4)
         times, weights = meeting.times - now, shown.astype(now.dtype)
         if known_target:
@@ -144,7 +144,7 @@ def predict_scene(
             return target, dataclasses.replace(movers, centre=centre)
         fit = lambda seen: fit_polynomial(times, seen, 1, weights).at(0.0 * now)  # noqa: E731
         state = jax.vmap(fit, in_axes=1)(meeting.movers)
-        # Standard deviation of a fitted line's current position, from the noise of observations.
+        # Standard deviation of the obstacle's current position by a line fitted to observations.
         number = jnp.sum(weights)
         middle = jnp.sum(weights * times) / number
         spread = jnp.sum(weights * (times - middle) ** 2)
@@ -253,8 +253,8 @@ def fly_intercepts(
         predict_movers: whether moving obstacles are predicted from observations instead of known.
 
     Raises:
-        ValueError: `replan` does not divide the rate of the frames, or the cases' car is not the
-            simulated car.
+        ValueError: `replan` does not divide the simulation's 50 frames per second, or the cases'
+            car is not the simulated car.
     """
     require_car(loop.car.vehicle, cases.cases)
     frames = loop.sensing.frames_per_plan(replan)
@@ -371,13 +371,13 @@ def _collect_drives(
 def score(
     cases: InterceptCase, first: InterceptPlan, flown: Driven, planning_seconds: float = 0.0
 ) -> InterceptFlights:
-    """Score drives against the true targets and obstacles in float64: misses and clearances.
+    """Compute distances from true targets at the end, and least clearances from obstacles.
 
     Args:
         cases: the true cases of B drives, leaves (B, ...).
         first: the first plans.
         flown: the drives.
-        planning_seconds: wall time of planning.
+        planning_seconds: wall time of planning the first plans of all drives.
     """
     meeting = flown.meeting
     times = np.minimum(flown.times, meeting[:, None])  # (B, S)

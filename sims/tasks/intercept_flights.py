@@ -1,4 +1,4 @@
-"""Runs of the command `planner-jax fly intercept`: table of results, recordings and report."""
+"""Simulated drives of the command `planner-jax fly intercept`: table, recordings, report."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -95,7 +95,7 @@ class InterceptFlight(FlightTask):
         )
 
     def fly(self, cases: Meetings, record: bool) -> InterceptFlights:
-        """Plan and simulate some interceptions; the result always includes all motions."""
+        """Plan and simulate interceptions; motions are stored even if `record` is false."""
         settings = self.settings
         return fly_intercepts(
             self.loop(),
@@ -181,7 +181,7 @@ class InterceptFlight(FlightTask):
         return jax.tree.map(lambda leaf: np.asarray(leaf)[0], one)
 
     def counts(self, rows: Any) -> dict[str, Any]:
-        """Return numbers for the summary: meetings, contacts, and times of saturated actuators."""
+        """Count meetings and obstacle contacts; add shares of time of saturated drive, steering."""
         miss = np.asarray(rows["miss"])
         wall, mover = (np.asarray(rows[f"{name}_clearance"]) < -TOUCH for name in ("wall", "mover"))
         return {
@@ -196,7 +196,7 @@ class InterceptFlight(FlightTask):
         }
 
     def findings(self, summary: Mapping[str, Any]) -> list[str]:
-        """Return sentences for the report: shares of misses, contacts and saturated actuators."""
+        """Return sentences on shares of met targets, obstacle contacts and saturated actuators."""
         number = summary["num"]
         near, success, far = (
             percent(summary[f"within_{width:g}_m"], number) for width in (NEAR, SUCCESS, FAR)

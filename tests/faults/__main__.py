@@ -2,9 +2,9 @@
 
     python -m tests.faults [--share F] [--only NAME,...] [--jobs N] [--out FILE]
 
-A killed run survives if it is resumed to the rows of an undisturbed run. Of two processes that
-write one folder, one must end with a line that names the other. A damaged file must be refused with
-one line, be planned again, or have no effect. A signal must end a command with one line.
+F scales the number of trials; N trials run at once. A killed run survives if it is resumed to the
+results of an undisturbed run. Of two processes that write one folder, one must end with an error
+line. A damaged file must be rejected, be planned again, or have no effect.
 """
 
 import argparse

@@ -1,4 +1,4 @@
-"""The command `planner-jax` with quick planners: a sweep compiles one small program for its task.
+"""The command `planner-jax` with planners for tests, which try one search and so compile quickly.
 
 python -m tests.faults.quick sweep hit ...
 """

@@ -1,4 +1,4 @@
-"""Cases of a batch that break a rule are recognised, and change no plan of another case."""
+"""Invalid cases of a batch, such as with NaN, are found and change no plan of other cases."""
 
 import dataclasses
 

@@ -24,7 +24,7 @@ QUICK = "tests.faults.quick"
 SWEEPS = {
     "hit": ("hit", "--num", "200", "--batch", "32", "--seed", "5"),
     "catch": ("catch", "--suite", "parabola2", "--num", "96", "--batch", "16", "--seed", "5"),
-    # Ray workers do not use the quick planners of this process, but the library's own planner.
+    # Ray workers are other processes, so they use the library's planner and not a test's planner.
     "many": ("hit", "--planner", "juggle", "--num", "20000", "--batch", "500", "--seed", "5"),
 }
 Outcome = tuple[bool, str]  # whether a run survived, and a word on how
@@ -35,7 +35,7 @@ sweep = partial(start, "sweep", module=QUICK)
 class Trial(NamedTuple):
     name: str
     words: str  # of the table
-    # Arguments: random generator, number of faults, an empty folder, folder of undisturbed runs.
+    # It takes a random generator, a number of faults, an empty folder, undisturbed runs' folder.
     run: Callable[[random.Random, int, Path, Path], Survived]
     num: int
     most: int  # faults that one process tries

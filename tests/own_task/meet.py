@@ -19,7 +19,7 @@ import planner_jax as pj
 
 @struct.dataclass
 class MeetCase:
-    """The states of robot and target at time 0, and the limit; world frame in the plane."""
+    """The states of robot and target at time 0, and the robot's limit; world frame in the plane."""
 
     pos: Array  # (2,) [m], of the robot
     vel: Array  # (2,) [m/s]
@@ -39,7 +39,7 @@ class MeetPlan(pj.Plan):
 
 
 def plan_at(point, case: MeetCase) -> tuple:
-    """Return time, and accelerations (2, 2) at both ends, from log time and first acceleration."""
+    """Return the meeting time and the accelerations (2, 2) at start and meeting, from `point`."""
     time, first = jnp.exp(point[0]), point[1:]
     way = case.target_pos - case.pos + (case.target_vel - case.vel) * time
     last = 6.0 * way / time**2 - 2.0 * first  # way = (2 first + last) time^2 / 6
@@ -47,14 +47,14 @@ def plan_at(point, case: MeetCase) -> tuple:
 
 
 def excess(acc: Array, case: MeetCase) -> Array:
-    """Return relative excesses (2,) over the limit at both ends, one of which is the greatest."""
+    """Return (2,) |acceleration| / limit - 1 at start and meeting; between them it is not more."""
     return jnp.sqrt(jnp.sum(acc**2, axis=1) + 1e-12) / case.most - 1.0
 
 
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class SmoothMeet(pj.OptimisedPlanner):
-    """A planner that minimises by L-BFGS, with a penalty that starts a margin below the limit."""
+    """A planner that minimises by L-BFGS, with a penalty on accelerations close to the limit."""
 
     case_type = MeetCase
     weight: float = 30.0
