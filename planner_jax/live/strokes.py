@@ -77,7 +77,7 @@ class Stroke(abc.ABC, Generic[CaseT, PlanT]):
         self.pieces = self._planner.num_pieces  # number of polynomial pieces of a plan
 
     def first(self, ball: BallState, head_state: Float[np.ndarray, "4 3"]) -> PlanT:
-        """Plan for a ball; `head_state` is the position, velocity, acceleration, jerk at time 0."""
+        """Plan from `head_state`: the robot's position, velocity, acceleration, jerk at time 0."""
         case = dataclasses.replace(self._with_ball(ball), head_state=head_state)
         return call_packed(self._solve_first, self._planner.rounds[1], self._planner, case)
 
@@ -93,7 +93,7 @@ class Stroke(abc.ABC, Generic[CaseT, PlanT]):
 
     @abc.abstractmethod
     def _with_ball(self, ball: BallState) -> CaseT:
-        """Return the case of this task with an estimated ball at time 0."""
+        """Return the planning problem (robot, limits, ball) with this estimated ball at time 0."""
 
 
 def _state_in(task: Replanning) -> Array:
@@ -143,7 +143,7 @@ class HitStroke(Stroke[HitCase, HitPlan]):
 
 
 def _time_left(case: CatchCase) -> Array:
-    """Return the time (1,) [s] until a falling ball is too low for the net; 0 if it is too low."""
+    """Return the last time (1,) [s] when the ball is above the net's least height, else 0."""
     height = case.limits.min_height + case.net.height
     path = jax.tree.map(lambda leaf: leaf[0], case.targets)
     # The bisection starts at the ball's highest point, since a rising ball may be low at time 0.

@@ -56,12 +56,12 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
     """A planner of N minimum-snap segments of M polynomial pieces each.
 
     The decision variables of a segment are whitened waypoint offsets (scaled deviations from the
-    smoothest trajectory) and K end variables, in units of `scale`. The first end variable is the
-    logarithm of the segment's duration.
+    smoothest trajectory) and K end variables. Each is divided by its unit in `scale`. The first end
+    variable is the logarithm of the segment's duration.
 
     Cost: energy_weight * integral |snap|^2 + time_weight * total time + integral of the smoothed
-    hinges of the limits and of the case's extras + end_weight * smoothed hinges of the excess at
-    the ends.
+    hinges of the limits and of the user's extra terms + end_weight * smoothed hinges of the
+    relative excess over the limits at the segments' ends.
     """
 
     subspace = 0
@@ -117,7 +117,7 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
         return jnp.ones(1, bool)
 
     def relative_excess(self, excess: Array) -> Array:
-        """Convert the excess at a plan's ends, `ChainEnds.excess`, to fractions of the limits."""
+        """Return excesses over limits at a plan's ends as fractions of the limits: unchanged."""
         return excess
 
     def start_network(self, case: PyTree) -> StartNetwork | None:
@@ -169,7 +169,7 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
         return points.at[0].set(select_start(cost, points[0], learned))
 
     def split(self, point: Float[Array, " n"]) -> tuple[Array, Array]:
-        """Split a point into waypoint offsets (N, O, 3) and end variables (N, K) of N segments."""
+        """Split a point: waypoint offsets (N, M - 1, 3), end variables (N, K) of N segments."""
         scale = jnp.asarray(self.scale, point.dtype)
         natural = point.reshape(-1, scale.size) * scale[None]
         offsets = natural[:, : self.num_offsets].reshape(natural.shape[0], -1, 3)

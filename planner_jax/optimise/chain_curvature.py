@@ -41,13 +41,13 @@ def chain_curvature(
     """Return evaluation, gradient and second derivatives of a trajectory's objective at a point.
 
     The objective is the cost of the ends, plus for each active segment the integral of penalties,
-    and the energy (integral of the squared s-th derivative) due to its waypoint offsets. A point
-    lists, segment by segment, offsets and end variables, in units of `scale`. Products with the
-    Hessian contain all second derivatives. The preconditioner contains those among the end
-    variables, and the diagonal for the offsets.
+    and the energy (integral of the squared derivative of order `maps.order`) due to its waypoint
+    offsets. A point lists, segment by segment, offsets and end variables, in units of `scale`.
+    Products with the Hessian contain all second derivatives. The preconditioner contains the second
+    derivatives among the end variables, and the diagonal for the offsets.
 
     Args:
-        maps: constants of a segment of M pieces that minimises its squared s-th derivative.
+        maps: constants of a segment of M pieces with the least energy.
         along: penalties along the trajectory.
         ends: function of the end variables. The first variable of each segment is the logarithm of
             its duration and affects nothing else. The first segment's initial state is fixed.
@@ -55,9 +55,9 @@ def chain_curvature(
         natural: (N, k), k end variables of each of N segments, in SI units.
         offsets: (N, M - 1, 3) whitened waypoint offsets.
         scale: (3 (M - 1) + k,) units of one segment's variables.
-        parameters: gravity, limits and extras of the case, for the functions in `along`.
+        parameters: gravity, limits and the user's extra terms, for the functions in `along`.
         energy_weight: weight of the energy in the cost.
-        active: (N,) bool, the segments that exist.
+        active: (N,) bool, the segments that the planning problem uses; the others are padding.
 
     Returns:
         The evaluation's `violation` is the greatest excess at ends or samples + `BETWEEN_NODES`.
@@ -91,8 +91,8 @@ def chain_curvature(
     unit = jnp.asarray(np.eye(natural.size), natural.dtype)
     tangent = lambda unit: jax.jvp(slope, (natural.ravel(),), (unit,))  # noqa: E731
     (by_natural, _), (within, turned) = jax.vmap(tangent, out_axes=((None, None), 0))(unit)
-    # `within` (N k, N k) is the Hessian, by the end variables, of the ends' cost and of penalties
-    # by way of the boundary rows. `turned` (N k, N, num_rows, 3) is the rows' Jacobian.
+    # `within` (N k, N k) is the Hessian of the ends' cost, plus the penalties' gradient times the
+    # second derivatives of the boundary states. `turned` is the boundary states' Jacobian.
     dot = functools.partial(jnp.tensordot, precision=lax.Precision.HIGHEST)
     einsum = functools.partial(jnp.einsum, precision=lax.Precision.HIGHEST)
     theta_theta = of.theta_theta + power**2 * energies

@@ -96,8 +96,8 @@ def optimal_plan(planner: Planner, case: PyTree, *, solver: LbfgsConfig | None =
     implicit function theorem. Use float64 (`jax.enable_x64`) for more than two correct digits.
 
     Args:
-        planner: a planner that minimises. If it first decides something or searches for a path,
-            derivatives treat its first decision or path as a constant.
+        planner: a planner that minimises. If it first chooses an order of the targets or finds a
+            path around obstacles, derivatives treat this order or path as a constant.
         case: one case; derivatives are by its leaves.
         solver: settings of the search before the refinement; 200 iterations by default.
 

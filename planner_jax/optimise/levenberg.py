@@ -38,8 +38,8 @@ class LevenbergConfig:
     ease: float = 0.2  # factor on the damping after an accepted step
     tighten: float = 6.0  # factor on the damping after a rejected step
     longest: float = 1.5  # greatest change of an unknown in one step
-    # A search ends after `settled` steps in a row at feasible points that each lower the cost by
-    # less than the fraction `tolerance`.
+    # A search ends after `settled` steps in a row that each lower the cost by less than the
+    # fraction `tolerance`, at points with `Model.violation` <= 0.
     settled: int = 2
     tolerance: float = 1e-2
     # A search is aborted if, k >= 0 steps after step number `trial`, its cost exceeds
@@ -97,7 +97,7 @@ def continue_search(
     config: LevenbergConfig,
     most: Array | int | None = None,
 ) -> LevenbergState:
-    """Continue a search until it has made `most` steps in total, and return its last state."""
+    """Continue to at most `most` steps in total (None: `config.max_steps`); return the state."""
     most = config.max_steps if most is None else most
 
     def is_unfinished(state: LevenbergState) -> Array:

@@ -76,7 +76,8 @@ def minimise_lanes(
 
     `starts` is (n, B). A context is the pytree of a problem's data. In all arrays of `contexts` and
     of the result, the last axis counts problems. `objective` and `curved` take a point (n,) and the
-    context of one problem.
+    context of one problem. `curved` returns the derivatives for Newton's method; if it is None,
+    they are computed from `objective` by automatic differentiation.
     """
     if _has_steps(config, 0):
         evaluate = lambda x, context: _optimum_at(x, objective(x, context), config)  # noqa: E731
@@ -197,7 +198,7 @@ def solve_batch(planner: "OptimisedPlanner", attempt: Round, cases: PyTree) -> P
 
 @struct.dataclass
 class Searches:
-    """L searches, each from one starting point, in one stage of a round (attempt) of a planner."""
+    """The inputs of L searches that run together: case and starting point of each search."""
 
     cases: PyTree  # leaves (L, ...)
     index: Array  # (L,) int32, index of the starting point among the guesses; -1: `point`
@@ -205,10 +206,11 @@ class Searches:
 
 
 def count_guesses(rounds: Sequence[Round], stage: Stage) -> int:
-    """Return how many guessed starting points the program for one stage (search) must compute.
+    """Return how many guessed starting points the compiled program of a search must compute.
 
-    It is the greatest number that a round (attempt) uses whose first stage has these settings.
-    Later stages start where the stage before them ends.
+    A round (attempt) is a sequence of stages (searches). Only its first stage starts at guesses.
+    All rounds whose first stage has the planner settings of `stage` share the program, so the
+    greatest number of guesses among these rounds is returned.
     """
     begun = [each for each in rounds if each.all_stages[0].settings == stage.settings]
     return max((each.first + each.starts for each in begun if each.is_divided), default=0)
@@ -286,7 +288,7 @@ def divide_round(
 
 
 def solve_divided(planner: "OptimisedPlanner", attempt: Round, cases: PyTree) -> PyTree:
-    """Return each case's best plan from all starts of a round (attempt), by one program; pure."""
+    """Search from all starts of a round (attempt) as one batch; return each case's best plan."""
 
     def search(
         stage: Stage, cases: PyTree, index: Array, points: Array | None

@@ -140,9 +140,9 @@ def step(
 def solve_damped(here: Curvature, damping: Array, config: NewtonConfig) -> tuple[Array, Array]:
     """Return Newton steps (k, n) within the Krylov subspace, one for each of k trial dampings.
 
-    `damping` > 0 is the problem's own damping, which is added to the Hessian's diagonal. No step is
-    longer than `config.step_cap`. The second result () is the decrease of the cost that the
-    quadratic model predicts for the step without trial damping.
+    `damping` > 0 is added to the Hessian's diagonal. A trial damping t also adds t times the
+    preconditioner's matrix. No step is longer than `config.step_cap`. The second result () is the
+    decrease of the cost that the quadratic model predicts for the step with t = 0.
     """
     gradient = here.gradient
     solve_about = here.preconditioner(damping)

@@ -70,7 +70,8 @@ class OptimisedPlanner(Planner[CaseT, PlanT], abc.ABC):
     rounds: tuple[Round, ...]  # attempts, in order
     # Number of Newton's subspace vectors. With 0 the preconditioner counts as inverse Hessian.
     subspace: ClassVar[int] = 4
-    adjoint: ClassVar[str] = "products"  # default of the argument `curvature` of `pj.gradient`
+    # Default of the argument `curvature` of `pj.gradient`: "products" with the Hessian, or "whole".
+    adjoint: ClassVar[str] = "products"
 
     @abc.abstractmethod
     def prepare(self, case: PyTree) -> PyTree:
@@ -110,7 +111,7 @@ class OptimisedPlanner(Planner[CaseT, PlanT], abc.ABC):
 
     @property
     def held(self) -> np.ndarray | None:
-        """Variables (n,) bool that a `frozen` stage (search) keeps constant, or None for none."""
+        """Mask (n,) of variables that searches with `Stage.frozen` keep constant; None: no such."""
         return None
 
     @property
@@ -119,7 +120,10 @@ class OptimisedPlanner(Planner[CaseT, PlanT], abc.ABC):
         return self.rounds
 
     def load_attempt(self, attempt: Round, cases: PyTree) -> PyTree:
-        """Convert a round (attempt) so that rounds with other L-BFGS settings share a program."""
+        """Convert a round (attempt) to an argument of compiled programs.
+
+        Rounds that differ only in numbers of the L-BFGS settings can then share a program.
+        """
         return load_round(attempt, jax.default_backend() != "cpu")
 
     def solve(self, case: PyTree, attempt: Round) -> PyTree:
@@ -134,13 +138,16 @@ class OptimisedPlanner(Planner[CaseT, PlanT], abc.ABC):
         return (solve_divided if attempt.is_divided else solve_batch)(self, attempt, cases)
 
     def divides(self, attempt: Round) -> bool:
-        """Return whether `pj.plan` runs the searches of a round (attempt) as separate problems."""
+        """Return whether each starting point of a case becomes a separate problem of the batch."""
         return attempt.is_divided
 
     def settle(
         self, cases: PyTree, plan_of: Callable[[Planner, PyTree], PyTree] | None = None
     ) -> tuple[Self, PyTree]:
-        """Return the planner and the cases unchanged; this planner decides nothing in advance."""
+        """Return the planner and the cases unchanged: there is no choice, such as an order, to fix.
+
+        `plan_of(planner, cases)`, which would make plans to choose from, is not called.
+        """
         return self, cases
 
     def with_settings(self, settings: Settings) -> Self:
@@ -169,9 +176,9 @@ class OptimisedPlanner(Planner[CaseT, PlanT], abc.ABC):
         Only the first round (attempt) is longer. The later rounds are unchanged.
 
         Args:
-            effort: "good" adds one iteration of Newton's method, "best" adds 8. Cases get more
-                iterations while the predicted relative decrease of the cost exceeds 2e-2 ("good")
-                or 1e-7 ("best"). "feasible" returns the planner itself.
+            effort: "good" adds one iteration of Newton's method for each case, "best" adds up to 8.
+                Further iterations follow for cases whose predicted relative decrease of the cost
+                exceeds 2e-2 ("good") or 1e-7 ("best"). "feasible" returns the planner itself.
         """
         require_one_of(EFFORTS, "effort", effort)
         return (

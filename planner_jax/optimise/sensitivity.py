@@ -111,11 +111,11 @@ class Differentiated(OptimisedPlanner):
 
     @property
     def held(self) -> np.ndarray | None:
-        """Variables (n,) bool that a `frozen` stage (search) keeps constant, or None for none."""
+        """Mask (n,) of variables that searches with `Stage.frozen` keep constant; None: no such."""
         return self.planner.held
 
     def divides(self, attempt: Round) -> bool:
-        """Return false, so that the gradient is computed once for a plan, not for each search."""
+        """Return false: starts are not separate problems, each of which would need a gradient."""
         return False
 
     def objective(self, point: Array, context: _Context) -> Evaluation:
@@ -131,7 +131,7 @@ class Differentiated(OptimisedPlanner):
         return self.planner.rules_out(context.inner)
 
     def decode(self, point: Array, context: _Context) -> DifferentiatedPlan:
-        """Return the inner planner's plan at a point (n,), with the gradient of its number."""
+        """Return the inner plan at a point (n,), with the gradient of its number `quantity`."""
         plan = self.planner.decode(point, context.inner)
         return DifferentiatedPlan(
             plan=plan,

@@ -86,8 +86,9 @@ class NewtonConfig:
     max_steps: int = 6
     subspace: int = 4  # number of subspace vectors; 0 uses the preconditioner alone
     damping: float = 1e-4  # initial damping
-    # Multiples of the preconditioner's curvature that are tried at once. The damping is multiplied
-    # by the best multiple, but at least by `ease`; or by `tighten` if no trial lowers the cost.
+    # Each iteration tries one step for each t of these numbers, with t times the preconditioner's
+    # matrix added to the Hessian. Then `damping` is multiplied by the t of the cheapest step, but
+    # at least by `ease`; or by `tighten` if no step lowers the cost.
     trial_dampings: tuple[float, ...] = (0.0, 0.3, 3.0, 30.0)
     ease: float = 0.03
     tighten: float = 1e3
@@ -167,11 +168,11 @@ class Round(Attempt):
 
     @property
     def is_divided(self) -> bool:
-        """Whether the search from each starting point of a case is a problem of its own.
+        """Whether the search from each starting point of a case is a separate problem of the batch.
 
-        This is so for several starting points, a `first` > 0, or a round (attempt) with
-        `settings`. Rounds with equal settings then share a compiled program, for any number of
-        starting points.
+        This is so for several starting points, for starting points other than the first guess, and
+        if `settings` changes fields of the planner. Rounds (attempts) with equal `settings` then
+        share a compiled program, for any number of starting points.
         """
         return self.starts > 1 or self.first > 0 or bool(self.settings)
 
@@ -187,8 +188,9 @@ def load_round(attempt: Round, is_counted: bool) -> Round | Fixed:
     """Convert a round (attempt) to an argument of compiled programs.
 
     Rounds that differ only in L-BFGS's numbers of iterations and tolerances then share one program.
-    A round with a search of 0 iterations is static. If `is_counted`, up to `COUNTED` iterations are
-    static: a GPU then need not ask the host after every iteration whether the loop has ended.
+    A round with a search of 0 iterations becomes a constant of its program, because without
+    iterations the program has no loop. If `is_counted`, numbers of up to `COUNTED` iterations are
+    constants: a GPU then need not ask the host after every iteration whether the loop has ended.
     """
     if any(stage.solver.max_steps == 0 for stage in attempt.all_stages):
         return Fixed(attempt)

@@ -76,7 +76,8 @@ class ReachSet:
     # Bitmaps of the reachable states, (layers + 1, words, levels, headings, cells) uint32. The last
     # axis is over cells along y. The bits of the words on the second axis are cells along x.
     bits: Array
-    # (layers, levels, headings, 2, 2) int32, cells [x, y] that the car moves in each half step.
+    # (layers, levels, headings, 2, 2) int32. The last axis is the number of cells along x and y
+    # that the car moves. The axis before it is the first or second half of the time step.
     moves: Array
     turns: Array  # (layers, levels, 2 SPAN + 1) bool, allowed turns at each level of speed
 
@@ -309,9 +310,9 @@ def _turn(bits: Array, turns: Array) -> Array:
 
 
 def bit_at(bits: Array, level: Array, heading: Array, cell: Array) -> Array:
-    """Test whether a state is marked in a layer (words, levels, headings, cells) of bits.
+    """Test whether a state (speed level, heading bin, cell [x, y]) is marked in a bitmap.
 
-    The state is a speed level, a heading bin and a cell (2,), its indices along x and y.
+    `bits` is (words, levels, headings, cells) uint32. Bit i of word w is the cell 32 w + i along x.
     """
     _, levels, headings, cells = bits.shape
     inside = jnp.all((cell >= 0) & (cell < cells)) & (level >= 0) & (level < levels)

@@ -96,7 +96,7 @@ class Watch:
 
     @property
     def waits(self) -> bool:
-        """True if a time limit or progress reports require waiting for the end of each call."""
+        """Whether the host waits for each compiled call, for a time limit or progress reports."""
         return self._limit is not None or self._progress is not None
 
     @property
@@ -392,10 +392,6 @@ def _cut_unsolved(
 
 @functools.partial(jax.jit, static_argnames=("mesh", "within"))
 def _mark_due(mesh: Mesh, within: float, plans: PyTree) -> tuple[Array, Array]:
-    """Mark plans with a violation above `within` as solved, so that the next search skips them.
-
-    Return the marked statuses, and the number of cases to be tried on each device, (devices,).
-    """
 
     def due(plans: PyTree) -> tuple[Array, Array]:
         near = plans.violation <= within

@@ -22,7 +22,8 @@ class DecidedPlanner(PlannerAround[CaseT, PlanT]):
     `decision` proposes several choices for each case, and `planner` plans the case with every
     choice. The solved plan with the least `decision.rank` is selected, or the plan with the least
     violation if none is solved. The planner's last attempt (search), the longest, is made only for
-    cases that no choice has solved. If `starts_long`, so is every attempt after the first.
+    cases that no choice has solved. If `planner.starts_long(cases)`, which means that even the
+    first attempt takes long, every attempt after the first is made only for such cases.
     """
 
     decision: PyTree  # a `Decision`
@@ -44,7 +45,7 @@ class DecidedPlanner(PlannerAround[CaseT, PlanT]):
         return self.planner.settle(cases.with_choice(choice), plan_of)
 
     def plan_by(self, drive: Drive, cases: PyTree) -> PyTree:
-        """Plan each case with every choice that `decision` proposes; return its best plan."""
+        """Plan each case with every proposed choice, by the loop `drive`; return the best plan."""
         alone = cases.batch_shape == ()
         if not drive.is_pure:
             self.decision.check(cases)

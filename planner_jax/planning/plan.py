@@ -201,7 +201,10 @@ class Driver:
     def __call__(
         self, planner: Planner, cases: PyTree, attempts: Sequence[Attempt] | None = None
     ) -> tuple[PyTree, PyTree]:
-        """Plan by `attempts` (searches), or all; return plans, and a mask or count of unsolved."""
+        """Plan by these attempts (searches), or by all attempts of the planner.
+
+        Returns the plans, and a count or mask of unsolved cases, which is zero if all are solved.
+        """
         if planner.kind is Kind.COMPOSITE:
             plans = planner.plan_by(self, cases)
             return plans, is_unsolved(plans.status)

@@ -166,7 +166,7 @@ class _NotStoredError(Exception):
 
 
 def _folder() -> Path | None:
-    """Return the folder of the programs, within the folder of JAX's cache if that is in use."""
+    """Return the folder of stored traced programs in JAX's cache; None if this is off or remote."""
     chosen = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
     is_on = os.environ.get(SWITCH) != "off" and jax.config.jax_enable_compilation_cache  # type: ignore[attr-defined]
     return Path(chosen, "traced") if chosen and is_on and "://" not in str(chosen) else None

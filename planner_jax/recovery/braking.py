@@ -21,7 +21,7 @@ PlanT = TypeVar("PlanT", CarPlan, ArmPlan)
 
 _SPARE = 0.98  # fraction of each limit that braking uses
 _SAMPLES = 400  # number of times at which distances are computed
-_GAP = 1e-3  # [m] least distance at these times, since it may be smaller in between
+_GAP = 1e-3  # [m] accepted distance to obstacles at samples; it may be smaller between samples
 _DECELERATIONS = (1.0, 0.7, 0.4)  # tried decelerations / the car's greatest deceleration
 # Tried final curvatures / the car's greatest curvature. The curvature at the plan's end is tried
 # before these.

@@ -16,7 +16,7 @@ from planner_jax.recovery.case import RecoveryCase
 from planner_jax.robot.quadrotor import QuadrotorPlan
 from planner_jax.trajectory.polynomial import PiecewisePolynomial
 
-# [m], least height of the final position of a starting point above the least allowed height.
+# [m], guessed trajectories end at least this far above the least allowed height.
 _ABOVE_GROUND = 0.2
 # Starting points of the search in the order of trial: rows of a time T_0 [s] and a factor c. The
 # displacement to standstill is d = c T_0 v / 2 for the initial velocity v, and the duration is

@@ -138,7 +138,7 @@ def shield_middle(case: dict, turns: list, positions: list) -> np.ndarray:
 
 
 def clearances(case: dict, links: Sequence, angles: np.ndarray, sampled: np.ndarray) -> dict:
-    """Return the least distances between an arm and its obstacles, for each of `KINDS`.
+    """Return an arm's least distances to the floor, the pole, the rig, its base and itself.
 
     The distance of overlapping solids is minus the penetration depth. If one solid is a capsule,
     the depth is at most its radius, and for two capsules at most the sum of both radii. Distances

@@ -234,7 +234,6 @@ def _extremes(motion: _Motion) -> list[tuple[np.ndarray, np.ndarray]]:
 
 
 def _worst(excess: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return each plan's greatest excess over all joints, pieces and times, its time and joint."""
     by_lane = judging.flat(np.moveaxis(excess, 2, 0))
     lanes, top = np.arange(len(by_lane)), by_lane.argmax(axis=1)
     k, joint, piece = np.unravel_index(top, (*excess.shape[:2], excess.shape[3]))
@@ -273,7 +272,6 @@ def _judge_limits(case: dict, motion: _Motion, extremes: list, relative: float) 
 
 
 def _rest(case: dict, motion: _Motion, stays: np.ndarray) -> tuple[tuple, np.ndarray]:
-    """Test that a motion ends at standstill if the case requires it or the contact is later."""
     rates = np.abs(judging.derivative(motion.coeffs[..., -1], motion.durations[:, -1], 1))
     has_to = (case["ends_at_rest"] != 0.0) | (stays > judging.CONTACT_TIME_TOLERANCE)
     time = motion.starts[:, -1] + motion.durations[:, -1]
@@ -348,7 +346,6 @@ def _judge_contact(case: dict, angles: np.ndarray, relative: float, contact: flo
 
 
 def _tunnel(case: dict, contact: float) -> tuple:
-    """Test that the contact is in the outer box, and before the ball enters the protected box."""
     time = case["plan.contact_time"]
 
     def off(grown: float) -> np.ndarray:

@@ -315,7 +315,6 @@ def _test_order(
 
 
 def _judge_catches(case, pieces, held, ends, net_test: str, tolerances: dict) -> tuple[dict, dict]:
-    """Measure and test the distance and the angle between net and target at all catches."""
     each = pieces.durations.shape[1] // held.shape[1]
     tail = np.moveaxis(pieces.coeffs[:, :, each - 1 :: each], -1, 0)
     spans = pieces.durations[:, each - 1 :: each]
@@ -362,7 +361,6 @@ def _catch_time(case: dict, held: np.ndarray, ends: np.ndarray) -> tuple:
 
 
 def _worst(test: tuple, held: np.ndarray) -> tuple:
-    """Reduce a test (failed, excess, time) of catches (B, N) to the worst catch of each plan."""
     failed, excess, time = test
     failed = failed & held
     value = np.where(failed | (held & np.isnan(excess)), excess, -np.inf)

@@ -28,9 +28,9 @@ class ExtraLimit(Protocol):
 # Number of intervals between samples that are searched more finely, and number of their
 # refinements. Each refinement reduces an interval to a quarter of its length.
 _REFINED, _REFINEMENTS = 6, 4
-# Slope that replaces the first line (see `_worst_excess`) in a piece's first interval, which has
-# no two samples before it. In the last interval minus this number replaces the second line. So
-# steep a line bounds nothing, and the excess is bounded by the other line alone.
+# The excess in an interval is bounded by two lines, through the two samples before the interval and
+# through the two samples after it. A piece's first and last intervals lack one of these lines. A
+# line of this slope replaces it. It is so steep that only the other line bounds the excess.
 _STEEP = 1e9
 
 

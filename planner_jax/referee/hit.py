@@ -76,8 +76,9 @@ def referee_hits(
 ) -> HitVerdict:
     """Decide for every plan of a batch of hits whether it succeeds.
 
-    The impact is at the end of the trajectory. Errors of the state at time 0 and jumps between
-    pieces count as displacement (`referee.quadrotor.joint_errors`).
+    The impact is at the end of the trajectory. An error e of the n-th derivative at time 0, or a
+    jump by e between pieces, counts as the displacement |e| h^n / n!, with pieces of mean duration
+    h (at least 0.1 s).
 
     Args:
         cases: object with the fields of `HitCase`, for B cases.
@@ -195,7 +196,7 @@ def _return_in_air(state, height, drag, gravity) -> tuple:
 
 
 def _return_in_vacuum(state, height, gravity) -> tuple:
-    """Compute the results of `_return_in_air` for a ball without drag, in closed form."""
+    """Return greatest height and its time, landing point and its time, for balls without drag."""
     pos, vel = state[:3], state[3:]
     apex_time = np.maximum(vel[2], 0.0) / gravity
     apex = pos[2] + 0.5 * gravity * apex_time**2

@@ -299,7 +299,7 @@ def _judge_limits(case: dict, span: np.ndarray, relative: float) -> tuple[dict, 
 
 
 def _integrate_poses(case: dict, span: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Integrate B motions to poses (B, S, 3) of the body's middle at S times (B, S) [s] each."""
+    """Return times (B, S) [s] and poses (B, S, 3) of the body's middle; knots are `span` apart."""
     v, k = case["plan.speed"][..., None], case["plan.curvature"][..., None]
     num, h = v.shape[1] - 1, span[:, None, None]
     v0, k0 = v[:, :-1], k[:, :-1]
@@ -334,7 +334,7 @@ def _integrate_poses(case: dict, span: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 
 def _judge_clearance(case: dict, times: np.ndarray, poses: np.ndarray, contact: float) -> tuple:
-    """Test that the car's body stays in the map and off obstacles; also measure the distances."""
+    """Test that the body stays in the map and off obstacles, within `contact` [m]; also measure."""
     middle = poses[..., :2]
     outside = np.maximum(case["lower"][:, None] - middle, middle - case["upper"][:, None])
     off, when = _greatest(outside.max(axis=2), times)

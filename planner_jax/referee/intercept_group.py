@@ -89,7 +89,6 @@ def referee_groups(
 
 
 def _leg(shared: Any, target: Any, begin: np.ndarray, car: tuple) -> SimpleNamespace:
-    """Return the interception cases of one leg; their times count from its start `begin` [s]."""
     movers, (start, speed, curvature) = shared.movers, car
     centre = movers.centre + begin[:, None, None] * np.asarray(movers.velocity, np.float64)
     own = {"start": start, "speed": speed, "curvature": curvature, "target": target}

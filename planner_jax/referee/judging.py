@@ -209,7 +209,7 @@ def first_failures(tests: dict, limits: tuple[str, ...], finite: np.ndarray) -> 
 
 
 def clear_where(invalid: np.ndarray, tests: dict) -> dict:
-    """Return tests (failed, excess, time) by name that pass, with excess 0, for invalid plans."""
+    """Return all tests (failed, excess, time), set to passed with excess 0 for invalid plans."""
     return {
         name: (failed & ~invalid, np.where(invalid, 0.0, excess), time)
         for name, (failed, excess, time) in tests.items()

@@ -108,7 +108,7 @@ _PRODUCT, _SEARCHED = 250_000, 1024
 
 
 def intervals_of(num_pieces: int) -> int:
-    """Return in how many intervals each piece is sampled, if `num_pieces` precede a contact."""
+    """Return a piece's number of sampling intervals, at least 16, and 400 for all `num_pieces`."""
     return max(math.ceil(_INTERVALS / num_pieces), _FEWEST_INTERVALS)
 
 
@@ -121,7 +121,7 @@ def check_coeffs(value: ArrayLike) -> np.ndarray:
 
 
 def read_flight(cases, plans) -> dict[str, np.ndarray]:
-    """Read the arrays of cases and plans for the tests of the flight, except the start state."""
+    """Read trajectories, limits, gravity and recovery as arrays by name, as "limits.speed"."""
     coeffs = check_coeffs(plans.trajectory.coeffs)
     num_lanes, num_pieces = coeffs.shape[:2]
     leaves = {"lane": np.arange(num_lanes), "coeffs": coeffs}
@@ -337,9 +337,17 @@ def judge_motion(
 ) -> tuple[dict, dict]:
     """Test a flight against its case's limits, start state and continuity.
 
-    Returns the measurements of `FlightVerdict`, and tests (failed, excess, time) by name. The
-    dictionary `case` has "head_state" and the arrays of `read_flight`. The tolerance of the start
-    state and of jumps is `continuity` times the largest coordinate at ends of pieces (>= 1 m).
+    Args:
+        pieces: polynomial pieces of B plans.
+        case: arrays by name, such as the start state "head_state" and "limits.speed".
+        extras: the user's extra limits.
+        intervals: number of sampling intervals of each piece.
+        relative: relative tolerance of each limit.
+        continuity: tolerance of the start state and of jumps between pieces, relative to the
+            largest coordinate at ends of pieces (at least 1 m).
+
+    Returns:
+        The measurements of `FlightVerdict`, and tests (failed, excess, time), by name.
     """
     found = peaks(pieces, case["gravity"], intervals)
     head, jump, jump_time, scale = joint_errors(pieces, case["head_state"])
@@ -391,7 +399,6 @@ def judge_motion(
 
 
 def _judge_rest(case: dict, pieces: Pieces, continuity: float) -> dict:
-    """Test that recovery trajectories end at standstill; the result is empty without a recovery."""
     if "recovery.coeffs" not in case:
         return {}
     durations = case["recovery.durations"]

@@ -15,7 +15,7 @@ _NUMBERS = 250_000  # greatest number of samples computed at once, so that they 
 
 
 def judge_rotors(pieces: Pieces, case: dict, u: np.ndarray, relative: float) -> tuple[dict, dict]:
-    """Measure and test each plan's least and greatest rotor thrust [N] at fractions u of pieces."""
+    """Measure rotor thrusts [N] at fractions u of pieces; test limits with tolerance `relative`."""
     parts = [
         _rotor_range(pieces.of(lanes), {name: leaf[lanes] for name, leaf in case.items()}, u)
         for lanes in cut(len(pieces.durations), max(_NUMBERS // (pieces.flown[0].size * u.size), 1))

@@ -123,7 +123,6 @@ def knots_at(end: Array, speed: Array, curvature: Array, time: Array) -> tuple[A
 
 
 def _setpoint_at(leaves: tuple[Array, Array, Array, Array], time: Array) -> dict[str, Array]:
-    """Return the fields of `CarSetpoints`, except `time`, of one plan at a time () [s]."""
     start, end, speed, curvature = leaves
     pose = pose_at(start, end, speed, curvature, time)
     v, c, acceleration = knots_at(end, speed, curvature, time)

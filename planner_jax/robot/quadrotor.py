@@ -25,7 +25,7 @@ _SHORTEST = 1e-3  # [s], least time in `beyond_reach`; avoids the product of zer
 
 @struct.dataclass
 class RotorLimits:
-    """Least and greatest thrust of each rotor, and the numbers that relate thrusts to motion."""
+    """Thrust limits of a rotor, and mass, inertia and mixer, which give the thrusts of a motion."""
 
     mass: Array  # () [kg], of the quadrotor
     inertia: Array  # (3,) [kg m^2], principal moments about the body's axes
@@ -295,7 +295,7 @@ class QuadrotorPlan(Plan):
 
 
 def setpoint_at(leaves: tuple[PiecewisePolynomial, Array], time: Array) -> dict[str, Array]:
-    """Return the fields of `QuadrotorSetpoints`, except `time`, of one plan at a time () [s]."""
+    """Return the `QuadrotorSetpoints`, except `time`, of (trajectory, gravity) at a time () [s]."""
     path, gravity = leaves
     pos, vel, acc, jerk = (evaluate(path, time, order) for order in range(4))
     return {

@@ -1,6 +1,6 @@
 """Description of a quadrotor: body, rotors, tool and limits, for planner, referee and simulation.
 
-The robots of the papers are defined here, all others in `quadrotor_models`.
+The quadrotors of [Yu2023catch] and [Yu2023bat] are defined here, others in `quadrotor_models`.
 
 Body frame: x forward, y left, z along the thrust. The origin is the centre of mass, which lies in
 the plane of the propellers. SI units. This module imports no JAX.
@@ -169,7 +169,7 @@ class QuadrotorModel:
 
     @property
     def thrust_bounds(self) -> tuple[float, float]:
-        """Least and greatest thrust per unit mass [m/s^2], by `limits.thrust` or by the rotors."""
+        """Least, greatest thrust per unit mass [m/s^2]: `limits.thrust`; if None, by the rotors."""
         if self.limits.thrust is not None:
             return self.limits.thrust
         low, high = self.rotor_range or (self.rotors.min_thrust, self.rotors.max_thrust)
@@ -193,11 +193,11 @@ def _require(name: str, value: object, rule: str, holds: Callable[[float], bool]
 
 
 # The quadrotor of [Yu2023catch]. Height and radius of the net are from Fig. 6 and the diagonal is
-# from the paper. The limits are this library's, since the paper states none. The papers state
-# neither mass, inertia nor rotors. Assumptions: 0.9 kg of computer, battery and frame within 5 cm
-# of the centre, and 75 g of motor and propeller at the end of each arm. The greatest thrust is four
-# times the weight; plans use up to 2.5 times, so that a reserve remains for the controller. As in
-# the papers, plans do not limit the thrusts of single rotors.
+# from the paper. The limits are this library's, since the paper states none. It also states neither
+# mass, inertia nor rotors. Assumptions: 0.9 kg of computer, battery and frame within 5 cm of the
+# centre, and 75 g of motor and propeller at the end of each arm. The greatest thrust is four times
+# the weight; plans use up to 2.5 times, so that a reserve remains for the controller. As in the
+# paper, plans do not limit the thrusts of single rotors.
 PAPER_CATCHER = QuadrotorModel(
     name="paper-catcher",
     mass=1.2,

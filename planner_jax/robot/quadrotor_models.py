@@ -1,7 +1,7 @@
-"""Quadrotors by name: the robots of the papers, and three robots with published numbers.
+"""Quadrotors by name: those of [Yu2023catch] and [Yu2023bat], a Crazyflie, a racer and an X500.
 
 Numbers without a source are assumptions; the field `source` of a robot lists them. All tools are
-massless. The limits, and the tools of the three published robots, are assumptions.
+massless. All limits, and the tools of Crazyflie, racer and X500, are assumptions.
 """
 
 import dataclasses

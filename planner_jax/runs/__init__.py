@@ -1,1 +1,1 @@
-"""Folders of runs, in which sweeps and flights store their manifest, rows, table and figures."""
+"""Folders in which many planned and judged problems are stored: manifest, rows and figures."""

@@ -118,7 +118,6 @@ def leaf_columns(batch: RefereedBatch) -> list[Column]:
 
 
 def _columns_of(tree: PyTree, name: str, path: str, words: Mapping[str, str]) -> Iterator[Column]:
-    """Yield a column for each leaf of `tree`, which has the dotted `path` in a `RefereedBatch`."""
     if dataclasses.is_dataclass(tree):
         for f in dataclasses.fields(tree):
             if f.metadata.get("pytree_node", True):  # a static field has one value for all rows

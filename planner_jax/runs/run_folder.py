@@ -176,7 +176,7 @@ class RunFolder:
 
 @dataclasses.dataclass(frozen=True)
 class RunRows:
-    """Manifest and rows of a finished run (a sweep or flights), from which figures are drawn."""
+    """Manifest of a finished run and its rows, one for each planned problem, for the figures."""
 
     folder: RunFolder
     manifest: Entries
