@@ -5,9 +5,10 @@
 
 A robot arm blocks thrown balls with a shield. Balls are drawn from the suite `pole`, in which a
 pole stands in front of the arm. Each ball must meet the middle of the shield at a right angle, and
-the arm may start at time 0. Without --library a library of motions is built first, for the joint
-limits --regime and a division --layout of the space around the arm into cells. These planners get
-the same balls:
+the arm may start as soon as the ball is seen. A ball flies through a cell (rectangle) of an outer
+box and then of an inner box around the arm. The library stores a motion for each pair of cells.
+Without --library a library is built first, for the joint limits --regime and the division --layout
+of the boxes into cells. These planners get the same balls:
 * `adapt`, with its short search alone, and with a longer search if the short one fails;
 * planners that try 6 or 48 straight motions, in which all joints move in proportion;
 * the default planner `online`;

@@ -71,7 +71,9 @@ def time_call(function: Any, *arguments: Any, **how: Any) -> tuple[Any, float]:
 def build_timed(bench: Bench, path: Path, layout: str, regime: str) -> Library:
     """Build a library of block motions in the file `path`; report build time and compile time.
 
-    `layout` names the division of two boxes around the arm into cells, `regime` the joint limits.
+    A ball flies through a cell (rectangle) of an outer box and then of an inner box around the arm.
+    The library stores a motion for each pair of cells. `layout` names the division of the boxes
+    into cells, `regime` the joint limits.
     """
     given: Any = REGIMES[regime]
     at_rest: Any = np.asarray(given.ends_at_rest)
@@ -80,8 +82,9 @@ def build_timed(bench: Bench, path: Path, layout: str, regime: str) -> Library:
     home = irb1600().home
     own = LAYOUTS[layout]
     tunnel = tunnels(own, scene.inner, scene.outer)
-    # Some pairs of cells are planned only to compile the programs of every batch size. They are
-    # spread over all pairs, so that some also need, and compile, the search by least squares.
+    # Motions for some pairs of cells are planned only to compile the programs of every batch size.
+    # These pairs are spread over all pairs, so that straight motions fail for some of them. Those
+    # need, and compile, the search by least squares.
     few = np.flatnonzero(tunnel.is_feasible)[:: tunnel.is_feasible.sum() // 64]
     began = time.perf_counter()
     for size in set(building.portions().lanes):
@@ -97,7 +100,6 @@ def build_timed(bench: Bench, path: Path, layout: str, regime: str) -> Library:
 
 
 def describe(bench: Bench, library: Library) -> None:
-    """Report the share of pairs (outer cell, inner cell) with a stored motion, and size [MB]."""
     covered = coverage(library)
     shares = {
         "feasible": float(covered.share(covered.is_feasible)[0]),
@@ -115,11 +117,10 @@ def describe(bench: Bench, library: Library) -> None:
 
 
 def referee(bench: Bench, library: Library, num: int, name: str) -> None:
-    """Draw `num` balls through pairs of cells with stored motions; report how many are blocked.
+    """Draw `num` balls for which the library stores motions; report how many are blocked.
 
-    The referee, an independent check in float64, judges each motion. The function also counts
-    motions that the planner reports as blocking and the referee rejects. `name` labels the printed
-    line.
+    The referee, an independent check in float64, judges each motion. Also report how many motions
+    the planner reports as blocking and the referee rejects. `name` labels the printed line.
     """
     found = check(library, num, SEED)
     wrong = int((found.claimed & ~found.verdict.success).sum())
@@ -181,7 +182,10 @@ class OneBall:
     """
 
     def __init__(self, library: Library, gravity: float = 9.81, home: int = 0):
-        """Compile the lookup for the home pose (start pose) number `home`; gravity in [m/s^2]."""
+        """Compile the lookup of motions that start at the library's home pose with index `home`.
+
+        `gravity` is in [m/s^2].
+        """
         own = library.table
 
         def pack_rows(rows: Array, vector: Array) -> Array:
@@ -214,7 +218,7 @@ class OneBall:
 
 
 def single_queries(bench: Bench, library: Library, num: int) -> None:
-    """Look up `num` balls one after another, and report quantiles of the time for one ball."""
+    """Look up stored motions for `num` balls one by one, and report quantiles of the time."""
     one, cases = OneBall(library), pj.block.draw(min(num, 2000), "pole", SEED)
     balls = list(zip(np.asarray(cases.ball.pos), np.asarray(cases.ball.vel), strict=True))
     seconds = []
@@ -239,7 +243,10 @@ def look_up(table: Table, balls: BallState, gravity: Any) -> Answer:
 
 
 def batch_queries(bench: Bench, library: Library, batch: int) -> None:
-    """Report how many balls per second the default device looks up in a batch of `batch` balls."""
+    """Report for how many balls per second the default device looks up the stored arm motion.
+
+    All `batch` balls are looked up in one call.
+    """
     cases = pj.block.draw(2000, "pole", SEED)
     pick = np.random.default_rng(SEED).integers(0, 2000, batch)
     balls = jax.device_put(jax.tree.map(lambda leaf: np.asarray(leaf)[pick], cases.ball))
@@ -262,9 +269,10 @@ def batch_queries(bench: Bench, library: Library, batch: int) -> None:
 
 
 def measure_repair(bench: Bench, library: Library, shift: float, num: int) -> None:
-    """Move the pole along y by `shift` [m], and time planning again all motions that now collide.
+    """Move an obstacle, and time planning again the stored arm motions that collide with it.
 
-    Then draw `num` balls. Report how many the changed library blocks, according to the referee, an
+    The obstacle is the pole in front of the arm. It moves along y by `shift` [m]. Then draw `num`
+    balls, and report how many of them the repaired library blocks, according to the referee, an
     independent check.
     """
     scene = library.setting.scene
@@ -298,8 +306,9 @@ def measure(bench: Bench, options: argparse.Namespace) -> None:
 def library_options(parser: argparse.ArgumentParser, layout: str) -> argparse.Namespace:
     """Add the options --library, --layout and --regime to a parser, and parse the command line.
 
-    --layout names the division of two boxes around the arm into cells, and `layout` is its default.
-    --regime names a set of joint limits. An unknown name ends the program with an error.
+    --library is a file of stored block motions. --layout names how two boxes around the arm,
+    through which balls fly, are divided into cells; `layout` is its default. --regime names a set
+    of joint limits. An unknown name ends the program with an error.
     """
     parser.add_argument("--library", type=Path, help="file of a built library; default: build one")
     known = ", ".join(LAYOUTS)

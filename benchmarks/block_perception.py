@@ -83,9 +83,11 @@ RENDERED_RATE = 60.0  # [Hz] Frame rate of rendered images.
 TIMED = 200  # Number of camera frames, and of flight fits, that are timed.
 OVERHEAD = 0.05  # [s] Time from a camera frame until the motion that uses it may start.
 PARTS = ("errors", "images", "pipeline", "planning")
-# Row of the table -> (noise, times, options). The noise is the standard deviation [m] of each
-# observed coordinate, or None for the noise of a stereo camera. The arm plans from the first to the
-# last time [s] at a rate [Hz]. The options are arguments of `decide`, which simulates the arm.
+# Row of the table of simulated arms -> (noise, times, options). The noise is the standard deviation
+# [m] of each observed coordinate, or None for the noise of a stereo camera. The arm plans from the
+# first to the last time [s] at a rate [Hz]. Options of `decide`, which simulates the arm: `patient`
+# lets the arm wait for more observations while it can still block; without `again` the arm plans
+# only one motion.
 PIPELINES: dict[str, tuple[float | None, tuple[float, float, float], dict[str, Any]]] = {
     "once": (0.02, (0.25, 0.25, 60.0), {}),
     "once, stereo": (None, (0.25, 0.25, 60.0), {}),
@@ -386,9 +388,10 @@ def planning(bench: Bench, num: int, seed: int) -> None:
 def time_with_aims(planner: Any, entries: Any) -> tuple[Any, np.ndarray]:
     """Plan B problems one by one, and time the planner.
 
-    A fitted ball is not exact, so each problem is first planned with stricter limits on the contact
-    (an aim, see `studies.block.receding`). Weaker limits follow until a plan is solved. Returns the
-    plans, and for each problem the total planning time, (B,) [s].
+    The ball's position is only an estimate. Each problem is therefore first planned with a contact
+    within 5 mm of the shield's centre and an arm at standstill. Until a plan is solved, it is
+    planned again without standstill, then within 3 cm and within 9 cm. Returns the plans, and for
+    each problem the total planning time, (B,) [s].
     """
     (num,), own = entries.batch_shape, isinstance(planner, ReplanBlock)
     aimed = []

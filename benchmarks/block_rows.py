@@ -42,7 +42,8 @@ from planner_jax.task.block.end_poses import end_poses, flight_of
 
 # [s] In rows named "late" the arm may start only this long after the ball is first seen.
 LATE = 0.133
-# Row of the table -> suite of throws, and options with which `pj.block.draw` draws them.
+# Row of the printed table -> suite of throws, and options of `pj.block.draw`. R1 and R2 are sets of
+# joint limits. In rows named "wide" the ball may meet the shield off its centre and at a slant.
 ROWS: dict[str, tuple[str, dict[str, Any]]] = {
     "R1": ("pole", {"regime": "R1"}),
     "R1 late": ("pole", {"regime": "R1", "delay": LATE}),
@@ -122,7 +123,6 @@ def search_long(cases: pj.block.BlockCase, index: np.ndarray, starts: int, lanes
 
 
 def find_blocked(cases: pj.block.BlockCase, planner: Any) -> np.ndarray:
-    """Return for each case (B,) whether an independent check accepts the planner's block."""
     plans = pj.plan(planner, cases)
     return np.asarray(pj.block.judge(cases, plans).success & pj.are_solved(plans))
 
@@ -156,7 +156,8 @@ def measure(bench: Bench, name: str, options: Any) -> dict[str, np.ndarray]:
 def write_throws(path: Path, results: dict[str, dict[str, np.ndarray]], options: Any) -> None:
     """Write a CSV file with each throw's position and velocity, and which methods block it.
 
-    A cell of the columns of methods has one digit for each row of the printed table.
+    A throw is used in several rows of the printed table, which differ in limits. The column of a
+    method has one digit for each of these rows: 1 if the method blocks the throw, 0 if not.
     """
     suites = {ROWS[name][0]: [] for name in results}
     for name in results:

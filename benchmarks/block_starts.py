@@ -52,10 +52,12 @@ SHARES = tuple(np.arange(1, 33) / 32)  # Sampled times of a motion, divided by i
 
 
 def random_starts(rng: np.random.Generator, num: int) -> tuple[np.ndarray, np.ndarray]:
-    """Draw `num` starting points of the search by least squares.
+    """Draw `num` initial motions from which a least-squares search of block motions starts.
 
-    Returns bumps (num, 6) [rad], which are the greatest deviations of the joints from a straight
-    motion, and ranks (num,) of end poses in the planner's order.
+    An initial motion is a straight motion, in which all joints move in proportion to an end pose,
+    plus a bump. Returns bumps (num, 6) [rad], the greatest deviations of the joints from the
+    straight motion, and ranks (num,) of end poses. The planner sorts the end poses of a throw; rank
+    0 is its first choice.
     """
     bumps = rng.normal(size=(num, 6)) * SPREAD * rng.uniform(0.3, 1.8, (num, 1))
     return bumps, rng.integers(0, LATER_RANKS, num)
@@ -63,7 +65,7 @@ def random_starts(rng: np.random.Generator, num: int) -> tuple[np.ndarray, np.nd
 
 @struct.dataclass
 class Followed:
-    """Result of a least-squares search from one starting point."""
+    """Result of a least-squares search of a block motion from one initial motion of the arm."""
 
     plan: BlockPlan
     point: Array  # (n,), the planner's unknowns at the end of the search
@@ -104,7 +106,16 @@ def follow(
 def try_starts(
     planner: online.OnlineBlock, cases: pj.block.BlockCase, bumps: Array, ranks: Array, steps: Array
 ) -> tuple[Array, Array]:
-    """Run least squares for B cases, each from one starting point (see `follow`).
+    """Search block motions by least squares for B cases, each from one initial motion.
+
+    An initial motion is a straight motion, in which all joints move in proportion, plus a bump.
+
+    Args:
+        planner: defines the unknowns and residuals.
+        cases: B cases.
+        bumps: (B, 6) [rad], greatest deviation of each joint from the straight motion.
+        ranks: (B,) int, indices of end poses in the planner's order.
+        steps: () int, maximum number of least-squares steps.
 
     Returns:
         is_good: (B,) bool, whether the plan is solved.
@@ -201,7 +212,8 @@ def learn(bench: Bench, num: int, tries: int, lanes: int) -> list[dict[str, Any]
     # Otherwise most of them would come from easy throws, which nearly every starting point solves.
     some = [rng.permutation(np.flatnonzero(good & (places == throw)))[:8] for throw in solvable]
     picked = np.concatenate(some)
-    # Typical deviations are cluster centres of the found deviations. The initial centres are drawn
+    # The planned motions deviate from straight motions, in which all joints move in proportion. The
+    # cluster centres of these deviations are candidates for bumps. The initial centres are drawn
     # here: the argument `seed` of `kmeans2` is deprecated, and its argument `rng` would draw other
     # numbers than the shipped file used.
     first = np.random.RandomState(1).choice(len(picked), min(KINDS, len(picked)), replace=False)

@@ -75,7 +75,10 @@ def read_set(path: Path, dtype) -> tuple[pj.catch.CatchCase, dict[str, np.ndarra
 
 
 def guess_cost(planner: PaperCatch, case: pj.catch.CatchCase) -> jax.Array:
-    """Return the cost at the planner's initial guess for a case, in the published costs' unit."""
+    """Return the cost [Yu2023catch, eqs 18-28] at the planner's initial guess for a case.
+
+    The planner divides its cost by `COST_UNIT`; the returned cost is multiplied by it.
+    """
     context = planner.prepare(case)
     return COST_UNIT * planner.objective(planner.guesses(context, 1)[0], context).cost
 
@@ -117,8 +120,8 @@ def throughput(planner, cases: pj.catch.CatchCase) -> str:
 def report_paper_planner(bench: Bench, data: Path) -> None:
     """Print how far the costs of the planner `catch` in float64 are from the published costs.
 
-    The costs are computed at the initial guess and at the end of the search. The published costs
-    are in the files of the folder `data`.
+    The planner minimises the objective of [Yu2023catch]. The costs at the initial guess and at the
+    end of the search are compared with the costs in the files of the folder `data`.
     """
     with jax.enable_x64(True):
         for name in SETS:
@@ -141,11 +144,11 @@ def _gap(plans, known: dict[str, np.ndarray]) -> str:
 
 
 def quick_paper_catch() -> PaperCatch:
-    """Return a `PaperCatch` with few iterations, for the measurement of its speed.
+    """Return a planner that minimises the objective of [Yu2023catch] in few iterations.
 
-    On most throws of the hard set its costs are within 1e-3 (relative) of the optimum. The first
-    stage of the search checks limits at a quarter of the samples, the second stage at all samples.
-    Both stages use the published weights of the penalties.
+    Its speed is measured. On most of the 240 throws its costs are within 1e-3 (relative) of the
+    optimum. The first stage of the search checks limits at a quarter of the samples, the second
+    stage at all samples. The weights of the penalties are as published with [Yu2023catch].
     """
     chosen = PaperCatch()
     (full,) = chosen.rounds
@@ -156,7 +159,11 @@ def quick_paper_catch() -> PaperCatch:
 
 
 def report_set(bench: Bench, data: Path, name: str, repeats: int) -> None:
-    """Print cost, success and speed of `catch` and `exact` on the set `name`, in float32."""
+    """Print cost, success and speed of two planners on a set of published throws, in float32.
+
+    The planner `catch` minimises the objective of [Yu2023catch], `exact` is the default planner.
+    The set `name` is "paper" for easy and "hard" for hard throws, in a file of the folder `data`.
+    """
     cases, known = read_set(data / f"catch_{name}.csv", jnp.float32)
     quick, exact = quick_paper_catch(), pj.catch.ExactCatch()
     bench.say(
@@ -177,7 +184,10 @@ def report_set(bench: Bench, data: Path, name: str, repeats: int) -> None:
 
 
 def report_peer(bench: Bench, data: Path) -> None:
-    """Print speed and cost of the C++ program `catch_peer` on the easy and the hard throws."""
+    """Print speed and cost of this project's C++ program on both published sets of throws.
+
+    The sets "paper" (easy) and "hard" are files in the folder `data`.
+    """
     with tempfile.TemporaryDirectory(prefix="catch-peer-") as folder:
         program = peer.build(Path(folder))
         if program is None:

@@ -91,14 +91,18 @@ class Estimator:
 
 @dataclasses.dataclass
 class Times:
-    """Durations [s] of calls in all simulated throws, and counts of rejected re-plans."""
+    """Durations [s] of estimates, first plans and re-plans in all throws, and counts of failures.
+
+    A re-plan fails if it takes longer than the time between two observations, or violates a limit.
+    """
 
     estimate: list[float] = dataclasses.field(default_factory=list)
     first: list[float] = dataclasses.field(default_factory=list)
     again: list[float] = dataclasses.field(default_factory=list)
     missed: int = 0  # number of re-plans that took longer than a period
     broken: int = 0  # number of re-plans that violate a limit
-    # The first `COMPARED` re-planning problems, with their plans.
+    # The first 1,024 re-planning problems with their plans, whose costs are compared with the costs
+    # of a longer search.
     replans: list[tuple[Any, CatchPlan]] = dataclasses.field(default_factory=list)
 
     def keep(self, left: Any, found: CatchPlan) -> None:
@@ -128,9 +132,9 @@ def balls_of(case: CatchCase) -> pj.BallPath:
 
 
 def first_plan(case: CatchCase) -> tuple[CatchCase, CatchPlan]:
-    """Plan a catch from scratch, for an estimate of the earliest time at which it is possible.
+    """Estimate the earliest time at which the ball can be caught, and plan a catch from scratch.
 
-    Returns the case with this time, and the plan.
+    The planner's search starts from this time. Returns the case with the time, and the plan.
     """
     case = case.with_choice(jax.tree.map(lambda leaf: np.asarray(leaf)[0], _propose(case)))
     return case, pj.plan(SCRATCH, case)
@@ -239,7 +243,7 @@ def judge(cases: CatchCase, plans: list[CatchPlan]) -> dict[str, np.ndarray]:
 
 
 def report_times(bench: Bench, name: str, seconds: list[float]) -> None:
-    """Print one line with percentiles of durations `seconds`, and store them as a row."""
+    """Print percentiles of durations [s], and store them in the run folder under `name`."""
     p50, p90, p99 = 1e3 * np.percentile(seconds, [50, 90, 99])
     bench.row(name=name, num=len(seconds), p50_ms=p50, p90_ms=p90, p99_ms=p99)
     bench.say(

@@ -3,11 +3,15 @@
     python -m benchmarks.catch_rows [--suites throws,hard] [--planners exact,catch,mpp]
         [--decide best] [--num 1000] [--seed 0] [--out DIR]
 
-A quadrotor catches flying targets with a net. A suite is a family of random cases. The referee, an
-independent check in float64, judges every plan with a relative tolerance of 1e-3. The paper's
-planner, here named `catch`, treats limits as penalties, so its plans exceed limits slightly. Every
-plan is therefore judged a second time by the protocol of the published C++ program, which accepts
-limits exceeded by up to 5 % and requires the ball within the net's radius of its centre.
+A quadrotor catches flying targets with a net. A suite is a family of random cases. The option
+--decide sets how the order of several targets is chosen; `best` plans the six most promising orders
+and uses the best plan. The planners are `exact`, the default; `catch`, which reimplements
+[Yu2023catch]; and `mpp`, the motion primitives of [Mueller2015].
+
+The referee, an independent check in float64, judges every plan with a relative tolerance of 1e-3.
+The planner `catch` treats limits as penalties, so its plans exceed limits slightly. Every plan is
+therefore judged a second time by the protocol of the published C++ program, which accepts limits
+exceeded by up to 5 % and requires the ball within the net's radius of its centre.
 """
 
 import argparse

@@ -44,11 +44,12 @@ def cost_gaps(
         cases: a batch; only the first 1,024 cases (`COMPARED`) are compared.
         plans: one plan for each case.
         devices: devices of the long search; None for all devices.
-        card: specification of the planner's task.
+        card: specification of the planner's task. With None there is no other planner, so the
+            result is None for a planner that does not minimise a cost.
 
     Returns:
         (K,), cost / best cost - 1 for the K cases that both searches solve. None if the planner
-        does not minimise a cost and the task names no other planner for this class of cases.
+            does not minimise a cost and the task names no other planner for this class of cases.
     """
     cases, plans = jax.tree.map(lambda leaf: np.asarray(leaf[:COMPARED]), (cases, plans))
     if isinstance(planner, DecidedPlanner):

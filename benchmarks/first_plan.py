@@ -29,7 +29,7 @@ from planner_jax.benchmarks.run import argument_parser, begin, parse_names
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """A row of the table: the cases to plan, as arguments of the task's function `draw`."""
+    """One measurement of a first plan: which cases the task's function `draw` draws for it."""
 
     task: str
     num: int | None = None  # number of cases in a batch; None for one case without a batch axis

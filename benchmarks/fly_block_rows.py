@@ -27,8 +27,9 @@ from planner_jax.benchmarks.run import Bench, argument_parser, begin, parse_name
 from planner_jax.runs.summary import percent, wilson_interval
 from planner_jax.sweep.block.settings import REGIMES
 
-# Row of the table -> fields of `Drives` that differ from drives without errors. The key "share" is
-# not a field of `Drives` but a factor of the torque limits.
+# Row of the printed table -> fields of the simulated joint drives (`Drives`) that differ from
+# drives without errors. The key "share" is not a field of `Drives` but a factor of the torque
+# limits.
 ROWS: dict[str, dict[str, Any]] = {
     "ideal": {},
     "lag 5 ms": {"lag": 0.005},
@@ -51,11 +52,6 @@ HEADER = (
 
 
 def line(regime: str, name: str, flights: Any, seconds: float) -> str:
-    """Format one row of the table as text.
-
-    Joint errors, torques, tracking errors and collisions are computed over the balls that have a
-    plan. `seconds` is the duration of the simulation.
-    """
     from planner_jax.sims.tasks.block_flights import TOUCH
 
     number, good, some = len(flights.miss), flights.success, flights.planned
@@ -86,7 +82,11 @@ def line(regime: str, name: str, flights: Any, seconds: float) -> str:
 
 
 def measure(bench: Bench, regime: str, rows: list[str], options: Any) -> None:
-    """Plan all throws once, simulate the plans in every row, and print the rows of the table."""
+    """Plan all throws once, simulate the plans with different errors of the drives, and print rows.
+
+    Each row has the errors that `ROWS` names, such as a lag of the torques or noise of the
+    encoders. `regime` names the joint limits, `options` are the command-line options.
+    """
     from planner_jax.core.protocol import is_solved
     from planner_jax.runs.timing import measure_plans
     from planner_jax.sims.robots.arm.drives import TORQUES, Drives

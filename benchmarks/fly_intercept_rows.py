@@ -54,7 +54,10 @@ HEADER = (
 
 
 def line(name: str, flights: InterceptFlights, seconds: float) -> str:
-    """Format one row of the table as text; `seconds` is the duration of the simulation."""
+    """Format success, misses, contacts, tracking errors and saturation of simulated drives as text.
+
+    `name` labels the row of the table, and `seconds` is the duration of the simulation.
+    """
     good, miss, number = flights.success, flights.miss, len(flights.miss)
     low, high = wilson_interval(int(good.sum()), number)
     within = " / ".join(percent(int((miss <= d).sum()), number) for d in (NEAR, SUCCESS, FAR))
@@ -88,9 +91,9 @@ def command(settings: InterceptFly) -> str:
 def run_drives(
     settings: InterceptFly, first_plans: dict[tuple, InterceptPlan]
 ) -> tuple[InterceptFlights, float]:
-    """Simulate the drives of a row; return them, and the duration of the simulation [s].
+    """Simulate drives with given settings; return them, and the duration of the simulation [s].
 
-    The plan at the start depends only on observations before the start. Rows with equal
+    The plan at the start depends only on observations before the start. Settings with equal
     observations therefore use the same plans, which are stored in `first_plans`.
     """
     task, key = settings.flight(), (settings.known_target, settings.predict_movers, settings.noise)

@@ -121,9 +121,10 @@ def contact_errors(flown: Flown) -> tuple[np.ndarray, np.ndarray]:
 
 
 def prediction_errors(flown: Flown) -> None:
-    """Print quantiles of the errors of the predicted contact position.
+    """Print quantiles of the errors of the predicted contact position along x, y and z.
 
-    The errors are grouped by the time from the prediction until the contact, see `HORIZONS`.
+    The errors are grouped by the time from the prediction until the contact, in five intervals from
+    0.1 to 1.1 s.
     """
     assert flown.record is not None
     horizon, error = flown.record.horizon[:, :, 0], np.abs(flown.record.error[:, :, 0])
@@ -142,11 +143,21 @@ def prediction_errors(flown: Flown) -> None:
 def catches(
     name: str, loop: Loop, args: Any, drag_error: float, bar: float | None = None, **options: Any
 ) -> CatchFlights | None:
-    """Simulate catches, and print one line: success rate, distances, tracking error and times.
+    """Simulate catches, and print their success rate, errors and times in one line.
 
-    `name` labels the line. The initial estimate of the ball's drag has the relative error
-    `drag_error`. `bar` is the required success rate. Returns the flights, or None if the time limit
-    was exceeded.
+    The errors are the distance of each ball from the net's centre at its catch, and the distance of
+    the flown from the planned trajectory.
+
+    Args:
+        name: label of the line.
+        loop: simulated world, sensor noise and re-planning rate.
+        args: command-line options; `num` flights, `seed`, and the time `limit` [s].
+        drag_error: relative error of the initial estimate of the ball's drag.
+        bar: required success rate; None for none.
+        **options: further arguments of `fly_catches`, such as another planner.
+
+    Returns:
+        The flights, or None if the time limit was exceeded.
     """
     cases = throws(args.num, loop.world.num_balls, args.seed, drag_error=drag_error)
     with limit_time(name, args.limit):
@@ -166,11 +177,21 @@ def catches(
 def hits(
     name: str, loop: Loop, regions: Any, args: Any, drag_error: float, **options: Any
 ) -> HitFlights | None:
-    """Simulate hits, and print one line: landing errors, success rates, tracking error and times.
+    """Simulate hits, and print how near to the target the balls land, errors and times in one line.
 
-    `name` labels the line, and `regions` names the court scenarios from which serves are drawn. The
-    initial estimate of the ball's drag has the relative error `drag_error`. Returns the flights, or
-    None if the time limit was exceeded.
+    The line has the shares of balls that land within 0.5 m and 1 m of the target, and of flights
+    that hit the ball at all.
+
+    Args:
+        name: label of the line.
+        loop: simulated world, sensor noise and re-planning rate.
+        regions: names of the court scenarios from which serves are drawn.
+        args: command-line options; `num` flights, `seed`, and the time `limit` [s].
+        drag_error: relative error of the initial estimate of the ball's drag.
+        **options: further arguments of `fly_hits`, such as another planner.
+
+    Returns:
+        The flights, or None if the time limit was exceeded.
     """
     cases = volleys(args.num, regions, args.seed, drag_error=drag_error)
     with limit_time(name, args.limit):
@@ -187,7 +208,11 @@ def hits(
 
 
 def exact_rows(args: Any) -> None:
-    """Print lines without sensor noise: errors of the contact, and of the hit ball's landing."""
+    """Simulate catches and hits without sensor noise, and print how exactly plans are followed.
+
+    Also print how far flown contacts are from planned contacts, and the share of hit balls that
+    land within 5 cm of the target. `args` are the command-line options.
+    """
     for rate in (0.0, CATCH_RATE):
         name = f"no noise, catch, re-planned {rate:g} Hz"
         if flights := catches(name, Loop(CATCH_WORLD, replan=rate), args, 0.0):

@@ -59,7 +59,10 @@ def report_speed(name: str, steps: int, run: Callable[[], Any]) -> None:
 
 
 def measure_open_loop(world: World, worlds: int, steps: int) -> None:
-    """Report steps per second of the physics alone, with constant rotor thrusts."""
+    """Report steps per second of the physics alone, with constant rotor thrusts.
+
+    `world` is the model of one quadrotor with one ball; `worlds` copies are simulated in a batch.
+    """
     start = at_rest(world, jnp.array(START))
     start = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (worlds, *leaf.shape)), start)
     drag = jnp.zeros(1)
@@ -75,9 +78,10 @@ def measure_open_loop(world: World, worlds: int, steps: int) -> None:
 
 
 def measure_closed_loop(world: World, worlds: int, seconds: float) -> None:
-    """Report steps per second of whole flights without re-planning.
+    """Report physics steps per second of closed-loop flights, which follow one plan each.
 
-    The time does not include planning. `seconds` is the simulated time of each flight.
+    The time does not include planning. `worlds` flights are simulated in a batch, `seconds` of
+    simulated time each. `world` is the model of one quadrotor with one ball.
     """
     loop = Loop(world, NOISES["lab"])
     few = min(worlds, 256)  # Number of different throws, which are repeated to fill the batch.

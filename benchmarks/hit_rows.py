@@ -41,7 +41,11 @@ _TIGHT = {"speed": 2.5, "acceleration": 10.0, "body_rate": 3.0}
 
 
 def cases_of(name: str, serves: Serves) -> pj.hit.HitCase:
-    """Convert serves to cases; the row `name` defines initial positions, delay and limits."""
+    """Convert serves to cases as the row `name` of the published protocol defines.
+
+    For example, in `late-0.5` planning starts 0.5 s after the serve, in `limits-0.7` limits are
+    multiplied by 0.7, and in `uniform-start` initial positions are random.
+    """
     cases = pj.hit.to_cases(serves, **ROWS[name])
     if name != "tight":
         return cases
@@ -56,9 +60,10 @@ def cases_of(name: str, serves: Serves) -> pj.hit.HitCase:
 
 
 def run_row(bench: Bench, name: str, serves: Serves) -> dict[str, Any]:
-    """Plan the serves of the row `name` of the table; return success rate, costs and times.
+    """Plan serves as the row `name`, such as `late-0.5`, defines; return success, costs and times.
 
-    The successes are added to the run's summary.
+    In `late-0.5` planning starts 0.5 s after the serve. The successes are added to the run's
+    summary.
     """
     drag_after = name == "drag-after-impact"
     planner = pj.hit.planner("exact", drag_after_impact=drag_after)

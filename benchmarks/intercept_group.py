@@ -126,9 +126,11 @@ def _meet_in_order(
 
 
 def time_planning(groups: InterceptGroup, decide: str | Best) -> tuple[GroupPlan, float, float]:
-    """Plan all groups twice, with the method `decide` to order the targets.
+    """Plan all groups of targets twice, with one method to decide the order of the targets.
 
-    Returns the plans, and the durations [s] of the first call, which compiles, and of the second.
+    `decide` is "greedy" (next the target that can be met next), "given" (the drawn order), or
+    `Best(n)` (plan the n most promising orders, and use the best plan). Returns the plans, and the
+    durations [s] of the first call, which compiles, and of the second.
     """
     planner, began = pj.group.planner(decide=decide), time.perf_counter()
     pj.plan(planner, groups)
@@ -138,7 +140,10 @@ def time_planning(groups: InterceptGroup, decide: str | Best) -> tuple[GroupPlan
 
 
 def measure(bench: Bench, options: argparse.Namespace) -> None:
-    """Plan the groups with all four methods to order targets, and print a row for each."""
+    """Plan the groups with each method to order the targets, and print a row for each method.
+
+    The methods plan all six orders, the three most promising, the greedy order, or a random order.
+    """
     groups = draw(options.num, options.seed)
     least, found = limit_times(groups), {}
     for name, decide in DECISIONS.items():

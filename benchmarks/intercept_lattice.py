@@ -122,9 +122,10 @@ def _round(value: np.ndarray) -> np.ndarray:
 
 
 class Lattice:
-    """Search of all states that a car can reach in one scene, with given settings (`Rules`).
+    """Search of all states (position, heading and speed) that a car can reach in one scene.
 
-    Methods represent a set of cells as an integer, with one bit for each cell.
+    `rules` states how turns are rounded, and which discs replace the car's body. Methods represent
+    a set of cells as an integer, with one bit for each cell.
     """
 
     def __init__(self, scene: Scene, rules: Rules):
@@ -321,7 +322,10 @@ class Lattice:
         return [(bits.bit_length() - 1, level, h) for bits, level, h in found if bits]
 
     def reach(self, keep_path: bool = False) -> Reach:
-        """Search all time steps for meetings with the target; `keep_path` also returns a path."""
+        """Search for meetings with the target at all time steps.
+
+        With `keep_path` the result has the path to the earliest meeting, too.
+        """
         earliest, at_end, kept, path = np.inf, False, [], None
         for layer, planes in enumerate(self.sets()):
             if keep_path and path is None:
@@ -336,8 +340,9 @@ class Lattice:
     def _trace_back(self, kept: list, state: tuple[int, int, int]) -> np.ndarray:
         """Return a path to a state, found backwards through the reached cells of n time steps.
 
-        `kept` has the items of `sets`. A state is (bit of the cell, index of the speed level, index
-        of the heading). The rows of the path, (2 n + 1, 5), are described at `Reach.path`.
+        `kept` has the reached cells after each time step, an item of `sets` each. A state is (bit
+        of the cell, index of the speed level, index of the heading). The rows of the path, (2 n +
+        1, 5), have time, x, y, heading and speed in SI units, after each half of a time step.
         """
         rows = [self._row(2 * len(kept) - 2, state)]
         for layer in range(len(kept) - 2, -1, -1):

@@ -109,17 +109,24 @@ def _places(path: PlanePath, times: jax.Array) -> jax.Array:
 
 
 def _polygons(group: Obstacles) -> tuple[tuple[np.ndarray, ...], np.ndarray]:
-    """Return corners (V, 2) [m] of the obstacles that are present, and their velocities (N, 2)."""
+    """Return the corners (V, 2) [m] of each of N obstacles, and their velocities (N, 2) [m/s].
+
+    The entries of `group` that are not marked as present are placeholders, and are left out.
+    """
     corners, present = group.vertices(0.0), np.asarray(group.present)
     return tuple(np.asarray(corners)[present]), np.asarray(group.velocity)[present]
 
 
 def search(scene: Scene) -> tuple[list[bool], list[float]]:
-    """Run three searches for a meeting with the target on one scene.
+    """Run three searches that decide whether and when a car can meet the target of a scene.
 
-    `bound` is a proven bound, `minimal` an optimistic and `strict` a cautious search on a grid of
-    states. Returns for each of them whether the target is met at the time that the case prescribes,
-    and the earliest meeting [s].
+    Each search returns whether the target is met at the time that the case prescribes, and the
+    earliest meeting [s]:
+    * `bound` replaces the car by a point. If the point fails, every car fails;
+    * `minimal` moves a disc inside of the car's body over a grid of states. If it fails, the case
+      is very likely infeasible;
+    * `strict` moves discs that cover the body. If it succeeds, the case is feasible except for
+      discretisation errors.
     """
     of_bound = earliest_bound(scene)
     minimal, strict = (Lattice(scene, rules).reach() for rules in (MINIMAL, STRICT))
@@ -129,10 +136,12 @@ def search(scene: Scene) -> tuple[list[bool], list[float]]:
 
 
 def search_all(found: list[Scene], workers: int) -> tuple[np.ndarray, np.ndarray]:
-    """Run the searches `bound`, `minimal` and `strict` on B scenes, in `workers` processes.
+    """Run three searches on each of B scenes, in `workers` processes.
 
-    Returns whether each search meets the target at the prescribed time (B, 3), and the earliest
-    meetings (B, 3) [s].
+    The searches are `bound`, whose failure proves that no car can meet the target; `minimal`, which
+    may meet targets that no car can meet; and `strict`, which covers the car's whole body. Returns
+    whether each search meets the target at the prescribed time (B, 3), and the earliest meetings
+    (B, 3) [s].
     """
 
     def gather(results: Iterator) -> tuple[np.ndarray, np.ndarray]:
@@ -151,10 +160,12 @@ def format_indices(indices: np.ndarray) -> str:
 
 
 def report(bench: Bench, index: np.ndarray, at_end: np.ndarray, earliest: np.ndarray) -> None:
-    """Print the results of the searches `bound`, `minimal` and `strict` on B cases.
+    """Print the results of three searches on B cases.
 
-    `at_end` (B, 3) bool states whether targets are met at the prescribed time. `earliest` (B, 3)
-    [s] has the earliest meetings. `index` (B,) has the numbers of the cases in the suite.
+    The searches are `bound`, whose failure proves that no car can meet the target; `minimal`, which
+    may meet targets that no car can meet; and `strict`, which covers the car's whole body. `at_end`
+    (B, 3) bool states whether targets are met at the prescribed time. `earliest` (B, 3) [s] has the
+    earliest meetings. `index` (B,) has the numbers of the cases in the suite.
     """
     bench.say(
         "| search | solved at the case's time | at any time up to it | earliest median | p95 "

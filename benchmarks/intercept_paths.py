@@ -64,7 +64,8 @@ def body_of(case: Any) -> tuple[float, float, float]:
 def search(case: Any, meeting: np.ndarray, share: float = 1.0, **options: Any) -> HybridPath:
     """Search a path from the start of one case to its meeting point (2,) [m] by Hybrid A*.
 
-    The curvature limit is multiplied by `share`. The case has NumPy leaves.
+    The curvature limit is multiplied by `share`. The case has NumPy leaves. `options` are further
+    arguments of `hybrid_astar`, such as a heading at the meeting point.
     """
     return hybrid_astar(
         case.start,
@@ -161,7 +162,11 @@ def peer_row(cases: list, meetings: np.ndarray, headings: list[float]) -> Row:
 
 
 def say_rows(bench: Bench, suite: str, heading: str, rows: dict[str, Row]) -> None:
-    """Print each planner's row for one suite; lengths are means over problems that all solve."""
+    """Print success, path length and time of each planner of paths, for the problems of one suite.
+
+    Lengths are means over the problems that all planners solve. `heading` states whether the
+    heading at the meeting point is free or prescribed.
+    """
     together = np.logical_and.reduce([row.found for row in rows.values()])
     for name, row in rows.items():
         ms = np.nanpercentile(row.ms, [50, 95, 99]) if np.isfinite(row.ms).any() else [np.nan] * 3

@@ -248,16 +248,17 @@ def report(
     truth: InterceptCase,
     turning: np.ndarray,
 ) -> None:
-    """Judge all drives; print a line for each row and kind of target, and list failed drives.
+    """Judge all drives; print success rates for straight and for turning targets, and failures.
 
     Args:
         bench: prints the lines.
-        rows: name -> drives of this row, and their duration on this machine [s].
+        rows: "one shot", "re-planned" or "known" -> drives with this knowledge of the target, and
+            the wall-clock time of their simulation and planning [s].
         truth: the cases with the true targets.
         turning: (B,) bool, whether the target turns.
     """
     verdicts = {name: drives.judge(truth) for name, (drives, _) in rows.items()}
-    # The column "success of the solvable" leaves out cases that no row of the table solves.
+    # The column "success of the solvable" leaves out cases in which the drives of all rows fail.
     solvable = np.any([verdict.success for verdict in verdicts.values()], axis=0)
     for mode, is_of_mode in zip(MODES, (~turning, turning), strict=True):
         if not solvable[is_of_mode].any():

@@ -77,9 +77,10 @@ class Judged:
 
 
 def planners() -> dict[str, SpeedPlanner]:
-    """Return every speed planner with every number of pieces, by name.
+    """Return the planners of the speed along a path by name, each with 10 and with 20 pieces.
 
-    Planners whose bounds apply to samples always have 100 samples, 0.1 s apart for 10 s.
+    The pieces are polynomials of the planned curve. A planner whose limits are checked only at
+    samples has 100 samples, 0.1 s apart for 10 s.
     """
     return {
         f"{name}, {pieces}": dataclasses.replace(
@@ -177,7 +178,11 @@ def split_batches(*batches: Any) -> list[tuple]:
 
 
 def table_of_planners(bench: Bench, problems: Any) -> dict[str, Judged]:
-    """Plan all problems with every planner, print one row a planner, and return the results."""
+    """Plan the speed in all problems with every planner, and print one row for each planner.
+
+    In a problem, a car must reach the end of a path at a given time and avoid moving obstacles.
+    Returns the results by planner.
+    """
     named = planners()
     single = {
         name: jax.jit(lambda problem, planner=planner: plan_speed(problem, planner))
@@ -251,9 +256,10 @@ def _compare_pairs(
 
 
 def table_of_solvers(bench: Bench, problems: Any) -> list[np.ndarray]:
-    """Solve the planners' quadratic programs with this library, Clarabel and OSQP; print a table.
+    """Solve quadratic programs with this library, Clarabel and OSQP, and print a table.
 
-    Returns the relative excess of this library's costs over Clarabel's costs.
+    The programs plan the speed of a car along a path, with least acceleration. Returns by what
+    fraction this library's costs exceed Clarabel's costs, an array for each planner.
     """
     bench.say(
         "",

@@ -328,8 +328,16 @@ def _report_equal_costs(
 ) -> None:
     """Print how fast IPOPT reaches the cost of the planner, relative to the planner's own speed.
 
-    There is a row for each effort of the planner (how long it searches for a lower cost), each form
-    of IPOPT's problem (limits as constraints or penalties), and each initial guess.
+    There is a row for each combination of an effort, a form and an initial guess.
+
+    Args:
+        bench: prints and stores the rows.
+        setup: cases, and IPOPT's two initial guesses of each, "learned" (by a network) and
+            "smooth".
+        efforts: effort of the planner, how long it searches for a lower cost -> results (`Found`).
+        peers: form of IPOPT's problem, "limits" (as constraints) or "penalties" -> `Peer`.
+        kept: form -> setting of IPOPT that was tuned for it.
+        repeat: number of times that each case is solved; the fastest time counts.
     """
     bench.say(
         "",

@@ -174,7 +174,10 @@ def _concatenate(*batches: Any) -> Any:
 
 @dataclasses.dataclass(frozen=True)
 class _NetworkSpec:
-    """One network: on which cases it is trained and compared, and where it is stored."""
+    """A network that corrects a planner's initial guess: its training cases, file and sizes.
+
+    Plans with and without the network are compared on other cases.
+    """
 
     file: str  # path of the shipped file, below the folder of planner_jax.task
     draw: Callable[[int, int], Any]  # draws training cases: (number, seed) -> cases

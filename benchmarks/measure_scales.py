@@ -57,7 +57,7 @@ _CATCH_FLOOR = 0.1
 
 
 # Type of a function that returns the residuals (R,) of a planner at n decision variables (n,). Its
-# third argument is the planner's prepared data of the case.
+# third argument is the result of the planner's `prepare` for one case.
 Residuals = Callable[[Any, jax.Array, Any], jax.Array]
 _ROUNDS = 3  # Number of measurements, each with the scales that the previous one measured.
 
@@ -113,8 +113,14 @@ def chain_residuals(planner: ChainPlanner, point: jax.Array, context: Any) -> ja
     """Return residuals whose squares sum to about twice a planner's objective near its minimum.
 
     The residuals belong to the penalties of limits, the snap energy and the durations. A penalty is
-    a smoothed max(excess, 0), whose curvature is at most 3 / (2 hinge_width). The residuals of
-    penalties have this curvature for every positive excess.
+    max(excess, 0), smoothed over an interval of the excess from 0 to `hinge_width`. Its second
+    derivative is at most 3 / (2 hinge_width). The residuals have this second derivative for every
+    positive excess, which overestimates the curvature of clearly exceeded limits.
+
+    Args:
+        planner: planner of hits or catches.
+        point: (n,), its decision variables.
+        context: result of the planner's `prepare` for one case.
     """
     case, along = context.case, planner.along(planner.nodes, context.case)
     offsets, natural = planner.split(point)
@@ -181,7 +187,10 @@ def draw_weak_throws(num: int, seed: int) -> pj.catch.CatchCase:
 
 
 def hit_planners() -> dict[str, Any]:
-    """Return planners of hits with guessed scales, by their keys in `measured_scales.json`."""
+    """Return planners of hits with 6 and 12 pieces, whose scales are rough initial guesses.
+
+    The keys "exact-6" and "exact-12" name the measured scales in `measured_scales.json`.
+    """
     found = {}
     for pieces in HIT_PIECES:
         first = (0.2,) * (3 * (pieces - 1)) + _FIRST_HIT
@@ -191,7 +200,10 @@ def hit_planners() -> dict[str, Any]:
 
 
 def catch_planners() -> dict[str, Any]:
-    """Return planners of catches with guessed scales, by their keys in `measured_scales.json`."""
+    """Return a planner of catches with 6 pieces, whose scales are rough initial guesses.
+
+    The key "exact-6" names the measured scales in `measured_scales.json`.
+    """
     found = {}
     for pieces in CATCH_PIECES:
         first = (0.3,) * (3 * (pieces - 1)) + _FIRST_CATCH
@@ -208,9 +220,10 @@ TASKS = {
 
 
 def measure(bench: Bench, task: str, num: int, seed: int) -> dict[str, np.ndarray]:
-    """Measure the scales of all planners of a task, and compare them with the shipped scales.
+    """Measure the scales of the variables of a task's planners, and compare with shipped scales.
 
-    Returns the measured scales by the keys of the shipped file.
+    `task` is "hit" or "catch". `num` and `seed` define the drawn cases. Returns the measured scales
+    by planner, "exact-" and its number of pieces.
     """
     draw, planners, options = TASKS[task]
     cases, found = draw(num, seed), {}

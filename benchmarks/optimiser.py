@@ -2,11 +2,13 @@
 
     python -m benchmarks.optimiser [--num 200] [--row late-0.5] [--out DIR]
 
-All three solvers minimise the same float32 objective in the same scaled variables, from the same
-initial guess. This library's solver and optax solve all cases in one batched call. SciPy solves one
-case after another, with a compiled function of value and gradient. Times are per plan, without
-compilation. The referee, an independent check in float64, decides about success. The run's summary
-has the success rate of this library's solver, over all maximum numbers of iterations.
+The cases are hits in which planning starts --row late-T seconds after the serve, or in which limits
+are multiplied by F (--row limits-F). All three solvers minimise the same float32 objective in the
+same scaled variables, from the same initial guess. This library's solver and optax solve all cases
+in one batched call. SciPy solves one case after another, with a compiled function of value and
+gradient. Times are per plan, without compilation. The referee, an independent check in float64,
+decides about success. The run's summary has the success rate of this library's solver, over all
+maximum numbers of iterations.
 """
 
 import time

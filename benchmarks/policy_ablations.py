@@ -101,7 +101,8 @@ def judge_decision(
 def measure(bench: Bench, variants: list[str], options: argparse.Namespace) -> None:
     """Train and judge every variant of the training, and print the table.
 
-    The first two rows are the methods `best` and `greedy`, which need no training.
+    The first two rows need no training: `best` plans the six most promising orders of the balls and
+    uses the best plan, and `greedy` always catches next the ball that can be caught first.
     """
     bench.say(
         f"{options.suite}, {options.decisions:,} decisions, {options.seeds} seeds, judged on "

@@ -1,6 +1,7 @@
-"""Cramer-Rao bounds for predicted targets: the smallest errors of unbiased predictions.
+"""Cramer-Rao bounds: the smallest errors of unbiased predictions of a target's position.
 
-The benchmarks of predicted targets compare the errors of predictions with these bounds.
+The target moves in a plane, is observed with noise, and is predicted to a later time. Benchmarks of
+interceptions compare the errors of this library's predictions with the bounds.
 """
 
 import jax.numpy as jnp

@@ -36,11 +36,14 @@ class PeerSolution:
 def clarabel_solver(matrices: Mapping[str, np.ndarray]) -> Callable[..., PeerSolution]:
     """Return a function that solves quadratic programs with given matrices by Clarabel.
 
-    Clarabel is an interior-point method. `matrices` has the matrices of cost, equalities and
-    bounds, by the names of the arguments of `qp_template`. The function takes right-hand sides of
-    the equalities, lower bounds and upper bounds. Clarabel is set up anew for every program,
-    because its interface cannot change which bounds are infinite. This is part of the measured
-    time.
+    Clarabel is an interior-point method. The returned function takes right-hand sides of the
+    equalities, lower bounds and upper bounds. Clarabel is set up anew for every program, because
+    its interface cannot change which bounds are infinite. This is part of the measured time.
+
+    Args:
+        matrices: "hessian" (n, n), the cost x' Q x / 2 of n unknowns x; "equalities" (q, n); "rows"
+            (M, n), whose products with x are bounded; "zeros" (z, n), equalities with right-hand
+            sides 0.
     """
     clarabel: Any = importlib.import_module("clarabel")
 
@@ -73,10 +76,14 @@ def clarabel_solver(matrices: Mapping[str, np.ndarray]) -> Callable[..., PeerSol
 def osqp_solver(matrices: Mapping[str, np.ndarray]) -> Callable[..., PeerSolution]:
     """Return a function that solves quadratic programs with given matrices by OSQP.
 
-    OSQP is the solver of [Qu2022]. `matrices` has the matrices of cost, equalities and bounds, by
-    the names of the arguments of `qp_template`. The function takes right-hand sides of the
-    equalities, lower bounds and upper bounds. OSQP is set up once. For every program it gets new
-    bounds, and starts at the solution of the previous program.
+    OSQP is the solver of [Qu2022]. The returned function takes right-hand sides of the equalities,
+    lower bounds and upper bounds. OSQP is set up once. For every program it gets new bounds, and
+    starts at the solution of the previous program.
+
+    Args:
+        matrices: "hessian" (n, n), the cost x' Q x / 2 of n unknowns x; "equalities" (q, n); "rows"
+            (M, n), whose products with x are bounded; "zeros" (z, n), equalities with right-hand
+            sides 0.
     """
     osqp: Any = importlib.import_module("osqp")
 
@@ -111,10 +118,6 @@ def osqp_solver(matrices: Mapping[str, np.ndarray]) -> Callable[..., PeerSolutio
 
 
 def _to_sparse(matrices: Mapping[str, np.ndarray]) -> tuple[Any, Any, Any]:
-    """Return sparse matrices of a quadratic program: Hessian, equalities and bounded rows.
-
-    Only the upper triangle of the symmetric Hessian is returned.
-    """
     equalities = np.concatenate([matrices["equalities"], matrices["zeros"]])
     hessian = scipy.sparse.csc_matrix(np.triu(matrices["hessian"]))
     return hessian, scipy.sparse.csr_matrix(equalities), scipy.sparse.csr_matrix(matrices["rows"])

@@ -138,11 +138,12 @@ class Bench:
         self._folder.write_text("rows.json", json.dumps(self._rows, indent=1) + "\n")
 
     def count(self, accepted: Any, *gaps: np.ndarray | None) -> None:
-        """Add plans to the numbers of the summary.
+        """Add plans to the numbers of the run's summary: success rate and excess costs.
 
         Args:
             accepted: (B,) bool, whether the referee, an independent check, accepts each of B plans.
-            *gaps: results of `cost_gaps` for these plans.
+            *gaps: arrays of cost / best cost - 1 of these plans, where a longer search finds the
+                best cost; None if the planner minimises no cost.
         """
         self._accepted += np.asarray(accepted, bool).tolist()
         self._gaps += gaps

@@ -226,7 +226,11 @@ class Soak:
                 break
 
     def count_misses(self, gaps: list[tuple[float, float]]) -> int:
-        """Count missed deadlines during one of the gaps (start, end) [s] of a sleeping process."""
+        """Count late answers of the planning server during gaps, when the system ran no processes.
+
+        `gaps` are (start, end) [s] of the times at which a process that only sleeps was woken too
+        late. The server could presumably not run at these times either.
+        """
         return sum(any(a < end and b > begin for a, b in gaps) for begin, end in self.missed)
 
     def end(self) -> None:

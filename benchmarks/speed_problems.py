@@ -50,7 +50,6 @@ def _convert_floats(problems: StationTimeProblem, dtype: Any) -> StationTimeProb
 
 
 def _draw_block(rng: np.random.Generator) -> StationTimeProblem:
-    """Draw 256 problems in double precision, without a check whether they are solvable."""
     shape = (_BLOCK, _MOST)
     num = rng.integers(1, _MOST + 1, _BLOCK)
     station, time = rng.uniform(1.0, 5.0, shape), rng.uniform(1.5, 8.5, shape)

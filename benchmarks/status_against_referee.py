@@ -53,13 +53,17 @@ class Row:
 
     @property
     def planner(self) -> Any:
-        """The planner of the row, with the benchmark options of the task and the row's options."""
+        """The planner, with the task's options for benchmarks, such as an order of catches.
+
+        The options of the row are added to these options of the task specification (`bench`).
+        """
         return self.card.planner(**{**self.card.bench, **self.options})
 
     def cases(self, num: int, seed: int) -> Any:
-        """Draw about `num` / `every` cases of the row, and change them if `change` is specified.
+        """Draw about `num` / `every` cases in NumPy arrays, and change them by `change`.
 
-        The cases are a batch in NumPy arrays.
+        The field `every` of the row is above 1 for slow planners. Its field `change` is a function
+        that adds an obstacle, for example; with None the drawn cases are returned.
         """
         cases = self.card.draw(max(num // self.every, 1), self.suite, seed, **self.draw)
         cases = jax.tree.map(np.asarray, cases)
@@ -216,7 +220,11 @@ def compare(row: Row, num: int, seed: int) -> dict[str, Any]:
 
 
 def measure(bench: Bench, options: Any, names: list[str]) -> None:
-    """Measure the rows with the given names, and print the table with the sums of all rows."""
+    """Plan and judge the cases of the rows with the given names, and print counts of plans.
+
+    A row has a task, a suite of cases and a kind of limit. The counts state how often the planner's
+    status and the referee, an independent check, disagree. The last printed line has sums.
+    """
     bench.say(
         f"seed {options.seed}, {jax.devices()[0].device_kind}, jax {jax.__version__}",
         "| row | cases | solved by status | accepted by referee | solved, rejected | accepted, not "

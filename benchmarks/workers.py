@@ -102,10 +102,12 @@ class _Sweep:
 
 
 def _list_setups(cores: list[int], gpus: list[str]) -> dict[str, tuple[list[_Share], bool]]:
-    """Return the four set-ups of sweeps by name.
+    """Return four set-ups of sweeps, which plan many drawn cases, by name.
 
-    A set-up has a list of parts of the machine (cores and GPUs), and whether its sweeps use Ray.
-    One sweep runs on each part, all at the same time.
+    They are: one sweep without Ray on one core; a sweep without Ray on each core; a sweep with one
+    Ray worker; and a sweep with a Ray worker for each core. If `gpus` has names, GPUs take the
+    place of cores. A set-up has a list of parts of the machine (cores and GPUs), and whether its
+    sweeps use Ray. One sweep runs on each part, all at the same time.
     """
     whole, num = _Share(cores, gpus), len(gpus or cores)
     if not gpus:

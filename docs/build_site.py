@@ -50,7 +50,10 @@ def rewrite_links(text: str, source: str, problems: list[str]) -> str:
 
 
 def stage_pages() -> list[str]:
-    """Write all pages and pictures into build/pages; return messages about wrong links or menus."""
+    """Write all pages and pictures into build/pages, and return messages about faulty pages.
+
+    A page is faulty if it links to a missing file, or if no menu in mkdocs.yml contains it.
+    """
     problems: list[str] = []
     menu = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
     shutil.rmtree(STAGE, ignore_errors=True)
@@ -82,7 +85,7 @@ def public_names(package: str) -> list[str]:
 
 
 def write_api() -> None:
-    """Add entries for the public names of each package below its line in the API page."""
+    """Add an entry for each public function and class to the API page, below its package."""
     page = STAGE / "api.md"
     lines = []
     for line in page.read_text(encoding="utf-8").splitlines():

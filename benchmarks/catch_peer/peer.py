@@ -130,11 +130,13 @@ def build(folder: Path) -> Path | None:
 
 
 def measure(program: Path, table: Path, settings: Settings, repeats: int = 5) -> Figures:
-    """Run the C++ program on a table of throws, and compare its costs with the published costs.
+    """Run the C++ program on a table of throws, and compare its costs with the published optima.
+
+    The optima are from the C++ program of [Yu2023catch].
 
     Args:
         program: path of the compiled program, from `build`.
-        table: CSV file with the columns of tests/data/catch_paper.csv.
+        table: CSV file with initial position and velocity of each ball, and the published costs.
         settings: settings of the search.
         repeats: number of times that all throws are planned; the fastest time counts.
     """

@@ -274,11 +274,11 @@ class Program:
         """Run IPOPT; return the unknowns at which it stops, and whether it has converged.
 
         Args:
-            case: values of `PARAMETERS`.
+            case: numbers of the case by name, such as limits, in SI units.
             guess: initial guess of the unknowns.
             margins: (M,), relative amounts by which the limits on each of M pieces are tightened.
                 With margins the durations keep their initial values, so that each piece remains the
-                same part of the trajectory.
+                same part of the trajectory. None for no margins.
         """
         bounds = dict(self._bounds)
         if margins is not None:

@@ -27,9 +27,11 @@ from planner_jax.trajectory.polynomial import PiecewisePolynomial
 TOLERANCE = 1e-3  # The referee accepts an excess up to this value.
 COARSE_PIECES, COARSE_SAMPLES = 20, 3  # Number of pieces, and of samples of each piece, at first.
 FINE_SAMPLES = 4  # Number of samples of each piece after the pieces were halved.
-COARSE_FLOOR, FINE_FLOOR = -0.01, -0.003  # Lower bounds of the excess before and after halving.
+# Lower bounds of the excess before and after the pieces are halved. The minimum of the excess is
+# negative if all limits hold with a margin; IPOPT stops at these margins, 1 % and 0.3 %.
+COARSE_FLOOR, FINE_FLOOR = -0.01, -0.003
 # A solution is refined by halving its pieces only if it exceeds limits by less than this relative
-# amount, because halving reduces the excess by at most 0.03.
+# amount. Halving reduces the excess by at most 0.03, and the threshold is twice this reduction.
 REFINED_BELOW = 0.06
 # A solution is refined by halving its pieces only if its excess is lower, by at least this amount,
 # than the excess of every solution whose refinement has failed. The refinement of a worse solution
@@ -41,8 +43,8 @@ HOPELESS_ABOVE, HOPELESS_STARTS = 0.1, 4
 MOST_TIGHTENINGS = 5  # Maximum number of times that limits of a solution are tightened.
 INFEASIBLE_ABOVE = 0.01  # A case counts as infeasible if its least excess is above this value.
 
-# Starting points: impact time over the ball's landing time, the ball's flight time after the impact
-# [s], and thrust at the impact [g]. The fifth is a smash, after which the ball flies fast.
+# Initial guesses of the impact: its time over the ball's landing time, the ball's flight time after
+# it [s], and the thrust [g]. The fifth is a smash, after which the ball flies fast.
 STARTS = (
     (0.93, 1.6, 1.2),
     (0.80, 1.3, 1.0),
@@ -53,8 +55,8 @@ STARTS = (
     (0.65, 1.1, 0.8),
     (0.97, 1.0, 1.4),
 )
-# Ranges of random starting points: impact time over landing time, the ball's flight time after the
-# impact [s], and thrust at the impact [g].
+# Ranges of random guesses of the impact: its time over the ball's landing time, the ball's flight
+# time after it [s], and the thrust [g].
 START_RANGES = ((0.5, 0.98), (0.6, 2.3), (0.8, 2.3))
 
 
@@ -80,7 +82,12 @@ def worst_ratios(motion: list[np.ndarray], durations: np.ndarray, values: dict) 
 
 @dataclasses.dataclass
 class Finding:
-    """Result of the search for one case: whether a hit exists, and the best trajectory."""
+    """Result of the search for one case: whether a hit exists, and the best trajectory found.
+
+    The best trajectory is a hit that the referee, an independent check, accepts, or else the
+    trajectory with the least excess. An excess is the greatest relative amount by which a limit is
+    exceeded.
+    """
 
     feasible: bool = False  # whether the referee accepts a hit
     least_excess: float = math.inf  # least relative excess over the limits, of converged programs
@@ -112,17 +119,22 @@ class Finding:
 
 
 class Oracle:
-    """Search for a feasible hit: with 20 pieces, and from promising solutions with 40 pieces."""
+    """Search for a feasible hit: with 20 pieces, and from nearly feasible solutions with 40 pieces.
+
+    The trajectory consists of these pieces, on which the snap is constant. A solution is nearly
+    feasible if it exceeds limits by less than 6 %.
+    """
 
     def __init__(self):
         self.coarse = Program(COARSE_PIECES, COARSE_SAMPLES, COARSE_FLOOR)
         self.fine = Program(2 * COARSE_PIECES, FINE_SAMPLES, FINE_FLOOR)
 
     def find(self, case: HitCase, starts) -> Finding:
-        """Search for a feasible hit in one case from the starting points `starts`.
+        """Search for a feasible hit in one case.
 
-        The case has NumPy leaves without a batch axis. The search ends at the first hit that the
-        referee, an independent check, accepts.
+        `starts` are initial guesses of the impact: (its time over the ball's landing time, the
+        ball's flight time after it [s], thrust [g]). The case has NumPy leaves without a batch
+        axis. The search ends at the first hit that the referee, an independent check, accepts.
         """
         began, finding, in_vain = time.process_time(), Finding(), math.inf
         values = case_parameters(case)
@@ -226,9 +238,11 @@ def find_hit(case: HitCase, starts) -> Finding:
 
 
 def find_hits(cases: HitCase, starts, workers: int = 1) -> list[Finding]:
-    """Search for a feasible hit in each case of a batch, from the starting points `starts`.
+    """Search for a feasible hit in each case of a batch, in `workers` processes.
 
-    Runs in `workers` processes, and shows a progress bar. Returns one result for each case.
+    `starts` are initial guesses of the impact: (its time over the ball's landing time, the ball's
+    flight time after it [s], thrust [g]). Shows a progress bar, and returns one result for each
+    case.
     """
     cases = jax.tree.map(np.asarray, cases)
     num = len(cases.drag)

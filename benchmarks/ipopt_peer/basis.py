@@ -20,13 +20,14 @@ Places = list[tuple[int, int]]  # indices (row, column) of the entries of a spar
 
 
 class Basis:
-    """Linear maps from the C coefficients per axis of a trajectory to its samples and to x.
+    """Matrices of a trajectory's C coefficients per axis, and their order in IPOPT's variables x.
 
     The coefficients of an axis are the boundary conditions (position to jerk at both ends) and then
-    the offsets of the waypoints from the smoothest trajectory. IPOPT's decision variables x contain
-    the offsets, ordered by waypoint, and a few variables of the trajectory's end, which determine
-    the boundary conditions and the mean duration h of a piece. Here the offsets are called
-    outer coefficients, and the boundary conditions and h inner coefficients.
+    the offsets of the waypoints from the smoothest trajectory. Samples of the trajectory are linear
+    functions of the coefficients. IPOPT's decision variables x contain the offsets, ordered by
+    waypoint, and a few variables of the trajectory's end, which determine the boundary conditions
+    and the mean duration h of a piece. The offsets, which are variables themselves, are called
+    outer coefficients; the boundary conditions and h, which are functions of variables, inner ones.
 
     Args:
         planner: the `ExactHit` or `ExactCatch` whose settings and constant matrices are used.
@@ -46,7 +47,8 @@ class Basis:
     def join(self, outward: Any, offsets: Any) -> tuple[Any, Any]:
         """Return the C coefficients per axis (C, 3), and the mean duration h of a piece [s].
 
-        `outward` is one vector with the boundary conditions and h.
+        `outward` is one vector with the boundary conditions (position to jerk at both ends) and h.
+        `offsets` are the offsets of the waypoints from the smoothest trajectory.
         """
         rows = 2 * ORDERS
         columns = ca.vertcat(ca.reshape(outward[: 3 * rows], rows, 3), offsets)
@@ -88,7 +90,8 @@ class Basis:
         factors = {place: bends[k, :].T for k, place in enumerate(places)}
         sizes = (num, num, num, 1)
         blocks = [[ca.MX.zeros(a, b) for b in sizes] for a in sizes]
-        # In this order of the loops each product with a sample matrix is computed only once.
+        # The constant matrices map coefficients to samples. In this order of the loops each product
+        # with one of them is computed only once.
         for i, (order, axis) in enumerate(PLACES):
             inside: dict[int, Any] = {}
             for j, (other, of) in enumerate(PLACES):

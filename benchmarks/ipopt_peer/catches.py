@@ -32,9 +32,10 @@ SIZES = {
 
 
 def read_params(context: Any) -> dict[str, Any]:
-    """Return the parameters of IPOPT's problem for one case, by name.
+    """Return the numbers of one case that IPOPT's problem needs, by name.
 
     `context` is the result of the planner's `prepare` for a case with one ball, with NumPy leaves.
+    It contains the case.
     """
     case, path = context.case, context.targets
     found = {"ball_pos": path.ball.pos, "ball_vel": path.ball.vel}
@@ -78,9 +79,9 @@ def ends(natural: Any, params: dict, time_weight: float) -> tuple[Any, Any, list
     """Compute the end of a trajectory at which the ball is caught, from the end's variables.
 
     The variables `natural` are the logarithm of the duration, the ball's position in the net (2),
-    and velocity, acceleration and jerk of the quadrotor (3 each). Returns the state at the end, the
-    duration, the relative excesses over the limits of the catch, and the cost, as specified by
-    `Problem.ends`.
+    and velocity, acceleration and jerk of the quadrotor (3 each). `params` has the numbers of the
+    case by name. Returns position to jerk at the end (4, 3), the duration [s], the relative
+    excesses over the limits of the catch, and the cost.
     """
     time, place = ca.exp(natural[0]), natural[1:3]
     pos, vel = ball_at(time, params)

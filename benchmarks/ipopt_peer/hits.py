@@ -28,10 +28,10 @@ SIZES = {
 
 
 def read_params(context: Any) -> dict[str, Any]:
-    """Return the parameters of IPOPT's problem for one case, by name.
+    """Return the numbers of one case that IPOPT's problem needs, by name.
 
-    `context` is the result of the planner's `prepare` for the case, with NumPy leaves. It has a
-    table of the ball's path.
+    `context` is the result of the planner's `prepare` for the case, with NumPy leaves. It contains
+    the case and a table of the ball's path.
     """
     case, path = context.case, context.path
     found = {"path_pos": path.pos, "path_vel": path.vel, "resolution": path.resolution}
@@ -67,7 +67,11 @@ def keys_kernel(distance: Any) -> Any:
 
 
 def ball_at(time: Any, params: dict, nodes: int) -> tuple[Any, Any]:
-    """Interpolate position and velocity of the incoming ball at a time [Yu2023bat, eqs 8 to 10]."""
+    """Interpolate position and velocity of the incoming ball at a time [Yu2023bat, eqs 8 to 10].
+
+    `params` has a table of the ball's path with `nodes` entries at equal time steps, the first of
+    them before time 0.
+    """
     inside = ca.fmin(ca.fmax(time, 0.0), params["resolution"] * (nodes - 3))
     place = inside / params["resolution"] + 1.0
     weights = keys_kernel(place - ca.DM(np.arange(nodes)))
@@ -79,9 +83,10 @@ def ends(natural: Any, params: dict, nodes: int) -> tuple[Any, Any, list, Any]:
     """Compute the end of a trajectory at which the ball is hit, from the end's variables.
 
     The variables `natural` are the logarithms of the duration, of the ball's flight time after the
-    impact and of the thrust, two speeds of the racket in its plane, and the jerk (3). Returns the
-    state at the end, the duration, the relative excesses over the limits of the hit, and the cost
-    (zero), as specified by `Problem.ends`.
+    impact and of the thrust, two speeds of the racket in its plane, and the jerk (3). `params` has
+    the numbers of the case by name, `nodes` is the length of its table of the ball's path. Returns
+    position to jerk at the end (4, 3), the duration [s], the relative excesses over the limits of
+    the hit, and the cost, which is zero.
     """
     time, flight, thrust = (ca.exp(natural[k]) for k in range(3))
     gravity, up = params["gravity"], ca.DM([0.0, 0.0, 1.0])

@@ -76,9 +76,10 @@ class Solutions:
 
 
 def stack_params(module: ModuleType, planner: Any, contexts: Any) -> np.ndarray:
-    """Return the P parameters of IPOPT's problem for each of B cases, (B, P).
+    """Return the numbers of B cases on which IPOPT's problem depends, such as limits, (B, P).
 
-    `contexts` are the planner's prepared data of the cases. `module` is `hits` or `catches`.
+    `contexts` are the results of the planner's `prepare` for the cases: each has a case and
+    precomputed data, such as a table of a ball's path. `module` is `hits` or `catches`.
     """
     contexts = jax.tree.map(np.asarray, contexts)
     sizes = module.make_problem(planner).sizes

@@ -50,7 +50,9 @@ class Problem:
     # Function of height, velocity, acceleration and jerk at a sample, and `params`. Returns a list
     # of excesses over limits.
     limits: Callable[[Any, Any, Any, Any, dict], list]
-    factors: tuple[float, ...]  # the planner's margin is multiplied by one factor for each limit
+    # Factor for each limit. The limit's penalty starts at the excess -margin * factor, where
+    # `margin` is a setting of the planner.
+    factors: tuple[float, ...]
     impact_weight: float  # [s], weight of the penalties at the end
 
 
