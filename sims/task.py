@@ -180,7 +180,7 @@ class BallFlightTask(FlightTask):
 
     @property
     def conditions(self) -> str:
-        """Sensing noise and error of the estimated drag, as the beginning of a sentence."""
+        """Sensing noise and error of the estimated drag, to begin a sentence of the report."""
         settings = self.settings
         return (
             f"Noise {settings.noise}, {100 * settings.drag_error:g} % error of the estimated drag"

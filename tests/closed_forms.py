@@ -15,7 +15,6 @@ def region_of(x, y):
 
 
 def positions_on(path, times):
-    """Return positions (..., 2) or (..., T, 2) of `TurningPath`s (...) at one or T times [s]."""
     times = np.asarray(times, float)
     pos, vel = (np.asarray(leaf, float) @ [1.0, 1.0j] for leaf in (path.pos, path.vel))
     rate = np.asarray(path.turn_rate, float)

@@ -101,7 +101,6 @@ def read_imports(path: Path, source: str | None = None) -> Iterator[Import]:
 
 
 def is_allowed(found: Import) -> bool:
-    """Return whether the order of layers allows this import, or this module named in a string."""
     own, other = package_of(found.path), found.package
     if own not in LAYERS:
         return False

@@ -1,4 +1,4 @@
-"""Planners of every task and of a user's task, each with a function that draws its cases."""
+"""Planners of every task and of a user's task, each with a function that draws its problems."""
 
 import dataclasses
 import functools

@@ -1,4 +1,4 @@
-"""Helpers of the referees' tests: cases and plans from arrays by name, batches, comparisons."""
+"""Helpers for tests of the referees, which check plans in float64 independently of planners."""
 
 from types import SimpleNamespace
 

@@ -1,4 +1,4 @@
-"""Penalties along a trajectory: their integral, its derivatives, and the kernels for both."""
+"""Penalties along a trajectory: their integral, its derivatives, and GPU kernels for both."""
 
 import dataclasses
 import functools

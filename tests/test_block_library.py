@@ -404,7 +404,6 @@ def test_a_planner_of_a_file_needs_the_file_and_others_take_none():
 @pytest.mark.slow
 @pytest.mark.parametrize("regime, starts", [("R1", 1), ("R2", 1), ("R2", 16)])
 def test_the_referee_confirms_a_built_library(regime, starts, tmp_path, monkeypatch):
-    """Try the starting points of the search one after another, as on a CPU, or all at once."""
     monkeypatch.setattr(building, "_ON_CPU", building.Portions(256, (16, 16), starts))
     path = tmp_path / "a.lib"
     layout = Layout((Face(0, 1, (4, 4)),), (Face(0, 1, (2, 2)),))

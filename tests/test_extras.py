@@ -17,7 +17,7 @@ from planner_jax.trajectory.polynomial import PiecewisePolynomial, states_at
 from planner_jax.trajectory.proportional_minco import boundary_rows
 from tests.derivatives import assert_gradient_matches_differences
 
-# A planner that starts from smooth trajectories, near whose middles tests place obstacles.
+# This planner's first guesses are smooth trajectories; tests place obstacles near their middles.
 FREE = pj.hit.ExactHit(learned=False)
 CATCH = pj.catch.planner("exact", decide="given")
 HIT = FREE.with_settings((("rounds", FREE.rounds[1:2]),))  # One attempt needs one program.
@@ -119,8 +119,8 @@ def test_excess_and_cost_have_their_closed_forms():
     np.testing.assert_allclose(wall.excess(pos, vel, vel), [-2.0, 1.0, -2.0], atol=1e-12)
     found = pj.Geofence(np.array([-1.0, -1.0, 0.0]), np.full(3, 3.5)).excess(pos, vel, vel)
     np.testing.assert_allclose(found, [0.0, 0.5, -1.0], atol=1e-12)
-    # The speed limit is 2.5 m/s at the first position, inside the zone. Beyond 1.25 radii, at the
-    # second, there is none. At the third, halfway between, it is 5 m/s.
+    # The speed limit is 2.5 m/s inside the zone (first position), absent beyond 1.25 radii (second
+    # position), and 5 m/s halfway between (third position).
     found = pj.SpeedZone(AT, 2.0, 2.5).excess(pos, vel, vel)
     np.testing.assert_allclose(found, [1.0, -1.0, 0.0], atol=1e-9)
     np.testing.assert_allclose(pj.Dislike(AT, 1.0, 2.0).cost(pos, vel, vel), [1.125, 0.0, 0.0])

@@ -156,7 +156,7 @@ def test_bound_inner_disc_and_whole_body_are_in_order_of_time(drawn):
 
 @pytest.mark.parametrize(("ahead", "gets_away"), [(0.1, False), (1.2, True)])
 def test_a_car_escapes_a_wall_ahead_if_it_can_still_turn(ahead, gets_away):
-    # The car cannot reverse, and its least turning radius is half a metre.
+    # The car cannot reverse. It turns with a radius of at least 0.5 m, so it needs space ahead.
     front = START[0] + MIDDLE + 0.2
     one = scene((6.0, 4.0), time=8.0, walls=[box(front + ahead, 2.0, front + ahead + 0.2, 6.0)])
     assert departs(one, far=0.8, until=2.0) == gets_away
@@ -166,7 +166,7 @@ def test_a_car_escapes_a_wall_ahead_if_it_can_still_turn(ahead, gets_away):
     ("ahead", "lives"), [(0.05, False), pytest.param(0.5, True, marks=pytest.mark.slow)]
 )
 def test_near_a_target_it_suffices_to_touch_nothing(ahead, lives):
-    # From its initial speed the car stops within 0.125 m.
+    # The car brakes from its initial speed of 0.5 m/s within 0.125 m.
     front = START[0] + MIDDLE + 0.2
     near = scene((1.5, 4.0), time=2.0, walls=[box(front + ahead, 2.0, front + ahead + 0.2, 6.0)])
     assert departs(replace(near, initial_speed=0.5)) == lives

@@ -56,7 +56,7 @@ def server(warm):
 
 
 class Throw:
-    """One throw; the robot follows the setpoints of the last answer exactly."""
+    """A simulated throw, in which the robot exactly follows the setpoints of the live planner."""
 
     def __init__(self, planner, path, number, disturb=lambda step, data: [data], home=HOME):
         self.planner, self.path, self.number = planner, path, number

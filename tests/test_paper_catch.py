@@ -82,7 +82,7 @@ def test_converged_costs_are_the_published_optima():
     first = np.append(np.arange(4), len(gap) // 2 + np.arange(4))  # rows of both files
     np.testing.assert_allclose(gap[first], 0.0, atol=1e-4)
     np.testing.assert_allclose(late[first], 0.0, atol=1e-3)
-    # Like the published protocol, the referee permits an excess of 5 %, and accepts any ball within
+    # As in [Yu2023catch], limits may be exceeded by 5 %, and a ball is caught if it comes within
     # the net's radius of the net's centre.
     cases, plans = pj.take(cases, first), pj.take(plans, first)
     verdict = referee_catches(cases, plans, tolerance=0.05, net_test="ball")

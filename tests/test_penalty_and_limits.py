@@ -89,8 +89,8 @@ def limits():
     return pj.QuadrotorLimits(**{name: np.array(value) for name, value in values.items()})
 
 
-# Motions that meet a limit exactly for k = 1: speed 5 m/s, acceleration 15 m/s^2, and body rate 4
-# rad/s, from a jerk of 4 g across the thrust in hover.
+# Functions that return how far a motion, scaled by k, exceeds a limit; at k = 1 it meets the limit.
+# The body rate of 4 rad/s results from a jerk of 4 g across the thrust in hover.
 ACC, JERK = np.array([10.0, -5.0, 10.0]), np.array([0.0, 4.0 * GRAVITY, 0.0])
 AT_LIMIT = {
     "speed": lambda k: quadrotor.speed_excess(k * np.array([3.0, 0.0, 4.0]), limits()),

@@ -1,4 +1,4 @@
-"""The predicted path: cubic convolution of a state table, and its derivatives."""
+"""A ball's predicted path: cubic interpolation between stored states, and its derivatives."""
 
 import functools
 

@@ -1,4 +1,4 @@
-"""The referee of blocks, on motions in closed form, without a planner."""
+"""The referee of blocks, an independent check of plans, on motions in closed form."""
 
 from unittest.mock import Mock
 

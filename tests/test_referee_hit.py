@@ -1,4 +1,4 @@
-"""The referee of hits, on plans in closed form, without a planner."""
+"""The referee of hits, an independent check of plans, on plans in closed form."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""The referee of interceptions, on plans in closed form, without a planner."""
+"""The referee of interceptions, an independent check of plans, on plans in closed form."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Properties of every referee: plans are judged independently, and invalid input has a verdict."""
+"""Properties of every referee (check of plans): it judges each plan alone, and invalid input."""
 
 import dataclasses
 

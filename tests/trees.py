@@ -9,7 +9,7 @@ def as_numpy(tree):
 
 
 def assert_same(ours, theirs, lanes=...):
-    """Assert that the arrays of two pytrees have equal types and, at indices `lanes`, values."""
+    """Assert equal types of the arrays of two pytrees, and equal values at the indices `lanes`."""
     for a, b in zip(jax.tree.leaves(ours), jax.tree.leaves(theirs), strict=True):
         assert a.dtype == b.dtype
         np.testing.assert_array_equal(np.asarray(a)[lanes], np.asarray(b)[lanes])

@@ -1,1 +1,1 @@
-"""The tasks hit, catch, intercept and block as simulated flights, for the closed loop and runs."""
+"""Simulations of robots that execute and replan hits, catches, interceptions and blocks."""

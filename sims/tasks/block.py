@@ -110,7 +110,7 @@ class BlockFlight(FlightTask):
         }
 
     def cases(self) -> Throws:
-        """Draw all throws of the run from its suite and seed."""
+        """Draw all throws of the run from its suite (family of random throws) and seed."""
         settings = self.settings
         return throws(
             settings.suite,
@@ -177,7 +177,7 @@ class BlockFlight(FlightTask):
 
     @property
     def conditions(self) -> str:
-        """Times for sensing and planning, drives and encoders, as the beginning of a sentence."""
+        """Times for sensing and planning, and errors of drives and encoders, for the report."""
         settings = self.settings
         meeting = "wide" if settings.wide else "strict"
         return (

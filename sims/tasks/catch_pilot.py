@@ -93,8 +93,8 @@ class CatchPilot:
     ) -> tuple[CatchPlan, Array]:
         """Return one of the found plans, and whether it replaces the current plan.
 
-        A plan from scratch is returned at the times of new decisions if `is_worth_flying` prefers
-        it to the plan that continues the current plan.
+        At the rate `redecide`, the plan from scratch, with newly chosen order, is returned if it is
+        cheaper or violates limits less than the plan that continues the current plan.
         """
         plan, left = found[0], asked.case
         if self.redecide > 0.0:

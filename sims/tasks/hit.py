@@ -302,7 +302,7 @@ class HitFlight(BallFlightTask):
         return self.settings.robot or PAPER_HITTER
 
     def cases(self) -> Volleys:
-        """Draw all serves of the run from its suite and seed."""
+        """Draw all serves of the run from its suite (family of random serves) and seed."""
         settings = self.settings
         regions = REAL_SCENARIOS.get(settings.suite)
         return volleys(

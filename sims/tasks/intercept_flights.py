@@ -83,7 +83,7 @@ class InterceptFlight(FlightTask):
         return dataclasses.asdict(self.loop())
 
     def cases(self) -> Meetings:
-        """Draw all interceptions of the run from its suite and seed."""
+        """Draw all interceptions of the run from its suite (family of random cases) and seed."""
         settings = self.settings
         sensing = settings.sensing
         return meetings(
@@ -223,7 +223,7 @@ def _add_height(points: np.ndarray, height: float) -> np.ndarray:
 def reach_layers(case: InterceptCase) -> list[tuple[float, np.ndarray]]:
     """Return pairs of a time [s] and grid points (P, 2) [m] where the car could be at that time.
 
-    The car starts as in `case`, keeps its limits and avoids the obstacles; see `search_reach`.
+    The car starts as in `case`, keeps its limits and avoids the obstacles.
     """
     search = SEARCHES["given"][0]
     found = jax.device_get(

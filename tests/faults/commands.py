@@ -89,7 +89,6 @@ def is_one_line(ended: Ended) -> bool:
 
 
 def is_stopped(ended: Ended, number: int) -> bool:
-    """Return whether a command ended by the signal `number` with its exit code and one line."""
     words = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated", signal.SIGHUP: "hung up"}
     last = ended.err.rstrip("\n").rpartition("\n")[2]
     said = last.startswith(f"planner-jax: {words[signal.Signals(number)]}; ")
