@@ -167,7 +167,7 @@ class RunFolder:
             raise ArgumentError(self.name, rule, shown=why) from None
 
     def require_whole(self, rows: Dataset, remedy: str, num: int | None = None) -> None:
-        """Raise `ArgumentError` with the advice `remedy` if rows are missing or files damaged."""
+        """Raise an error with advice `remedy` if a file is damaged or there are not `num` rows."""
         for path, why in rows.damages(num).items():
             rule = f"a run whose {path.relative_to(self.path)} is whole"
             shown = f"{str(self.path)!r}, where it {why}; {remedy}"
@@ -183,7 +183,7 @@ class RunRows:
     failures: list[Row]  # the first rows whose plans the referee rejected
 
     def sample(self) -> list[Row]:
-        """Return about 60 evenly spaced rows, and more rejected plans until they are up to 12."""
+        """Return rows for figures: about 60, evenly spaced, then failures until 12 have failed."""
         last = self.manifest["summary"]["num"] - 1
         spread = np.linspace(0, last, _CASES_SHOWN).astype(int).tolist()
         shown = self.folder.plans.pick(spread)
@@ -192,7 +192,10 @@ class RunRows:
         return shown + others[: max(missing, 0)]
 
     def same_case(self) -> list[tuple[str, Row]]:
-        """Return (planner, row) of each plan for the example case, the run's planner first."""
+        """Return (planner, row) of each plan for the case in the figures, the run's planner first.
+
+        The sweep chose the case, and also planned it with other planners for comparison.
+        """
         own = self.folder.plans.pick([self.manifest["example"]])[0]
         others = self.folder.baselines
         rows = others.read().to_pylist() if others.files() else []

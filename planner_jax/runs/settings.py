@@ -31,9 +31,10 @@ def option(default: object, metavar: str, text: str) -> Any:
 
 
 def recovery_option(usual: str = NONE) -> str:
-    """Return the field `recovery` of settings: how the quadrotor stops after its last contact.
+    """Return a dataclass field for the option `recovery`, with the default value `usual`.
 
-    The values are "none", no stop; "brake", at the cheapest position; "home", at the start.
+    The option selects the trajectory after the quadrotor's last contact: "none"; "brake", to
+    standstill wherever this costs least; or "home", to the start position.
     """
     words = f"trajectory after the last contact, within all limits: {', '.join(CHOICES)}"
     return option(usual, "NAME", words)
@@ -132,7 +133,7 @@ def settings_to_resume(kind: type[AnySettings], parameters: Options, given: Opti
 def settings_of_manifest(
     kind: type[KnownSettings], parameters: Options, name: str
 ) -> KnownSettings:
-    """Return a run's settings from its manifest; raise `ArgumentError` if they are invalid."""
+    """Return a run's settings from its manifest; if invalid, raise an error about option `name`."""
     try:
         return kind(**parameters)
     except (TypeError, ValueError) as error:

@@ -1,4 +1,4 @@
-"""Sources of the cases of a sweep, which yield the cases in chunks of one batch each."""
+"""Sources of a sweep's cases (planning problems), which they draw or read batch by batch."""
 
 import abc
 import dataclasses
@@ -46,7 +46,7 @@ class Source(abc.ABC):
         return self.cases(number * self.batch, min((number + 1) * self.batch, self.num))
 
     def check(self) -> PyTree:
-        """Draw and check the first chunk before a run writes any file, and return its cases."""
+        """Return the first `batch` cases, so that invalid cases raise before a run writes files."""
         return self.chunk(0).cases
 
     @abc.abstractmethod
@@ -79,7 +79,7 @@ class DrawnSource(Source):
 
 
 def fill_in(settings: SweepSettings, num: int, batch: int) -> Entries:
-    """Return settings with `num` and `batch` in place of None, and both numbers, for a `Source`."""
+    """Return a `Source`'s keyword arguments; `num` and `batch` are defaults of the settings."""
     num, batch = settings.num or num, settings.batch or batch
     rule = f"at most {_MOST_PARTS * batch:,} with a batch of {batch}, as each batch is a file"
     require(num <= _MOST_PARTS * batch, "num", rule, num)

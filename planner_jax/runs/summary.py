@@ -65,11 +65,14 @@ class Tally:
             more.add(rows)
 
     def examples(self, rows: pa.Table, success: np.ndarray) -> list[np.ndarray]:
-        """Return masks of rows for the report's example, best first: successes, then any row."""
+        """Return masks (B,) over B rows, by which the case in the report's figures is chosen.
+
+        It is the first row in the first mask that is not empty. `success` (B,) are the successes.
+        """
         return [success, np.ones_like(success)]
 
     def summary(self) -> Entries:
-        """Return the success rate, counts, and means over the plans that the referee accepted."""
+        """Return success rate, outcome counts, and means of the columns `MEANS` over successes."""
         num = self.successes
         others = {
             f"mean_{name}": total / num if num else None for name, total in self._sums.items()

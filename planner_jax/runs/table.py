@@ -32,7 +32,11 @@ def align(rows: Sequence[Sequence[str]]) -> list[str]:
 
 
 def headline(manifest: Entries, findings: Sequence[str] = ()) -> list[str]:
-    """Return the first sentences of a report: success rate, `findings`, speed, failed limits."""
+    """Return a report's first sentences: success rate, `findings`, speed, failed limits.
+
+    `findings` are sentences on results of one task. A failed limit, such as the greatest speed, is
+    the first limit that a rejected plan breaks; the last sentence counts them.
+    """
     summary, times = manifest["summary"], manifest["times"]
     settings, device = manifest["parameters"], manifest["device"]
     low, high = summary["wilson_95"]

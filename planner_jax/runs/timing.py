@@ -41,7 +41,7 @@ class CompileClock:
 
     @property
     def seconds(self) -> float:
-        """Time [s] spent on compilation so far: the length of the union of all time spans."""
+        """Time [s] in which JAX traced, lowered or compiled; simultaneous work counts once."""
         total, reached = 0.0, 0.0
         for start, end in sorted(self._spans):
             total += max(end - max(start, reached), 0.0)

@@ -1,8 +1,8 @@
 """Differentiable distances between segments, rectangles, boxes, vertical lines and the ground.
 
-The planner of blocks keeps an arm's links and shield clear of obstacles with this module. Every
-function takes ONE pair of bodies; use `jax.vmap` for many pairs. The distance of a capsule is the
-distance of its axis minus its radius. Any frame, SI units; the ground is the x-y plane. Bodies are:
+With them an arm that blocks a ball keeps its links and shield clear of obstacles. Every function
+takes ONE pair of bodies; use `jax.vmap` for many pairs. The distance of a capsule is the distance
+of its axis minus its radius. Any frame, SI units; the ground is the x-y plane. Bodies are:
 
 * a segment: `ends` (2, 3) [m], which may coincide;
 * a rectangle: its `middle` (3,) [m] and `edges` (2, 3) [m], halves of its edges as vectors from the
@@ -16,7 +16,7 @@ theorem). `_shortest` declares this rule to JAX. Derivatives then cost little mo
 need no division by the sine of the angle between nearly parallel bodies. Bodies that cross have
 distance 0 and derivative 0. Parallel bodies can have several pairs of nearest points; the
 derivative then belongs to one of these pairs. `approach` returns the line through the nearest
-points. Derivatives by many rotations and translations follow from this line in a few products.
+points. Derivatives of the distance by rotations and translations of a body follow from this line.
 
 Vectors are tuples of components here, so that XLA compiles one elementwise loop over the batch.
 """
@@ -162,7 +162,6 @@ def _gap_of_segments(shares: tuple[Array, Array], ends_a: Array, ends_b: Array) 
 
 
 def _nearest_of_box(ends: Array, lower: Array, upper: Array) -> tuple[Array]:
-    """Return the fraction, from 0 to 1, along the segment at which it is nearest to the box."""
     start, end = _rows(ends)
     slabs = [
         _slab(low - x, high - x, speed, speed * speed)
@@ -228,8 +227,8 @@ class _Slab(NamedTuple):
 def _slab(to_low: Array, to_high: Array, speed: Array, weight: Array) -> _Slab:
     moves = weight > _TINY
     step = jnp.where(moves, speed, 1.0)
-    # Do not multiply by 1 / step: XLA may fuse a product with a later difference of two equal
-    # numbers, and the difference is then not exactly 0.
+    # Do not multiply by 1 / step: XLA may fuse a product with the later subtraction s - enters,
+    # whose result must be exactly 0 at the fraction s = enters.
     first, last = to_low / step, to_high / step
     return _Slab(
         enters=jnp.minimum(first, last),
@@ -302,8 +301,8 @@ def _nearest_of_projection(middle: Array, edges: Array, position: Array) -> Any:
             p, q = jnp.where(closer, along_e, p), jnp.where(closer, along_f, q)
     area = jnp.abs(_area(e, f))
     inside = (jnp.abs(_area(to, f)) < area) & (jnp.abs(_area(e, to)) < area)
-    # A vertical rectangle projects to a line segment. Rounding errors of the areas can make any
-    # point of this segment's line look inside, so the distance from the middle is tested, too.
+    # A vertical rectangle projects to a line segment without area, for which rounding errors spoil
+    # the test of areas. A position farther from the middle than every corner is never inside.
     inside = inside & (dot(to, to) <= squares[0] + squares[1] + 2.0 * jnp.abs(product))
     return p, q, ~inside
 

@@ -171,7 +171,6 @@ def make_parts(
 def _make_here(
     maker: Maker, numbers: Iterable[int], pool: ThreadPoolExecutor
 ) -> Generator[Callable[[], Made], None, None]:
-    """Plan chunks of cases in this process; yield for each a function that returns its rows."""
     with CompileClock() as clock:
         draws = (pool.submit(as_here(maker.source.chunk), number) for number in numbers)
         following = next(draws, None)
@@ -181,9 +180,10 @@ def _make_here(
 
 
 def times_of(maker: Maker, records: dict[int, Record]) -> Entries:
-    """Return planning, compile and referee times of all chunks of a sweep, without compilation.
+    """Return times [s] of a sweep's chunks (blocks of cases): compiling, planning, judging.
 
-    If most chunks were planned while JAX compiled, one chunk is planned again to measure its time.
+    "warm_seconds" is the planning time of chunks in which JAX compiled nothing. If most cases were
+    planned while JAX compiled, one chunk is planned again to measure its time.
     """
     parts = [records[number] for number in sorted(records)]
     warm = [part for part in parts if part["warm"]]

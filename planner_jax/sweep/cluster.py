@@ -73,7 +73,6 @@ def workers_of(kind: str | None) -> Iterator[Workers | None]:
 
 
 def _start(ray: ModuleType, folder: str) -> None:
-    """Join the cluster at RAY_ADDRESS, or start one on localhost with its files in `folder`."""
     address, handler = os.environ.get(_ADDRESS), signal.getsignal(signal.SIGTERM)
     try:
         if address:
@@ -101,7 +100,6 @@ def _start(ray: ModuleType, folder: str) -> None:
 def _make_parts(
     ray: ModuleType, on_gpus: bool, maker: Maker, numbers: Iterable[int]
 ) -> Generator[Callable[[], Made], None, None]:
-    """Submit chunks of cases to Ray, a few per worker; yield functions that wait for their rows."""
     cores, gpus = (int(ray.cluster_resources().get(name, 0)) for name in ("CPU", "GPU"))
     num, threads = max(cores, 1), threads_of_a_computation()
     environ, config, how = {}, {"jax_platforms": "cpu"}, {}

@@ -1,4 +1,4 @@
-"""Comparison of finished sweeps by success, cost, speed, and cases that only some runs solve."""
+"""Comparison of sweeps (runs over many cases) by success, cost, speed, and solved cases."""
 
 import csv
 import dataclasses
@@ -161,7 +161,7 @@ def _of(measure: Callable[[np.ndarray], np.floating], values: np.ndarray) -> flo
 
 
 def differing(runs: Sequence[ComparedRun]) -> list[tuple[int, list[str]]]:
-    """Return the index of each case that only some runs solve, and the limit failed in each run."""
+    """Return, for cases that only some runs solve, the index and each run's failed limit or ""."""
     solved = np.stack([run.success for run in runs])
     places = np.flatnonzero(solved.any(axis=0) & ~solved.all(axis=0))
     index = runs[0].index

@@ -129,7 +129,10 @@ def _draw_thrust_limits(axes: Axes, setting: Entries) -> None:
 def write_verdicts(
     axes: Axes, run: RunRows, plans: Sequence[tuple[str, Row]], word: Callable[[Row], str]
 ) -> None:
-    """Write the name of each planner in its colour, with the referee's verdict on its plan."""
+    """Write the name of each planner in its colour, with the referee's verdict on its plan.
+
+    For a successful plan, `word` returns a short text from its row.
+    """
     axes.axis("off")
     look: Look = {"va": "top", "transform": axes.transAxes}
     row, suite = plans[0][1], run.manifest["parameters"].get("suite")

@@ -49,7 +49,7 @@ _RESTS = {"brake": "to standstill at the cheapest place", "home": "back to the s
 
 
 def recovery_remark(parameters: Row) -> list[str]:
-    """Return a sentence on how the robots stop, `recovery` "brake" or "home"; [] for "none"."""
+    """Return a sentence on the trajectory after the last contact; [] if the run plans none."""
     if (where := _RESTS.get(parameters.get("recovery", ""))) is None:
         return []
     words = f"After the last contact: a trajectory {where}"

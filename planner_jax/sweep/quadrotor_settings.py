@@ -20,7 +20,10 @@ def robot_option(usual: str) -> Any:
 
 
 def resolve_robot(given: object, tool: str) -> "QuadrotorModel | None":
-    """Return the robot for a name, file, model, or a model's fields; raise unless it has `tool`."""
+    """Return the quadrotor for a name, a file, a model or its fields; None for None.
+
+    An `ArgumentError` is raised unless the quadrotor carries `tool`, "net" or "racket".
+    """
     if given is None:
         return None
     from planner_jax.robot.quadrotor_file import RobotError, model_of
@@ -58,7 +61,7 @@ class QuadrotorSettings(SweepSettings):
     recovery: str = recovery_option()
 
     TOOL: ClassVar[str]  # tool that the robot must carry, "net" or "racket"
-    # Name of the planner that minimises no cost and for which the setting `effort` is rejected.
+    # Name of the planner without search, for which the option `effort` (search length) is rejected.
     WITHOUT_EFFORT: ClassVar[str]
 
     def __post_init__(self) -> None:

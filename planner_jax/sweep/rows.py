@@ -19,7 +19,7 @@ from planner_jax.trajectory.polynomial import PiecewisePolynomial
 
 
 def case_of_row(folder: RunFolder, row: int) -> PyTree:
-    """Return the case of a stored row; raise `ArgumentError` if it does not fit the manifest."""
+    """Return the case of a row; raise an error if physics or limits differ from the manifest's."""
     manifest, sweep = read_finished(folder)
     settings = settings_of_manifest(settings_of(sweep.task), manifest["parameters"], folder.name)
     cases = sweep.open_source(settings.of(sweep.task), 1).cases(row, row + 1).cases

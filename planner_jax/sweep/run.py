@@ -177,7 +177,6 @@ def _finish(
     workers: Workers | None,
     progress: bool,
 ) -> Entries:
-    """Plan the chunks of cases without a record in `there`; write summary, report, manifest."""
     source, watch = maker.source, Stopwatch()
     *earlier, session = manifest["sessions"]
     try:

@@ -148,7 +148,7 @@ def sweep_of(task: Task) -> Sweep:
 
 
 def sweep_of_run(manifest: Entries, name: str = "out") -> Sweep:
-    """Return the sweep object for a run's task; raise unless it is a sweep of a known task."""
+    """Return the sweep object of a run's task; if unknown, raise an error about option `name`."""
     first, _, task = str(manifest["kind"]).partition(" ")
     require(first == "sweep", name, "the folder of a sweep", shown=f"a {manifest['kind']}")
     try:

@@ -1,4 +1,4 @@
-"""The planning tasks: one subpackage each for hits, catches, interceptions, groups and blocks."""
+"""The tasks: hit, catch or block a ball, and intercept one target or a group with a car."""
 
 import lazy_loader
 

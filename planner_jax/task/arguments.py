@@ -48,7 +48,7 @@ def batch_of(name: str, vectors: object, *shape: int) -> tuple[int, ...]:
 
 
 def require_draw(num: int, seed: int, first: int) -> None:
-    """Raise an error unless num >= 1, seed >= 0 and first >= 0, and `num` cases fit in memory."""
+    """Raise unless num >= 1, seed >= 0, first case's index >= 0, and `num` cases fit in memory."""
     for name, value, least in (("num", num, 1), ("seed", seed, 0), ("first", first, 0)):
         require_size(name, value, least)
     require_memory("num", num, _DRAWN_BYTES)

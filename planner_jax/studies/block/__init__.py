@@ -1,1 +1,1 @@
-"""Experiments with arms that block balls: camera observations, repeated and timed planning."""
+"""Experiments with arms that block balls: cameras, re-planning, and delays by slow planning."""

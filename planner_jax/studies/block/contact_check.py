@@ -75,14 +75,9 @@ def _delay_each(case: BlockCase, plan: BlockPlan, late: Array) -> BlockPlan:
 
 
 def _find_contact(case: BlockCase, plan: BlockPlan) -> BlockPlan:
-    """Cut one plan at the time at which the ball of its case crosses the shield's plane."""
     motion = append_braking(case, plan.motion)
 
     def above(time: Array) -> tuple[Array, Array]:
-        """Return the ball's signed distance () [m] from the shield's plane at a time () [s].
-
-        The second result is its squared distance () [m^2] from the shield's centre.
-        """
         ends = jnp.sum(motion.durations)
         angles = evaluate(motion, jnp.clip(time - case.delay, 0.0, ends))
         rotation, middle = shield_pose(case.arm, angles)
@@ -110,10 +105,7 @@ _end_each_at_contact = jax.jit(jax.vmap(_find_contact))
 
 
 def _cut(motion: PiecewisePolynomial, time: Array) -> PiecewisePolynomial:
-    """Cut a motion at a time () [s] after its start; a motion that ends earlier is not cut.
-
-    Pieces after the cut get zero duration, and start with the angles and rates at the cut.
-    """
+    """Cut a motion at a time () [s] after its start; later pieces get zero duration."""
     starts = jnp.cumsum(motion.durations) - motion.durations
     last = jnp.minimum(time, jnp.sum(motion.durations))
     end = jnp.stack([evaluate(motion, last), evaluate(motion, last, 1)])

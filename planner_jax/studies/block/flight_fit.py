@@ -56,7 +56,7 @@ class FlightFit:
 
     @property
     def ball(self) -> BallState:
-        """Estimated position and velocity of the ball at `time`."""
+        """Estimated position and velocity of the ball at the mean time of its observations."""
         return self.belief.ball
 
 

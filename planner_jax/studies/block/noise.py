@@ -58,10 +58,14 @@ def stereo_noise(
 ) -> StereoNoise:
     """Create the error parameters of a stereo camera, with NumPy float32 leaves.
 
-    The default baseline is 0.12 m, the documented baseline of the ZED 2i, the camera of
-    [Natarajan2024]. A matching error of 0.2 px is a usual estimate for one pixel. The other
-    defaults are assumptions; for example the mean disparity over a ball is assumed to have half the
-    error of one pixel.
+    Args:
+        baseline: [m], distance between the lenses; the default is the baseline of the ZED 2i, the
+            camera of [Natarajan2024]. Most other defaults are assumptions.
+        pixel_std: [px], standard deviation of the ball's centre along each image axis.
+        disparity_std: [px], standard deviation of the disparity, averaged over the ball.
+        speckle_std: [px], further standard deviation for one pixel, with a usual value as default.
+        dropout: probability that a pixel, or a ball in a frame, has no depth.
+        mismatch: probability that a pixel has the depth of another object.
 
     Raises:
         ArgumentError: a number is out of its range.

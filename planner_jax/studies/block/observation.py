@@ -47,14 +47,13 @@ class Eye:
 
 
 def mast_camera(size: tuple[int, int] = (1280, 720)) -> Camera:
-    """Return a camera 1.6 m above the arm's base, on a mast on the rig's beam behind the arm.
+    """Return a camera on a mast behind the arm, 1.6 m above the arm's base.
 
     Position and field of view (120 degrees) are assumptions, chosen so that the camera sees the
     throws of all suites almost until they enter the outer box, the region in which the arm may
-    block them. From the mast it looks over the arm; it is 0.3 m to the left of the arm's axis, so
-    that it looks past the pole. [Natarajan2024] mounts its camera on the beams of the rig. In the
-    model of its authors the camera is in front of the arm, where 110 degrees do not cover throws
-    that come from up to 60 degrees to either side.
+    block them. It is 0.3 m to the left of the arm's axis, so that the pole in front of the arm does
+    not hide balls. In [Natarajan2024] the camera is in front of the arm, where a field of view of
+    110 degrees does not cover throws that come from up to 60 degrees to either side.
     """
     place = np.array([-RIG_HALF, 0.3, 1.6])
     ahead = np.array([1.0, np.tan(np.deg2rad(-1.0)), np.tan(np.deg2rad(-8.0))])

@@ -44,7 +44,7 @@ from planner_jax.task.block.replan import ReplanBlock, WarmBlock
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
 
 _NEAR = 0.02  # [m] A contact within this distance of the shield's centre needs no new motion.
-# An arm continues its motion if the contact exceeds its limits by at most this fraction.
+# Greatest relative excess over the limits of offset, tilt and time with which a motion continues.
 _EXCESS = 0.05
 _LONG = 100.0  # [s] Duration of the standstill piece after a motion, longer than any flight.
 
@@ -58,8 +58,8 @@ class Aim:
     edge: float = 0.0  # [m] cut from both ends of the path on which the shield may meet a ball
 
 
-# Requirements on a contact in the order in which they are tried, the strictest first. Each is tried
-# for the balls for which no plan meets the previous requirements.
+# Requirements on a contact, the strictest first: greatest offset [m] from the shield's centre, and
+# margins [m]. Each is tried for the balls for which no plan meets the previous requirements.
 AIMS = (Aim(0.005, at_rest=True, edge=0.05), Aim(0.005, edge=0.05), Aim(0.03, edge=0.03), Aim(0.09))
 
 
@@ -77,7 +77,10 @@ class Decided:
     motions: Array  # (B,) int32, number of started motions
 
     def fit_errors(self, place: int) -> tuple[Array, Array]:
-        """Return errors and standard deviations [m] of the B fits at one moment, index `place`."""
+        """Return errors of the balls' positions fitted at moment `place`, and their deviations [m].
+
+        Both (B,) hold halfway between a ball's entries into the outer and into the inner box.
+        """
         return fit_errors(self.cases, take(self.fits, place))
 
 
@@ -87,7 +90,8 @@ def plan_with_aims(
     """Plan cases with estimated balls, with the requirements `aims` tried one after another.
 
     An aim limits the contact's distance from the shield's centre, and may require standstill. Each
-    case gets the plan for the first aim that can be met, or else the best failed plan.
+    case gets the plan for the first aim that can be met, or else the plan of least violation. A
+    `Replanning` is a case with the motion being executed.
     """
     cases, plans = jax.tree.map(np.asarray, cases), None
     lanes = np.arange(cases.batch_shape[0])
@@ -123,15 +127,16 @@ def decide(
     """Simulate a batch of arms that observe their balls, and plan motions at specified moments.
 
     Args:
-        planner: planner of an arm's first motion, and of motions that do not start from its current
-            motion. A planner other than `OnlineBlock` requires a single moment.
+        planner: planner of motions from scratch. With several moments it must be an `OnlineBlock`,
+            whose re-planner refines motions that are being executed.
         cases: a batch of B cases with the true balls, and with the arms' initial states.
         eye: the camera, its noise and its frame rate.
         moments: [s], increasing times at which the flights are fitted to all observations so far.
         overhead: [s], time from the fit of a flight until a new motion may start, which includes
             the planning time, >= 0.
         seed: seed of the noise, or one seed for each throw, (B,).
-        aims: requirements on the contact, tried in this order; offsets must not decrease.
+        aims: requirements on the contact, tried in this order; their fields `offset`, the greatest
+            distances from the shield's centre, must not decrease.
         shortest: [s], time before the latest possible contact in which no new motion is started.
         patient: whether an arm that has not started waits for more observations, as long as a
             motion that starts later would still meet the first aim.
@@ -184,8 +189,6 @@ def decide(
 
 
 class _Arms:
-    """The arms of a batch: their current motions, and the pieces that they have executed."""
-
     def __init__(self, cases: BlockCase):
         num, dtype = cases.batch_shape[0], cases.gravity.dtype
         self.cases, self.since = cases, np.array(cases.delay)
@@ -201,11 +204,7 @@ class _Arms:
         self.first, self.motions = np.full(num, np.inf, dtype), np.zeros(num, np.int32)
 
     def count_useful(self, known: BlockCase, aims: Sequence[Aim]) -> np.ndarray:
-        """Count for each of B arms the aims that would bring the contact nearer to the centre.
-
-        Aims are requirements on the contact with the shield. `known` has the estimated balls. All
-        aims count for an arm without a motion, and for an arm whose motion misses its ball.
-        """
+        """Count for each of B arms the `aims` that would move the contact nearer to the centre."""
         num = np.full(len(self.motions), len(aims))
         if not self.motions.any():
             return num
@@ -221,11 +220,7 @@ class _Arms:
     def decide(
         self, planner: Planner, known: BlockCase, useful: np.ndarray, aims: Sequence[Aim]
     ) -> None:
-        """Plan new motions, and switch the arms to motions that meet the requirements `aims`.
-
-        For arm b the first useful[b] aims are tried. `known` are cases with the estimated balls;
-        their delays are the times at which new motions may start.
-        """
+        """Plan new motions of arms b for estimated balls, with the first useful[b] `aims` each."""
         begun = dataclasses.replace(self.cases, delay=self.since)
         tasks = ReplanBlock().begin(begun, self.plans, known.delay - self.since, ball=known.ball)
         moves, begin = is_solved(self.plans.status), np.asarray(known.delay)
@@ -313,8 +308,6 @@ def _latest(case: BlockCase) -> Array:
 
 @jax.jit
 def _meets(cases: BlockCase, plans: BlockPlan) -> Array:
-    """Return which motions meet their balls within the limits of the contact, enlarged by 5 %."""
-
     def one(case: BlockCase, plan: BlockPlan) -> Array:
         time = plan.contact_time - case.delay
         angles = evaluate(plan.motion, jnp.minimum(time, jnp.sum(plan.motion.durations)))

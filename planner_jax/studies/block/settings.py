@@ -73,7 +73,7 @@ class StudySettings(SweepSettings):
 
     @property
     def first_motion(self) -> float:
-        """Time [s] added to each case's delay: observation and overhead, or the planning budget."""
+        """Time [s] for observing and planning, before which no arm can start its first motion."""
         if self.perception:
             return self.observe + self.overhead
         return self.planning_budget or 0.0

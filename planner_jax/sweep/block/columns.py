@@ -1,4 +1,4 @@
-"""Columns of the rows that a sweep of blocks stores: ball, arm, plan and referee's verdict."""
+"""Columns of stored cases of an arm that blocks a ball: ball, arm, plan, referee's verdict."""
 
 from planner_jax.runs import columns as known
 from planner_jax.runs.columns import LIST, NUMBER, VECTOR, leaves_of

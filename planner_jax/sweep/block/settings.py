@@ -1,4 +1,4 @@
-"""Settings of a sweep of blocks, from which the options of `planner-jax sweep block` are made."""
+"""Settings of sweeps, that is runs over many cases, of an arm that blocks a thrown ball."""
 
 import dataclasses
 from typing import ClassVar
@@ -14,7 +14,7 @@ REGIMES = ("R1", "R2", "R3")
 
 @dataclasses.dataclass(frozen=True)
 class BlockSettings(StudySettings):
-    """Settings of a sweep of blocks, which plans and judges many drawn cases."""
+    """Settings and command-line options of a run over many cases of an arm that blocks a ball."""
 
     regime: str = option(
         "R2",
@@ -31,7 +31,6 @@ class BlockSettings(StudySettings):
     RUN: ClassVar[str] = "planner_jax.sweep.block.sweep:BlockSweep"
     DRAW: ClassVar[tuple[str, ...]] = ("regime", "wide", "anywhere", "delay")
     CASE_BYTES: ClassVar[int] = 60_000
-    # Number of cases in a batch on a CPU. It is small, so that a chunk takes only some seconds.
     CPU_BATCH: ClassVar[int] = 256
     GPU_BATCH: ClassVar[int] = 4096
 

@@ -45,7 +45,7 @@ class BlockSweep(Sweep[BlockSettings]):
         return {} if settings.is_study else super().other_planners(settings)
 
     def require_fit(self, settings: BlockSettings, planner: Planner, cases: PyTree) -> None:
-        """Raise `ArgumentError` if the planner or its library of motions does not fit the cases."""
+        """Raise an error if the planner takes other cases or has stored motions of another arm."""
         if isinstance(planner, SeeingArms | CountedPlanner):
             planner = planner.planner
         super().require_fit(settings, planner, cases)

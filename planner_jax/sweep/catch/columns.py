@@ -1,4 +1,4 @@
-"""Columns of the rows that a sweep of catches stores: targets, decision, catches and verdict.
+"""Columns of stored cases of catching: targets, order of catches, plan and referee's verdict.
 
 A column of lists has one number, or three coordinates, for each target. Lists that belong to the
 case are in the order of its targets, lists of plan and verdict in the order of the catches.

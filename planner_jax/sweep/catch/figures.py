@@ -75,14 +75,14 @@ def due_distance(plan: SampledCatch) -> np.ndarray:
 
 
 _SAMPLES = 1601  # number of times at which a plan is sampled
-_ROTORS = 0.165  # [m] half the diagonal distance between propellers, of the paper's quadrotor
+_ROTORS = 0.165  # [m] half the diagonal distance between propellers, of the robot in [Yu2023catch]
 # Half the side [m] of a close-up of a catch, and half the time [s] that the close-up shows.
 _CLOSE, _AROUND = 0.5, 0.4
 _TARGETS = (style.ORANGE, style.GREEN, style.PURPLE, style.SKY, "#8C564B", style.INK)
 
 
 def flight_figure(figure: Figure, run: RunRows) -> None:
-    """Draw the example case's plan from the side and from above, and a close-up of each catch."""
+    """Draw case `manifest["example"]` from the side and from above, with close-ups of catches."""
     setting, (_, row) = run.manifest["setting"], run.same_case()[0]
     motion = sample_motion(row["coeffs"], row["durations"], _SAMPLES)
     plan = sample_catch(row, motion, setting)
@@ -129,7 +129,6 @@ def _window(plan: SampledCatch) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _draw_view(axes: Axes, plan: SampledCatch, second: int, only: int | None = None) -> None:
-    """Draw a plan over x and axis `second` (1: y, 2: z); with `only`, just around one catch."""
     where, catches, time = [0, second], plan.catches, plan.motion.time
     for index, at in enumerate(catches):
         if only not in (None, index):

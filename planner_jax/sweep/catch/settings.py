@@ -1,4 +1,4 @@
-"""Settings of a sweep of catches, from which the options of `planner-jax sweep catch` are made."""
+"""Settings of sweeps, that is runs over many cases, of a quadrotor that catches with a net."""
 
 import dataclasses
 import math
@@ -15,7 +15,7 @@ NET_TESTS = ("plane", "ball")  # how the referee tests the net's radius: see the
 
 @dataclasses.dataclass(frozen=True)
 class CatchSettings(QuadrotorSettings):
-    """Settings of a sweep of catches, which plans and judges many drawn cases."""
+    """Settings and command-line options of a run over many drawn cases of catching with a net."""
 
     decide: str = option(
         "best", "NAME", f"decision of the order and times: {', '.join(DECISIONS)}, policy:FILE"
@@ -49,7 +49,7 @@ class CatchSettings(QuadrotorSettings):
 
     @property
     def case_bytes(self) -> int:
-        """Estimated memory [bytes] of one case; it grows with the number of target orders."""
+        """Estimated memory [bytes] of one case; it grows with the number of orders of catching."""
         suite = SUITES.get(self.suite or next(iter(SUITES)))
         all_orders = self.decide == "best" and suite is not None and not suite.optional
         orders = math.factorial(min(suite.num_targets, 6)) if suite and all_orders else 1

@@ -34,9 +34,9 @@ _NET_TESTS = {
 class CatchTally(Tally):
     """Counts of successes, and means of three further quantities of catches.
 
-    They are the number of caught targets divided by the number of targets in a case; the times of
-    catches [s]; and the optimal time ratio |T_o - T_p| / T_o of the solved cases, with first
-    decided catch times T_p and optimised catch times T_o [Yu2023catch, eq. 29].
+    They are the fraction of targets that are caught; the times of catches [s]; and the optimal time
+    ratio |T_o - T_p| / T_o of solved cases [Yu2023catch, eq. 29]. T_p is the time of a catch that
+    is estimated when the order of targets is chosen, T_o its time in the optimised plan.
     """
 
     READS = (*COUNTED, "caught", "present", "catch_times", "time_ratio")
@@ -61,7 +61,10 @@ class CatchTally(Tally):
         self._num_ratios += int(known.sum())
 
     def summary(self) -> Entries:
-        """Return success rates, mean catch time [s] and optimal time ratio; None without values."""
+        """Return success rates, mean time [s] of catches, and mean relative change of their times.
+
+        The change is from the time estimated in advance to the optimised one; None: no values.
+        """
         return {
             **super().summary(),
             "caught": self._shares / self.num,
@@ -102,7 +105,7 @@ class CatchSweep(Sweep[CatchSettings]):
         return make_table(manifest)
 
     def findings(self, manifest: Entries) -> list[str]:
-        """Return a sentence on the share of targets caught, mean time and optimal time ratio."""
+        """Return a sentence on caught targets, times of catches, and how planning changed them."""
         summary = manifest["summary"]
         text = f"{100.0 * summary['caught']:.2f} % of the targets caught"
         if summary["mean_catch_time"] is not None:

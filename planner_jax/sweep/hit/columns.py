@@ -53,7 +53,7 @@ COLUMNS = [
 ]
 
 _ORIGIN = ("scenario", "file", "line", "serve_pos", "serve_vel", "target")
-# Columns of one case that the user specified. It has no scenario, serve or published outcome.
+# Columns for a single case of the user, which has no court scenario, serve or published result.
 SINGLE_COLUMNS = [
     *(c for c in COLUMNS if c.name not in _ORIGIN and c not in OUTCOMES),
     *leaves_of("cases", ("target", "m", "desired landing point", VECTOR)),

@@ -58,7 +58,7 @@ def court_figure(figure: Figure, run: RunRows) -> None:
 def ball_path(
     pos: np.ndarray, vel: np.ndarray, end: float, drag: float, gravity: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return N times [s] from 0 to `end`, and the positions (N, 3) [m] of a flying ball."""
+    """Return N times [s] up to `end`, and positions (N, 3) [m] with quadratic `drag` [1/m]."""
     time = np.linspace(0.0, end, _SAMPLES)
     pos, vel = (np.tile(vector, (_SAMPLES, 1)) for vector in (pos, vel))
     return time, fly(pos, vel, time, drag, gravity)[0]
@@ -114,7 +114,7 @@ def _draw_floor(axes: Axes) -> None:
 
 
 def path_figure(figure: Figure, run: RunRows) -> None:
-    """Draw ball and quadrotor of the run's example case, from above and from the side."""
+    """Draw ball and quadrotor in case `manifest["example"]`, from above and from the side."""
     (_, row), setting = run.same_case()[0], run.manifest["setting"]
     drag_after = run.manifest["parameters"].get("drag_after_impact", False)
     above, side = figure.subplots(2, 1, sharex=True)

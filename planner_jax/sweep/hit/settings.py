@@ -1,4 +1,4 @@
-"""Settings of a sweep of hits, from which the options of `planner-jax sweep hit` are made."""
+"""Settings of sweeps, that is runs over many cases, of a quadrotor that hits a served ball."""
 
 import dataclasses
 import math
@@ -18,7 +18,7 @@ _FARTHEST = 1e6  # [m] greatest absolute coordinate of the start that is accepte
 
 @dataclasses.dataclass(frozen=True)
 class HitSettings(QuadrotorSettings):
-    """Settings of a sweep of hits, which plans and judges many drawn or published cases."""
+    """Settings and command-line options of a run over many drawn or published serves to hit."""
 
     serves: str | None = option(None, "DIR", "read published trial files (default: draw serves)")
     start: tuple[float, ...] | str = option(

@@ -71,7 +71,10 @@ class HitTally(Tally):
     MORE, READS = (ScenarioCounts,), (*COUNTED, *ScenarioCounts.READS)
 
     def examples(self, rows: pa.Table, success: np.ndarray) -> list[np.ndarray]:
-        """Return row masks for the example in figures, first successes from left to far court."""
+        """Return masks (B,) over B rows, by which the case in the report's figures is chosen.
+
+        The first mask has successes with a serve from the left region and a target in the far one.
+        """
         scenario = rows["scenario"].to_numpy()
         left_to_far = success & np.array([name[0] + name[2] == "LF" for name in scenario])
         return [left_to_far, *super().examples(rows, success)]
@@ -117,7 +120,7 @@ class HitSweep(Sweep[HitSettings]):
         return setting | first_values(cases.limits) | first_values(cases.hit_limits)
 
     def table(self, manifest: Entries) -> RateTable:
-        """Return success per scenario in percent, beside the rates of a published planner."""
+        """Return success rates [%] of the 36 court scenarios, beside the rates in [Yu2023bat]."""
         return comparison.make_table(manifest)
 
     def remarks(self, manifest: Entries) -> list[str]:

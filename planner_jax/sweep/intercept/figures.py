@@ -133,7 +133,7 @@ def plane_figure(figure: Figure, run: RunRows) -> None:
 
 
 def choose_rows(run: RunRows) -> list[Row]:
-    """Return the rows of the drawn cases: the report's example, successes, at most two failures."""
+    """Return rows for the figure: case `manifest["example"]`, successes, at most two failures."""
     (_, example), rows = run.same_case()[0], run.sample()
     others = [row for row in rows if row["index"] != example["index"]]
     failures = [row for row in others if not row["success"]][:_FAILURES]
@@ -143,7 +143,7 @@ def choose_rows(run: RunRows) -> list[Row]:
 
 
 def draw_drive(axes: Axes, drive: SampledDrive, colours: ScalarMappable) -> None:
-    """Draw one case from above, with car, target and moving obstacles at several times."""
+    """Draw car, target and moving obstacles from above; `colours` maps times [s] to colours."""
     row = drive.row
     draw_map(axes, drive.setting, drive.walls)
     end = float(np.nan_to_num(row["meeting_time"]))

@@ -14,7 +14,6 @@ class InterceptSettings(SweepSettings):
 
     RUN: ClassVar[str] = "planner_jax.sweep.intercept.sweep:InterceptSweep"
     CASE_BYTES: ClassVar[int] = 100_000
-    # Number of cases in a batch on a CPU. It is small, so that a chunk takes only some seconds.
     CPU_BATCH: ClassVar[int] = 256
     GPU_BATCH: ClassVar[int] = 4096
 

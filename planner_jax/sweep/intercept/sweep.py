@@ -18,14 +18,17 @@ COMPARED = ("lattice", "spacetime")
 
 
 class InterceptTally(Tally):
-    """Counts of successes, and means of meeting time, miss and acceleration over the successes."""
+    """Counts of successes, and their means of meeting time, miss distance and RMS acceleration."""
 
     MEANS = ("meeting_time", "miss", "rms_acceleration")
     READS = (*COUNTED, *MEANS, "mover_clearance")
     NEAR = 0.1  # [m] the figures prefer a case whose car passes a moving obstacle at less than this
 
     def examples(self, rows: pa.Table, success: np.ndarray) -> list[np.ndarray]:
-        """Return row masks for the example in figures, first successes close to an obstacle."""
+        """Return masks (B,) over B rows, by which the case in the report's figures is chosen.
+
+        The first mask has successes whose car comes closer than `NEAR` to a moving obstacle.
+        """
         is_near = rows["mover_clearance"].to_numpy() < self.NEAR
         return [success & is_near, *super().examples(rows, success)]
 

@@ -29,9 +29,10 @@ def planner(name: str = "online", **options: object) -> Planner[BlockCase, Block
     * `insat`: the A* of `epase` interleaved with the optimisation of B-splines [Natarajan2024,
       Algorithm 2]; runs on the host.
 
-    Arguments and errors are as for `pj.hit.planner`. The options are fields of the planner's class:
-    `OnlineBlock`, `LibraryBlock`, `AdaptBlock`, `DirectBlock`, `RrtConnectBlock`, `EpaseBlock` or
-    `InsatBlock`.
+    Planners of other packages are also found by name. The options are fields of the planner's
+    class: `OnlineBlock`, `LibraryBlock`, `AdaptBlock`, `DirectBlock`, `RrtConnectBlock`,
+    `EpaseBlock` or `InsatBlock`. `ValueError` is raised for an unknown name, `TypeError` for an
+    unknown option, and `ModuleNotFoundError` if an extra is missing.
     """
     return TASK.make_planner(name, options)
 
@@ -39,6 +40,8 @@ def planner(name: str = "online", **options: object) -> Planner[BlockCase, Block
 def judge(cases: BlockCase, plans: BlockPlan, **settings: object) -> BlockVerdict:
     """Judge one plan, or a batch, by collisions of the arm and the shield's contact with the ball.
 
-    See `pj.hit.judge` for arguments, result and errors, and `referee_blocks` for the settings.
+    The verdict has the batch shape of the cases: `success`, reasons by `sentence(k)`, and measured
+    quantities. The settings are keyword arguments of `referee_blocks`. `TypeError` is raised for
+    cases of other tasks, `ValueError` for different batch shapes or invalid settings.
     """
     return judge_by(referee_blocks, cases, plans, (BlockCase, BlockPlan), settings)

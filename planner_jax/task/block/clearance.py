@@ -30,8 +30,6 @@ _SHIELD_LINK = 5
 
 
 class _Poses(NamedTuple):
-    """Positions of the parts of an arm with C capsules in N poses, in the robot's base frame."""
-
     ends: Array  # (2, 3, C, N) [m], ends of the capsules' axes
     middle: Array  # (3, N) [m], middle of the shield's plate
     edges: Array  # (2, 3, N) [m], half edges of the plate
@@ -40,8 +38,6 @@ class _Poses(NamedTuple):
 
 
 class _Pairs(NamedTuple):
-    """P pairs of a link or shield and a body that it must not touch, with one shape of each."""
-
     measure: Callable  # function of `space.distances` that returns the distance of two shapes
     bodies: tuple[Array, ...]  # arguments of `measure`; their last axes are (P or 1, N)
     thick: Array | float  # (P, 1) or () [m], sum of the radii around both bodies

@@ -1,12 +1,12 @@
 """The default planner of blocks: a straight joint motion if one is free, else least squares.
 
-The shield may meet a ball anywhere between the outer box and the protected inner box around the
-arm, with the wrist and the elbow on either side. A straight motion turns all joints in proportion
-to such a pose, the end pose. The planner returns the first straight motion that is in time and free
-of collisions. If there is none, Levenberg-Marquardt optimises end pose, time of contact and motion
-together. It starts from straight motions with an added bump (a detour of the joints), until one
-start leads to a plan that keeps every limit. [Natarajan2024] takes its motions from a library; this
-planner stores only the bumps.
+An end pose is a pose of the arm in which the shield meets the ball, between the outer box and the
+protected inner box around the arm. A straight motion follows a straight line in joint space to an
+end pose. The planner returns the first straight motion that is in time and free of collisions. If
+there is none, Levenberg-Marquardt optimises end pose, time of contact and motion together. It
+starts from straight motions with an added bump (a detour of the joints), until one start leads to a
+plan that keeps every limit. [Natarajan2024] takes its motions from a library; this planner stores
+only the bumps.
 """
 
 import dataclasses
@@ -49,8 +49,8 @@ from planner_jax.task.block.end_poses import (
 from planner_jax.task.block.plan import BlockPlan, explain_status, make_empty_plan
 
 _HIGHEST = lax.Precision.HIGHEST
-# Number of starting points in a group, and number of starting points of a group that are refined at
-# the same time on a GPU.
+# Number of starting points that take trial steps before the best of them are refined, and number of
+# starting points that are refined at the same time on a GPU.
 _GROUP, _WIDTH = 4, 2
 
 
@@ -93,7 +93,7 @@ def read_learned_starts() -> tuple[np.ndarray, np.ndarray]:
     """Read N stored starting points, each a straight motion in joint space plus a detour.
 
     Returns:
-        ranks: (N,) int32, index of the motion's end pose in the order of `rank_poses`.
+        ranks: (N,) int32, index of the motion's end pose among poses in order of rising effort.
         bumps: (N, 6), detour of each joint [rad] at half of the motion's duration.
     """
     starts = json.loads((Path(__file__).parent / "learned_starts.json").read_text())
@@ -114,7 +114,8 @@ def rank_poses(poses: EndPoses, num: int, most: float) -> Array:
 
     In an end pose the shield meets the ball. The effort is the greatest ratio of a joint's rate or
     acceleration to its limit. Random numbers from 0 to 1 are added, so that the first poses differ
-    more from each other. A pose whose effort exceeds `most` is too late and ranked far behind.
+    more from each other. A pose whose effort exceeds `most` cannot be reached before the ball, and
+    is ranked far behind.
     """
     rng = np.random.default_rng(0)
     noise = jnp.asarray(rng.random(poses.effort.shape[0]), poses.effort.dtype)
@@ -153,9 +154,9 @@ class OnlineBlock(Planner):
         return self.searches
 
     def load_attempt(self, attempt: Search, cases: BlockCase) -> Search:
-        """Return a search whose numbers are arguments of a compiled program, shared by searches.
+        """Return a search whose numbers are arrays, so that all searches use one compiled program.
 
-        For a single case, searches without least squares share a smaller program. It is compiled
+        For a single case, searches without least squares use a smaller program. It is compiled
         sooner, so that the first plan comes early.
         """
         is_small = cases.batch_shape == () and not attempt.tries

@@ -106,10 +106,11 @@ class ReplanBlock(Planner):
     ) -> Replanning:
         """Return the case, or the batch, as it remains `elapsed` seconds into its motion.
 
-        See `pj.replan` for cases, the previous plan, the elapsed time and the errors. `ball` is the
-        estimated ball at time 0 of the cases, by default the ball of the cases. `angles` [rad] and
-        `rates` [rad/s] at the start of the new motion are (6,), or (B, 6) for B cases. By default
-        they are taken from the previous plan, whose motion is followed by braking.
+        `previous` is the plan of `cases` that is executed, `elapsed` () or (B,) [s] >= 0 the time
+        since its start. `ball` is the estimated ball at time 0 of the cases, by default the ball of
+        the cases. `angles` [rad] and `rates` [rad/s] at the start of the new motion are (6,), or
+        (B, 6) for B cases. By default they are taken from the previous plan, whose motion is
+        followed by braking.
         """
         elapsed, batch = check_elapsed(cases, elapsed), cases.batch_shape
         if ball is not None:
@@ -130,7 +131,7 @@ class ReplanBlock(Planner):
         return Replanning(case=left, previous=previous, elapsed=host_leaf(elapsed))
 
     def plan_by(self, drive: Drive, tasks: Replanning) -> BlockPlan:
-        """Return the plans of one case or a batch, from scratch where refining a motion fails."""
+        """Return plans, from scratch where refining fails; planners are called through `drive`."""
         plans, _ = drive(self.warm, tasks)
         unsolved, cases = is_unsolved(plans.status), tasks.case
         if not tasks.batch_shape:

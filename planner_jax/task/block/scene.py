@@ -29,7 +29,7 @@ class Box:
 
 @struct.dataclass
 class Scene:
-    """Surroundings of the arm: two boxes, which the paper calls domes, and the obstacles."""
+    """Surroundings of the arm: box to protect, box in which balls may be blocked, obstacles."""
 
     inner: Box  # protected box
     outer: Box  # box in which the shield may meet a ball

@@ -36,9 +36,15 @@ def draw(
     """Draw a batch of cases with random throws in float64, and cast them to `dtype`.
 
     In the suite "pole" (default) a pole stands in front of the arm, in "open" there is none, and in
-    "short" balls are launched nearer. Suites of other packages are also accepted. See
-    `pj.block.case` for `regime`, `wide`, `anywhere` and `delay` [s], and `pj.hit.draw` for the
-    other arguments and the errors.
+    "short" balls are launched nearer. Suites of other packages are also accepted. Case k of a suite
+    and seed is always the same; the batch has the cases from k = `first` >= 0 on. `ValueError` is
+    raised for an unknown suite or a number out of its range.
+
+    * `regime`: joint limits: "R1" of [Natarajan2024], "R2" of the data sheet, with rest at the end,
+      "R3" as "R1" with rest at the end.
+    * `wide`: accept a ball 0.1 m from the shield's middle, 30 degrees from its normal; `anywhere`:
+      accept every contact with the shield.
+    * `delay`: [s], time at which the arm may start to move.
     """
     suite = suite_named(suite, "pole")
     if suite not in SUITES:
@@ -58,10 +64,7 @@ def draw(
 
 
 def _draw_throw(suite: Suite, random: np.random.Generator) -> np.ndarray:
-    """Draw throws until one misses the pole and stays in the outer box once it has entered.
-
-    The result (2, 3) is the position [m] and the velocity [m/s] of the ball at the launch.
-    """
+    """Draw throws until one is valid; return position [m] and velocity [m/s] at launch, (2, 3)."""
     while True:
         azimuth, distance = random.uniform(-AZIMUTH, AZIMUTH), random.uniform(*suite.distance)
         pos = np.array(

@@ -69,7 +69,9 @@ def judge(cases: CatchCase, plans: CatchPlan, **settings: object) -> CatchVerdic
 
     The referee computes positions of targets of the library's classes itself. For other classes it
     calls their method `at` in float64 and takes velocities by central differences over 2e-4 s.
-    Arguments, result and errors are as in `pj.hit.judge`, with the settings of `referee_catches`.
+    The verdict has the batch shape of the cases: `success`, reasons by `sentence(k)`, and measured
+    quantities. The settings are keyword arguments of `referee_catches`. `TypeError` is raised for
+    cases of other tasks, `ValueError` for different batch shapes or invalid settings.
     """
     known = (BallPath, HarmonicPath, PathTable)  # classes of targets that the referee computes
     if isinstance(cases, CatchCase) and type(cases.targets) not in known:
@@ -80,7 +82,6 @@ def judge(cases: CatchCase, plans: CatchPlan, **settings: object) -> CatchVerdic
 def _states_by_class(
     targets: TargetPath, order: np.ndarray, times: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return positions and velocities (B, N, 3) of N targets of B cases, each at its own time."""
     lanes = np.arange(len(order))[:, None]
     with jax.enable_x64(True):
         ordered = jax.tree.map(lambda leaf: _double(leaf)[lanes, order], targets)

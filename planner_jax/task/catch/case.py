@@ -74,8 +74,8 @@ class CatchChoice:
 class CatchCase:
     """One case, or a batch: a quadrotor has to catch up to N flying targets in its net.
 
-    Every number is a leaf of the pytree. Time 0 is when planning starts. Before a case is planned,
-    a decision sets `order` and `times`.
+    Every number is a leaf of the pytree. Time 0 is when planning starts. The planner first replaces
+    the order and the guessed times of catches, the fields `order` and `times`.
     """
 
     rules: ClassVar[Table] = RULES
@@ -134,9 +134,8 @@ def case(
     The paper states no limits of the robot. The defaults are a speed of 5 m/s, a body rate of
     5 rad/s, thrust from 0.3 to 2.5 times the weight, height >= 0.25 m, and theta_safe = 30 degrees.
     `order` is 0, 1, ..., N - 1, and `times` are equally spaced up to the first target's horizon;
-    the decision of the planner replaces both.
-
-    The arguments that are not in this list, and the errors, are as in `pj.hit.case`.
+    the planner first replaces both. `CaseError` is raised for an invalid number, `ValueError` for a
+    wrong shape, `TypeError` for a wrong type.
 
     * `targets`: paths of the targets, such as a `BallPath`; leaves have leading axes (..., N).
     * `horizon`: (..., N) [s], latest time at which each target may be caught.
@@ -145,6 +144,10 @@ def case(
     * `net_height`, `net_radius`: height l above the propeller plane and radius of the net [m].
     * `max_angle`: theta_safe [rad], greatest angle between net's axis and ball's reversed velocity.
     * `optional`: whether targets may be left out. The number of caught targets is then maximised.
+    * `start`: (..., 3) [m], hover position at time 0; `gravity`: [m/s^2], magnitude.
+    * `speed` [m/s], `body_rate` [rad/s]: greatest values; `min_height` [m] of the propeller plane;
+      `min_thrust`, `max_thrust` [m/s^2], per unit mass.
+    * `extras`: further constraints and costs such as `pj.KeepOut`; `dtype`: type of the numbers.
     """
     dtype, shape = floating(dtype), shape_of("horizon", horizon)
     if not shape or not shape[-1]:

@@ -1,4 +1,4 @@
-"""Functions that all catch planners use: order of targets, axes of the net, reach of targets."""
+"""Functions of all catch planners: order of targets, axis of the net, targets out of reach."""
 
 import jax
 import jax.numpy as jnp

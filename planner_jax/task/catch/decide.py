@@ -77,8 +77,6 @@ def in_several_lengths(case: CatchCase, choices: CatchChoice) -> CatchChoice:
 
 @struct.dataclass
 class _Partial:
-    """State of a beam search: W sequences with equal numbers of catches."""
-
     rank: Array  # (W,) [s], the least is best; infinite in rows that hold no sequence
     short: Array  # (W,) [m], sum of the distances by which targets are missed
     time: Array  # (W,) [s], of the last catch
@@ -90,11 +88,11 @@ class _Partial:
 def beam(case: CatchCase, table: Timetable, width: int) -> CatchChoice:
     """Search for W orders of one case that catch most targets, and catch them early.
 
-    It is a beam search of width W = `width`. After each catch the W sequences of catches with the
-    least ranks continue. The rank is the estimated time plus 10 s for each metre by which targets
-    are missed. Among sequences with the same targets and the same last target only the best
-    continues. If fewer than W orders are found, the first one is repeated. For N targets the leaves
-    of the result have the shape (W, N).
+    It is a beam search of width W = `width` among the possible catches in `table`. After each catch
+    the W sequences with the least ranks continue. The rank is the estimated time plus 10 s for each
+    metre that the quadrotor would lack to reach its targets in time. Among sequences with the same
+    targets and the same last target only the best continues. If fewer than W orders are found, the
+    first one is repeated. For N targets the leaves of the result have the shape (W, N).
 
     Raises:
         ValueError: there are more than `MOST_SEARCHED` targets.
@@ -155,10 +153,7 @@ def beam(case: CatchCase, table: Timetable, width: int) -> CatchChoice:
 
 
 def _choice(position: Array, times: Array) -> CatchChoice:
-    """Return the order of N targets with positions `position` (N,) in a sequence of catches.
-
-    Targets that are not caught have the position N. `times` (N,) [s] are the times of the catches.
-    """
+    """Return the order of N targets whose `position` in it is 0 to N - 1, or N if not caught."""
     num = position.size
     order = jnp.argsort(position, stable=True)
     taken = position < num
@@ -219,7 +214,7 @@ class Best(CatchDecision):
         require(self.width >= self.finalists, "width", f">= {self.finalists} finalists", self.width)
 
     def propose(self, case: CatchCase) -> CatchChoice:
-        """Return the orders of one case with the least ranks, best first; each is a row."""
+        """Return the orders of one case that are estimated to end first, (F, N), the best first."""
         table = timetable(case)
         if case.optional or case.num_targets > MOST_PERMUTED:
             found = beam(case, table, self.width)
@@ -243,7 +238,6 @@ class Greedy(CatchDecision):
         return in_several_lengths(case, jax.tree.map(lambda leaf: leaf[None], choice))
 
     def _handicap(self, case: CatchCase, table: Timetable) -> Array:
-        """Return times (N,) [s] that are added to targets' earliest catches for comparisons."""
         return jnp.zeros_like(case.horizon)
 
 

@@ -68,7 +68,8 @@ _FROM_LEARNED = Round(starts=1, solver=LbfgsConfig(max_steps=2))  # from a netwo
 # iterations of `_FIRST` would end too far from the optimum.
 _LONG_CHAIN = Stage(LbfgsConfig(max_steps=200, tolerance=1e-6, patience=5))
 _CHAIN_TOLERANCE = 1e-4
-# If more than `_FEW` targets must all be caught, the first two attempts have more iterations.
+# If more than `_FEW` targets must all be caught, the first attempt has `_STEPS_A_TARGET` iterations
+# for each target, and the second attempt the settings `_OF_MANY`.
 _FEW = 3
 _STEPS_A_TARGET = 20
 _OF_MANY = LbfgsConfig(max_steps=300, memory=8, trial_steps=(1.0, 0.3))
@@ -118,9 +119,8 @@ class ExactCatch(ChainPlanner[CatchCase, CatchPlan]):
     def start_network(self, case: CatchCase) -> StartNetwork | None:
         """Return the network that predicts a starting point; None if there is no such network.
 
-        It exists for cases with one target and without obstacles, if `proportions`, `scale` and
-        `lift` have their defaults. Around obstacles the side on which a search starts decides on
-        which side it ends.
+        It exists for one target without obstacles, if the pieces' relative durations `proportions`,
+        the variables' units `scale` and the thrust `lift` have their defaults, as in training.
         """
         is_usual = self.proportions == _PROPORTIONS and self.lift == _GUESSES[0, 3]
         is_usual &= case.num_targets == 1 and not case.extras
@@ -168,7 +168,7 @@ class ExactCatch(ChainPlanner[CatchCase, CatchPlan]):
         return jax.vmap(lambda guess: self._guess(context, guess))(rows)
 
     def load_attempt(self, attempt: Round, cases: CatchCase) -> PyTree:
-        """Return an attempt as a pytree, with iterations that suit the number of targets."""
+        """Return an attempt (search settings) as arrays, with more iterations for more targets."""
         return super().load_attempt(self._for_start(attempt, cases), cases)
 
     def starts_long(self, cases: CatchCase) -> bool:

@@ -92,10 +92,11 @@ class ReplanCatch(OptimisedPlanner):
     ) -> Replanning:
         """Return the case, or the batch, as it remains `elapsed` seconds into its plan.
 
-        Caught targets become absent; the others keep their order. `pj.replan` describes `cases`,
-        `previous`, `elapsed` and the errors. The estimated `targets` have the shapes of the cases'
-        targets, and their time 0 is the present. The quadrotor's `head_state` (4, 3), or (B, 4, 3)
-        for B cases, is by default the state that the plan has at this time.
+        Caught targets become absent; the remaining targets keep their order. `previous` is the plan
+        of `cases` that is flown, `elapsed` () or (B,) [s] >= 0 the time since its start. The
+        estimated `targets` have the shapes of the cases' targets, and their time 0 is the present.
+        The quadrotor's `head_state` (4, 3), or (B, 4, 3) for B cases, is by default its state in
+        the plan at this time.
         """
         elapsed = check_elapsed(cases, elapsed)
         require_path("targets", targets, np.shape(cases.present), 3)
@@ -175,7 +176,7 @@ class ReplanCatch(OptimisedPlanner):
         return jnp.concatenate([first, self.planner.guesses(context.catch, num - 1)])
 
     def objective(self, point: Array, context: ReplanContext) -> Evaluation:
-        """Return cost and violation at `point`; shortly before a catch, of the previous plan."""
+        """Return cost and violation at `point`; at the starting point if `context.keep` is true."""
         return self.planner.objective(jnp.where(context.keep, context.start, point), context.catch)
 
     def decode(self, point: Array, context: ReplanContext) -> CatchPlan:
@@ -187,7 +188,6 @@ class ReplanCatch(OptimisedPlanner):
 
 
 def _states(coeffs: Array, time: Numbers) -> Array:
-    """Return states (K, 4, 3), position to jerk, of K pieces, each at its time (K,) [s]."""
     factors, powers = polynomial.state_basis(coeffs.shape[1])
     basis = time[:, None, None] ** jnp.asarray(powers, time.dtype)[None]
     basis *= jnp.asarray(factors, time.dtype)[None]
@@ -195,7 +195,6 @@ def _states(coeffs: Array, time: Numbers) -> Array:
 
 
 def _states_along(trajectory: polynomial.PiecewisePolynomial, times: Numbers) -> Array:
-    """Return the states (K, 4, 3), position to jerk, of a trajectory at K times (K,) [s]."""
     ends = jnp.cumsum(trajectory.durations)
     piece = jnp.sum(times[:, None] >= ends[None, :-1], axis=1)
     return _states(trajectory.coeffs[piece], times - (ends - trajectory.durations)[piece])

@@ -36,8 +36,6 @@ _PARALLEL = SUITES["hexagon6"].horizon  # [s], latest time of a catch of targets
 
 @dataclasses.dataclass(frozen=True)
 class _Throw:
-    """Ranges from which landing point and flight time of a ball are drawn; its drag and delay."""
-
     land: tuple[float, float] = (1.0, 0.4)  # [m], half sides of the landing rectangle
     flight: tuple[float, float] = (1.4, 1.78)  # [s], from the launch to the ground
     delay: float = 0.3  # [s], from the launch to time 0
@@ -68,7 +66,8 @@ def draw(
 ) -> CatchCase:
     """Draw a batch of random catch cases in float64, and cast them to `dtype`.
 
-    The arguments that are not in this list, and the errors, are as in `pj.hit.draw`.
+    Case k of a suite and `seed` is always the same; the batch has `num` cases from k = `first` >= 0
+    on. `ValueError` is raised for an unknown suite or a number out of its range.
 
     * `suite`: "throws" (thrown balls) by default; `planner_jax.task.catch.spec.SUITES` describes
       all suites. Suites of other packages are also accepted.
@@ -140,7 +139,6 @@ def _throws(uniform: PyTree, throws: tuple[_Throw, ...]) -> tuple[BallPath, PyTr
 
 
 def _throw(uniform: PyTree, throw: _Throw) -> tuple[PyTree, PyTree, PyTree]:
-    """Return positions and velocities at time 0 of random balls, and latest times of catches."""
     xp = _module(uniform)
     level = (2.0 * uniform[:, :2] - 1.0) * xp.asarray(throw.land)
     land = xp.concatenate([level, xp.zeros_like(level[:, :1])], axis=1)
@@ -189,7 +187,6 @@ def _fly(pos, vel, time, drag: float, gravity: float = GRAVITY) -> tuple[PyTree,
 
 
 def _lines(pos: PyTree, vel: PyTree) -> BallPath:
-    """Return N targets for each of B cases, with positions `pos` at time 0 and constant `vel`."""
     ball = BallState(pos=pos, vel=vel)
     drag, gravity = host_leaf(np.zeros(pos.shape)), host_leaf(np.zeros(pos.shape[:2]))
     return BallPath(ball, drag=drag, gravity=gravity)

@@ -40,8 +40,9 @@ def planner(
 def judge(cases: InterceptGroup, plans: GroupPlan, **settings: object) -> InterceptVerdict:
     """Judge plans of groups by the referee, an independent check of the drive to every target.
 
-    Arguments, result and errors are as for `pj.hit.judge`. The settings are keyword arguments of
-    `referee_intercepts`, which judges each drive as one interception.
+    The verdict has the batch shape of the cases: `success`, reasons by `sentence(k)`, and measured
+    quantities. The settings are keyword arguments of `referee_intercepts`. `TypeError` is raised
+    for cases of other tasks, `ValueError` for different batch shapes or invalid settings.
     """
     require_settings(referee_intercepts, settings)
     if isinstance(cases, InterceptGroup):

@@ -93,17 +93,19 @@ def case(
 ) -> InterceptGroup:
     """Make a case with a group of N targets, or a batch of cases.
 
-    Car and map are by default as in `pj.intercept.case`. The order is 0, 1, ..., N - 1; a planner
-    replaces it by the order that it decides.
+    Car and map have the defaults of `pj.intercept.case`, from [Qu2022]. The order is 0, 1, ...,
+    N - 1; a planner replaces it by the order that it decides.
 
     Args:
         targets: paths of targets, such as a `TurningPath`; leaves have leading axes (N,), (B, N).
         time: () [s], time before which all targets must be met, or (B,) for B cases.
         present: () or (N,) or (B, N) bool, whether each target exists.
-        **settings: arguments of `pj.intercept.case`, such as `start` and `walls`.
+        **settings: arguments of `pj.intercept.case`, such as the car's `start` and `speed`,
+            obstacles `walls` and `movers`, and the `tolerance` [m] of a meeting.
 
     Raises:
-        TypeError, ValueError: as for `pj.intercept.case`.
+        TypeError: an argument has a wrong type, or `pj.intercept.case` has no such argument.
+        ValueError: a number breaks a rule, a shape is wrong, or an obstacle is not convex.
     """
     scalars = [settings.get(name, 0.0) for name in ("initial_speed", "tolerance")]
     shapes = [np.shape(time), np.shape(settings.get("start", 0.0))[:-1], *map(np.shape, scalars)]

@@ -27,8 +27,6 @@ _TURNING = 0.6  # assumed mean turn rate of the car, divided by its greatest tur
 
 @struct.dataclass
 class _Meeting:
-    """Estimated state of the car at the moment at which it meets a target."""
-
     time: Array  # () [s], of the meeting
     position: Array  # (2,) [m], of the target and of the middle of the car's body
     heading: Array  # () [rad], of the car
@@ -44,7 +42,6 @@ def _start(group: InterceptGroup) -> _Meeting:
 
 
 def _timetable(group: InterceptGroup) -> tuple[Array, Array]:
-    """Return K times (K,) [s] up to the case's time, and the N targets' positions (N, K, 2) [m]."""
     shares = jnp.asarray(np.arange(1, _GRID + 1) / _GRID, group.shared.time.dtype)
     times = group.shared.time * shares
     of_one = jax.vmap(lambda path, time: path.at(time).pos, (None, 0))
@@ -54,7 +51,6 @@ def _timetable(group: InterceptGroup) -> tuple[Array, Array]:
 def _next(
     group: InterceptGroup, table: tuple[Array, Array], last: _Meeting, target: Array
 ) -> _Meeting:
-    """Estimate the earliest meeting with a target after `last`; `table` is from `_timetable`."""
     times, positions = table[0], table[1][target]
     limits = group.shared.limits
     away = positions - last.position[None]
@@ -75,8 +71,6 @@ def _next(
 
 
 def _rank(group: InterceptGroup, table: tuple[Array, Array], order: Array) -> Array:
-    """Return the rank () [s] of an order: last meeting's time + 10 * sum of the car's delays."""
-
     def advance(last: _Meeting, target: Array) -> tuple[_Meeting, None]:
         return _select(group.present[target], _next(group, table, last, target), last), None
 

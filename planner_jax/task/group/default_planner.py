@@ -42,7 +42,7 @@ class GroupIntercept(Planner):
     patient: SpacetimeIntercept = SpacetimeIntercept("least")  # for legs that `planner` fails
 
     def plan_by(self, drive: Drive, cases: InterceptGroup) -> GroupPlan:
-        """Plan a case or a batch, one leg (drive to one target) after another."""
+        """Plan the ways to one target after another; other planners are called through `drive`."""
         if cases.batch_shape == ():
             plans = self.plan_by(drive, jax.tree.map(lambda leaf: leaf[None], cases))
             return jax.tree.map(lambda leaf: leaf[0], plans)
@@ -144,7 +144,6 @@ def _advance(
 
 @jax.jit
 def _join(cases: InterceptGroup, begins: Array, legs: InterceptPlan) -> GroupPlan:
-    """Join the N drives (legs) of B groups, which start at `begins` (N, B) [s], to B plans."""
     begins, legs = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), (begins, legs))
     # The status of a plan is the status of its first unsolved leg (drive to one target).
     first = jnp.argmax(~is_solved(legs.status), axis=1)

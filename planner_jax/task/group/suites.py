@@ -29,8 +29,9 @@ def draw(
 ) -> InterceptGroup:
     """Draw a batch of cases with groups of targets in float64, and cast them to `dtype`.
 
-    The suite is "group" by default, or a suite of another package. See `pj.hit.draw` for the other
-    arguments and the errors.
+    The suite is "group" by default, or a suite of another package. Case k of a suite and `seed` is
+    always the same; the batch has `num` cases from k = `first` >= 0 on. `ValueError` is raised for
+    an unknown suite or a number out of its range.
     """
     suite = suite_named(suite, "group")
     if suite not in SUITES:
@@ -53,7 +54,6 @@ def draw(
 def _draw_target(
     suite: str, randoms: list[np.random.Generator], draws: dict[str, np.ndarray]
 ) -> dict[str, np.ndarray]:
-    """Draw one more target for each of B cases until it is on the map and clear of obstacles."""
     spec, pending = SUITES[suite], np.arange(len(randoms))
     turning = np.array([random.random() < 0.5 for random in randoms])
     targets = {name: np.zeros_like(draws[name]) for name in _TARGET}

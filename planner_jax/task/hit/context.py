@@ -73,8 +73,8 @@ def is_too_far(context: HitContext) -> Array:
     low = lowest - pos[:, 2] - _SLACK
     high = pos[:, 2] - ALLOWED * case.hit_limits.max_apex - _SLACK
     apart = jnp.maximum(far - arm, jnp.maximum(low, high))
-    # The proof covers the table's times only. It is complete if at the last time the ball is below
-    # the height of every possible impact, and sinks.
+    # The tests above end at the table's last time. Later impacts are impossible if the ball is then
+    # below the height of every possible impact, and sinks.
     is_down = (pos[-1, 2] < lowest) & (vel[-1, 2] < 0.0)
     return jnp.all(apart > moved) & is_down
 

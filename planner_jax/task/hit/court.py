@@ -26,11 +26,11 @@ LANE_LINE = 0.84  # [m], |y| of the lines between the middle strip and the side 
 _FLIGHT_STEPS = 16  # Runge-Kutta steps of a flight; landing points are then exact to 0.1 mm
 _NEWTON_STEPS = 5  # iterations that refine the time of a landing
 
-REGIONS = "NFLR"  # near, far, left, right; the published files number the regions from 1
+REGIONS = "NFLR"  # near, far, left, right; numbered from 1 in files of [Yu2023bat]
 # [m], target of each region of `REGIONS` in the opponent's half. Left is y > 0 in both halves.
 TARGETS = ((1.75, 0.0, 0.0), (4.0, 0.0, 0.0), (3.0, 1.67, 0.0), (3.0, -1.67, 0.0))
 
-PLANNERS = ("juggle", "bat-lite", "bat")  # planners with published results
+PLANNERS = ("juggle", "bat-lite", "bat")  # planners with results in [Yu2023bat]
 # Names of the 36 scenarios, such as "NFL": serve near, landing far, target left.
 SCENARIOS = tuple(
     serve + landing + target
@@ -71,7 +71,6 @@ def _acceleration(velocity: np.ndarray, drag: np.ndarray, gravity: np.ndarray) -
 
 
 def _rk4_step(position, velocity, step, drag, gravity):
-    """Advance position and velocity (3, ...) by a Runge-Kutta step of order 4, `step` (...) [s]."""
     half = 0.5 * step
     a1 = _acceleration(velocity, drag, gravity)
     a2 = _acceleration(velocity + half * a1, drag, gravity)
