@@ -69,8 +69,8 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
     shipped_name: ClassVar[str] = "exact"  # first part of the scales' names in the package
     num_end_variables: ClassVar[int]  # K, for each segment
     guess_table: ClassVar[np.ndarray]  # one row for each starting point, best first
-    # Intervals of a piece in the check of a finished plan: of one segment, of several segments.
-    # With a small thrust between two catches, the body rate can have narrow peaks.
+    # Number of intervals of each piece, at whose ends a finished plan is checked: for a plan of one
+    # segment, and of several segments, between which the body rate can have narrow peaks.
     decode_nodes: ClassVar[tuple[int, int]] = (32, 48)
     proportions: tuple[float, ...] = (1.0,) * 6  # relative durations of a segment's pieces
     nodes: int = 8  # number of intervals of each piece, at whose ends penalties are evaluated
@@ -113,7 +113,7 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
         return 0.0
 
     def active(self, context: PyTree) -> Bool[Array, " N"]:
-        """Return which of the N segments the case uses, (N,) bool; by default its only one."""
+        """Return which of the N segments the planning problem uses, (N,) bool; here N = 1."""
         return jnp.ones(1, bool)
 
     def relative_excess(self, excess: Array) -> Array:
@@ -181,7 +181,7 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
         return (together / jnp.asarray(self.scale, together.dtype)[None]).ravel()
 
     def along(self, nodes: int, case: QuadrotorCase) -> Along:
-        """Return the penalties' integrand and quadrature, with `nodes` intervals of each piece."""
+        """Return integrand and quadrature of a segment's penalties; `nodes` intervals a piece."""
         return flight_along(self.maps, nodes, case, self.margin, self.hinge_width)
 
     def evaluate_ends(
@@ -192,7 +192,7 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
         Returns:
             Boundary rows (N, 8, 3), scaled states at both ends of the segments; mean durations of a
             piece (N,) [s]; the cost () of time, ends, and energy without waypoint offsets; and the
-            greatest excess at the ends ().
+            greatest relative excess over the limits at the ends ().
         """
         ends = self.meet(natural, context)
         durations = ends.durations / self.num_pieces
@@ -230,7 +230,7 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
         )
 
     def curvature_at(self, point: Float[Array, " n"], context: PyTree) -> Curvature:
-        """Return evaluation, gradient and second derivatives at a point; see `chain_curvature`."""
+        """Return evaluation, gradient, Hessian products and preconditioner at a point (n,)."""
         # Imported here because only Newton's method needs this module.
         from planner_jax.optimise.chain_curvature import chain_curvature
 

@@ -9,10 +9,10 @@ feasible iterate. A lane is one problem of the batch.
 Few vectors are enough if the planner has a preconditioner, an inverse of the dominant part of the
 Hessian. There are two kinds of damping. First, each lane has its own damping, a multiple of the
 identity that is added to the Hessian. Far from the optimum it turns the step towards the negative
-gradient. Second, several multiples of the preconditioner's curvature are tried at once, which takes
-few operations. (A line search under `vmap` would continue until the slowest lane is done.) The best
-multiple determines the lane's next damping. The damping decreases towards the optimum, where the
-last steps are undamped Newton steps.
+gradient. Second, each iteration tries several steps, for which different multiples of the
+preconditioner's matrix are added to the Hessian. (A line search under `vmap` would continue until
+the slowest lane is done.) The best multiple determines the lane's next damping. The damping
+decreases towards the optimum, where the last steps are undamped Newton steps.
 
 Near an optimum the costs of two points differ by less than their rounding errors, while gradients
 still show where the optimum is. With a `slack` > 0 a step may raise the cost by a rounding error,
@@ -191,7 +191,7 @@ def _lanczos(
         diagonal.append(jnp.sum(directions[k] * product))
         if k + 1 == num:
             break
-        # Orthogonalise against all previous directions, since rounding errors add parts of them.
+        # Orthogonalise against all previous directions: rounding errors add components along them.
         shares = jnp.matmul(directions, product, precision=_HIGHEST)
         product = product - jnp.matmul(shares, images, precision=_HIGHEST)
         turned = turned - jnp.matmul(shares, directions, precision=_HIGHEST)
@@ -267,9 +267,6 @@ def _choose(
     decrease: Array,
 ) -> tuple[NewtonNumbers, Array, Array, Array]:
     """Choose the trial step of least cost, if it lowers the cost.
-
-    `here` is the objective at the current point, `trials` at the k trial points. `decrease` ()
-    is the predicted decrease of the cost; see `solve_damped`.
 
     Returns the new scalars of the state; weights of the trial steps, 1 for the chosen step; whether
     the new point is the best so far; and whether the search was unfinished before.

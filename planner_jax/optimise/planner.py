@@ -38,7 +38,7 @@ _POLISH = NewtonConfig(
     stragglers=(0.125, 10, 10),
 )
 _LONG = LbfgsConfig(max_steps=300, tolerance=1e-7, patience=6)
-# Effort -> settings of Newton's method after the first round (attempt); see `with_effort`.
+# Value of `effort` -> settings of Newton's method, which continues the first round (attempt).
 _EFFORTS = {
     "good": NewtonConfig(max_steps=1, damping=1e-6, tolerance=2e-2, stragglers=(0.125, 2, 60)),
     "best": NewtonConfig(
@@ -161,7 +161,7 @@ class OptimisedPlanner(Planner[CaseT, PlanT], abc.ABC):
     def with_polish(self, solver: NewtonConfig | None = None) -> Self:
         """Return a copy of the planner whose first round (attempt) continues by Newton's method.
 
-        `solver` has the settings of the method; by default it continues to the optimum.
+        `solver` has the settings of the method; None: settings that continue to a local optimum.
         """
         first, *others = self.rounds
         stages = (*first.stages, Stage(first.solver, first.settings))

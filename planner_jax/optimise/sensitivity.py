@@ -170,9 +170,9 @@ def gradient_at(
             early if the Hessian is not positive. 0 sets the adjoint vector to zero, which is
             correct for "cost": its derivative at an optimum is the derivative at a fixed point
             (envelope theorem). None: 40 for "products", 1 for "whole".
-        curvature: "products" uses products and preconditioner of the planner's `curvature_at`;
-            "whole" uses the inverse of the full Hessian as preconditioner, which takes one product
-            for each of n variables.
+        curvature: "products" uses the products with the Hessian, and the preconditioner, that the
+            planner's `curvature_at` returns. "whole" uses the inverse of the full Hessian as
+            preconditioner, which takes one product for each of n variables.
 
     Raises:
         ValueError: a name does not exist, or is not of floating-point numbers.

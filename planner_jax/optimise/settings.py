@@ -21,7 +21,7 @@ from planner_jax.core.errors import ArgumentError, ArgumentTypeError
 from planner_jax.core.protocol import Attempt
 from planner_jax.core.rules import NOT_NEGATIVE, Rule
 
-# Greatest number of L-BFGS iterations that is compiled as a constant; see `load_round`.
+# Greatest number of L-BFGS iterations that may be a constant of a compiled program.
 COUNTED = 16
 MOST_DAMPING = 1e4  # greatest damping of one problem in Newton's method
 
@@ -202,7 +202,7 @@ def load_round(attempt: Round, is_counted: bool) -> Round | Fixed:
 
 @cached_by_precision
 def load_stage(stage: Stage, is_counted: bool) -> Stage | Fixed:
-    """Convert a stage (search of a round) to an argument of compiled programs; see `load_round`."""
+    """Convert a stage (one search of a round) to an argument of compiled programs."""
     stage = dataclasses.replace(stage, keep=None)
     if stage.solver.max_steps == 0:
         return Fixed(stage)

@@ -73,8 +73,8 @@ def distance_field(walls: Obstacles, corner: Array, spacing: Array, size: int) -
         far = lax.cond(is_padded, lambda: measure(few), lambda: measure(corners))
         return jnp.minimum(nearest, far)
 
-    # The loops take one wall at a time: a program for all at once takes minutes to compile. On a
-    # CPU the loop ends at the last wall that is present, so that padding costs no time.
+    # The loops take one wall at a time, since a program for all walls takes minutes to compile. On
+    # a CPU the loop ends at the last wall that is present, so that padding costs no time.
     none = jnp.full((1, size * size), 1e3, corner.dtype)
 
     def loop(present: Array) -> Array:

@@ -1,4 +1,4 @@
-"""Plan batches of cases, for `plan`, in chunks of a few fixed sizes on all devices.
+"""Plan batches of cases, for `plan`, in parts (chunks) of a few fixed sizes on all devices.
 
 A lane is one case of a batch. The cases that an attempt (search) leaves unsolved are gathered into
 a smaller batch for the next attempt. Each device solves its lanes in its own loop and waits for no
@@ -147,8 +147,8 @@ def plan_batch(
     planner, mesh = on_devices(planner, devices)
     resident, num = is_resident(cases), count_lanes(cases)
     batch = _Batch(planner, chunk, mesh, watch, is_one_cpu(mesh) and num <= FEW)
-    # One CPU shares its memory with the host. There the chunks are planned by one thread for each
-    # core, and NumPy cuts and joins them: a JAX program would be compiled for every new size.
+    # One CPU shares its memory with the host. There one thread for each core plans parts of the
+    # batch, which NumPy cuts and joins: a JAX program would be compiled for every new size.
     is_small = is_one_cpu(mesh) and num != batch.sizes(attempts[0]).next(num)
     if resident and not is_small and not planner.divides(attempts[0]):
         return batch.plan_resident(attempts, cases)
@@ -250,11 +250,7 @@ class _Batch:
     def _results(
         self, attempt: Attempt, cases: PyTree, calls: list[_Call], may_end: bool
     ) -> Iterator[PyTree]:
-        """Yield the plans of each call (one chunk of cases); a CPU has one thread for each core.
-
-        One more thread prepares the next call while the others compute. With `may_end`, a call that
-        did not start before the time limit yields None.
-        """
+        """Yield the plans of each compiled call, or None after the time limit if `may_end`."""
         watch, spec = self.watch, lane_sharding(self.mesh)
         threads = min(len(calls), usable_cores() + 1) if is_one_cpu(self.mesh) else 1
 
@@ -376,10 +372,6 @@ def _cut(mesh: Mesh, size: int, tree: PyTree, begin: PyTree) -> PyTree:
 def _cut_unsolved(
     mesh: Mesh, size: int, tree: PyTree, status: Array, begin: PyTree
 ) -> tuple[PyTree, Array]:
-    """Return the next unsolved lanes (cases) of each device, and their indices on that device.
-
-    Padding repeats the device's last lane, with an index beyond its number of lanes.
-    """
 
     def cut(tree: PyTree, status: Array, begin: Array) -> tuple[PyTree, Array]:
         (num,) = status.shape

@@ -1,4 +1,4 @@
-"""The planner that first decides what cases leave open, such as an order of the targets."""
+"""The planner for problems with a discrete choice, such as an order in which to meet targets."""
 
 from collections.abc import Callable
 
@@ -33,8 +33,8 @@ class DecidedPlanner(PlannerAround[CaseT, PlanT]):
     ) -> tuple[PyTree, PyTree]:
         """Return the inner planner, which minimises a cost, and the cases with their choices.
 
-        `plan_of(planner, cases)` makes plans, whose choices are taken. Without `plan_of` they are
-        the first choices that `decision` proposes, and nothing is planned.
+        `plan_of(planner, cases)` makes plans, whose choices are used. If `plan_of` is None, nothing
+        is planned, and the first choices that `decision` proposes are used.
         """
         if plan_of is None:
             return self.planner.settle(first_choice(self.decision, cases))
@@ -45,7 +45,7 @@ class DecidedPlanner(PlannerAround[CaseT, PlanT]):
         return self.planner.settle(cases.with_choice(choice), plan_of)
 
     def plan_by(self, drive: Drive, cases: PyTree) -> PyTree:
-        """Plan each case with every proposed choice, by the loop `drive`; return the best plan."""
+        """Plan each case by `drive` with every proposed choice; return the plan of least rank."""
         alone = cases.batch_shape == ()
         if not drive.is_pure:
             self.decision.check(cases)

@@ -89,7 +89,7 @@ def sizes_of(planner: Planner, attempt: Attempt, chunk: int | None, mesh: Mesh) 
 
 
 def on_devices(planner: Planner, devices: Sequence[jax.Device] | None) -> tuple[Planner, Mesh]:  # pyright: ignore[reportInvalidTypeForm]
-    """Return the planner with its arrays on all `devices` (None: all local ones), and a mesh."""
+    """Return the planner with its arrays on `devices` (None: all local ones), and their mesh."""
     mesh = Mesh(np.array(jax.local_devices() if devices is None else devices), ("lanes",))
     if jax.tree.leaves(planner):
         planner = jax.device_put(planner, replicated_sharding(mesh))
@@ -157,8 +157,8 @@ def place_lanes(tree: PyTree, mesh: Mesh) -> PyTree:
 # XLA would try its own kernels for every matrix product, which takes a third of the compile time
 # on a GPU, while cuBLAS is as fast for these products. On a CPU the option has no effect.
 COMPILER_OPTIONS: Any = {"xla_gpu_enable_triton_gemm": False}
-# Batches, and loops over cases, run about 10 % longer with `QUICK_OPTIONS`. For batches of up to
-# `FEW` cases this is less than the seconds of compiling that the options save.
+# With `QUICK_OPTIONS` programs compile some seconds faster, but batches, and loops over cases, run
+# about 10 % longer. For batches of up to `FEW` cases the options save time.
 FEW = 256
 
 

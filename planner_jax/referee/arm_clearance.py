@@ -254,7 +254,6 @@ def _distance(one: _Capsule | _Box, other: _Capsule | _Box) -> np.ndarray:
 
 
 def _least(pairs: list[_Pair], sampled: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return least distances (B,) [m] over all pairs, their samples' indices, and pairs' names."""
     num_lanes, num_samples = sampled.shape
     if not pairs:
         return np.full(num_lanes, np.inf), np.zeros(num_lanes, int), np.full(num_lanes, "")

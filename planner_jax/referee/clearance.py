@@ -38,7 +38,6 @@ def clearances(group: dict, half: np.ndarray, times: np.ndarray, poses: np.ndarr
     apart = np.sqrt(apart) - reach[:, None]  # infinite for absent polygons
 
     def exact(lane: np.ndarray, sample: np.ndarray, which: np.ndarray) -> np.ndarray:
-        """Return the exact distance [m] of plan lane[k] from polygon which[k] at time sample[k]."""
         parts = [np.zeros(0)]
         for part in (slice(k, k + _PAIRS) for k in range(0, len(lane), _PAIRS)):
             b, s, n = lane[part], sample[part], which[part]

@@ -55,7 +55,7 @@ class HitVerdict(judging.FlightVerdict):
     apex: np.ndarray  # (B,) [m], greatest height of the ball after the impact
     # (B, 3) [m], where the ball falls to the target's height; NaN if it never does.
     landing_point: np.ndarray
-    # (B,) [m], horizontal distance of the landing point from the target; infinite without one.
+    # (B,) [m], horizontal distance from landing point to target; infinite without landing point.
     landing_error: np.ndarray
     contact_error: np.ndarray  # (B,) [m], distance of racket centre and ball at the impact
 
@@ -88,7 +88,7 @@ def referee_hits(
         tolerance: relative tolerance of every limit of the case.
         landing_tolerance: [m], greatest horizontal distance between landing point and target.
         contact_tolerance: [m], greatest distance between racket centre and ball at the impact. If
-            the case has `racket_radius`, the distance may also not exceed `RIM` times the radius.
+            the case has `racket_radius`, the distance may also not exceed 0.9 times the radius.
         continuity_tolerance: greatest displacement at time 0 and between pieces, relative to the
             largest coordinate at the ends of the pieces (at least 1 m).
 

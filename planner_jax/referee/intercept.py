@@ -334,7 +334,6 @@ def _integrate_poses(case: dict, span: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 
 def _judge_clearance(case: dict, times: np.ndarray, poses: np.ndarray, contact: float) -> tuple:
-    """Test that the body stays in the map and off obstacles, within `contact` [m]; also measure."""
     middle = poses[..., :2]
     outside = np.maximum(case["lower"][:, None] - middle, middle - case["upper"][:, None])
     off, when = _greatest(outside.max(axis=2), times)

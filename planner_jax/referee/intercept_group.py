@@ -53,7 +53,8 @@ def referee_groups(
     Args:
         cases: object with the fields of `InterceptGroup`, for B cases.
         plans: object with the fields of `GroupPlan`, for B plans.
-        target_positions: see `referee_intercepts`.
+        target_positions: function (targets, times (B,) [s]) -> positions (B, 2) [m], for targets of
+            a user's own class.
         **settings: other arguments of `referee_intercepts`, which also lists the errors.
     """
     present = np.asarray(cases.present, bool)

@@ -82,7 +82,7 @@ CONTACT_TIME_TOLERANCE = 1e-4
 # is divided by this number.
 SMALLEST_LIMIT = 1e-3
 _FEWEST_LANES = 256  # least number of plans that one thread judges
-# Processes instead of threads judge batches of at least this size, if there are this many cores.
+# Least numbers of plans and of cores with which processes instead of threads judge a batch.
 _MANY_LANES, _MANY_CORES = 16384, 4
 
 

@@ -180,6 +180,5 @@ class ArmPlan(Plan):
 
 
 def _setpoint_at(motion: PiecewisePolynomial, time: Array) -> dict[str, Array]:
-    """Return the fields of `ArmSetpoints`, except `time`, of one motion at a time () [s]."""
     names = ("angles", "rates", "accelerations")
     return {name: evaluate(motion, time, order) for order, name in enumerate(names)}

@@ -260,7 +260,6 @@ def _require_known(element: ET.Element, attributes: set[str], children: Iterable
 
 
 def _one(element: ET.Element, tag: str) -> ET.Element:
-    """Return the child of an element with a tag; raise unless there is exactly one child."""
     children = element.findall(tag)
     if len(children) != 1:
         raise ArgumentError(_tag(element), f"one <{tag}>", len(children), verb="have")

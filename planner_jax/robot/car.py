@@ -98,7 +98,6 @@ def pose_at(start: Array, end: Array, speed: Array, curvature: Array, time: Arra
     v, c = speed[:-1], curvature[:-1]
 
     def turn(tau: Array) -> Array:
-        """Return changes of heading [rad] on the K pieces, `tau` (K,) [s] after their starts."""
         return tau * (v * c + tau * ((v * bend + rise * c) / 2.0 + tau * rise * bend / 3.0))
 
     whole = turn(length)
@@ -112,7 +111,7 @@ def pose_at(start: Array, end: Array, speed: Array, curvature: Array, time: Arra
 
 
 def knots_at(end: Array, speed: Array, curvature: Array, time: Array) -> tuple[Array, Array, Array]:
-    """Return speed, curvature, acceleration at a time of a plan; see `pose_at` for arguments."""
+    """Return speed, curvature, acceleration at a time () [s], from values at equal time steps."""
     num = speed.shape[0] - 1
     position = jnp.clip(time / end * num, 0.0, num)
     k = jnp.clip(position.astype(jnp.int32), 0, num - 1)

@@ -135,7 +135,7 @@ def rotor_thrusts(
 ) -> tuple[Array, ...]:
     """Return the thrusts (...) [N] that the four rotors need for a motion at zero heading.
 
-    The snap is (..., 3) [m/s^4]. See `body_rate_squared` for acc, jerk and gravity.
+    Acceleration [m/s^2], jerk [m/s^3] and snap [m/s^4] are (..., 3), gravity is () [m/s^2].
     """
     a, j, s = (tuple(components(each)) for each in (acc, jerk, snap))
     rate, turning = jax.jvp(lambda acc, jerk: body_rate(acc, jerk, gravity), (a, j), (j, s))

@@ -204,7 +204,6 @@ def to_yaml(model: QuadrotorModel) -> str:
 
 
 def _add_unit(value: Value, quantity: _Quantity | None) -> Value:
-    """Format a field's value, which is in SI units, as text with its unit."""
     if quantity is None or value is None or quantity.kind == "share":
         return value
     if quantity.count == 8:
@@ -286,7 +285,6 @@ def _require_units(description: Mapping[str, Value], place: str) -> None:
 
 
 def _require_known(given: Mapping[str, Value], known: list[str], prefix: str, place: str) -> None:
-    """Raise `RobotError`, beginning with `place`, if `given` has a field that is not in `known`."""
     for name in given:
         if name not in known:
             hint = suggestion(str(name), known)
@@ -295,7 +293,6 @@ def _require_known(given: Mapping[str, Value], known: list[str], prefix: str, pl
 
 
 def _require_all(kind: type, given: Mapping[str, Value], prefix: str, place: str) -> None:
-    """Raise `RobotError`, beginning with `place`, if `given` lacks a field that `kind` requires."""
     for field in dataclasses.fields(kind):
         if field.default is dataclasses.MISSING and field.name not in given:
             name = "places or diagonal" if field.name == "places" else field.name
@@ -350,7 +347,7 @@ def parse_numbers(value: Value, kind: str, count: int, *, span: bool = False) ->
 
 
 def _parse(part: Value, kind: str, span: bool) -> list[float]:
-    """Parse the numbers of one text, or take one number, in SI units; see `parse_numbers`."""
+    """Convert one number, or the numbers in one text such as "3 3 5 g m^2", to SI units."""
     rule = f"must be in {_list_units(kind)}, got {_shorten(part)}"
     if isinstance(part, int | float) and not isinstance(part, bool):
         if not math.isfinite(part):
@@ -373,7 +370,6 @@ def _parse(part: Value, kind: str, span: bool) -> list[float]:
 
 
 def _has_unit(value: Value) -> bool:
-    """Return whether all numbers in a value have units; true for a value without numbers."""
     if isinstance(value, list | tuple):
         return all(map(_has_unit, value))
     if isinstance(value, str):

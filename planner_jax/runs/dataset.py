@@ -1,4 +1,4 @@
-"""The rows of a run: a Parquet dataset, which `pyarrow.dataset`, pandas and DuckDB read.
+"""The rows of a run, one for each planned problem, as a Parquet dataset (for pandas, DuckDB).
 
 A part is one file of rows, such as `part-000007-1a2b3c4d.parquet`, whose name holds its number and
 its CRC-32 checksum. Its metadata hold a record: a JSON object with the number of rows, the times of
@@ -121,7 +121,7 @@ class Dataset:
             yield fragment.to_table(columns=known)
 
     def pick(self, rows: Sequence[int], columns: Sequence[str] | None = None) -> list[Row]:
-        """Return the rows with the indices `rows`, sorted by index; read only their row groups."""
+        """Return the rows with the indices `rows`, sorted by index, without reading all rows."""
         wanted, first, picked = sorted(set(rows)), 0, []
         for fragment in self._open().get_fragments():
             for group in fragment.split_by_row_group():

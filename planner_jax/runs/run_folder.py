@@ -1,4 +1,4 @@
-"""The folder of a run: manifest, rows, table, figures and HTML page.
+"""The folder of a run, many planned and judged problems: manifest, rows, figures, HTML page.
 
 Each file is written under a scratch name and renamed when it is complete, so that a killed run can
 be resumed. Only the process that holds a lock on the file `.lock` writes to the folder.
