@@ -48,10 +48,11 @@ def draw_curves(folders: Sequence[str | os.PathLike], path: str | os.PathLike) -
 
 
 def curves_figure(figure: Figure, runs: Sequence[Rows]) -> None:
-    """Draw one panel for the mean reward and for each of its terms, over the number of decisions.
+    """Draw learning curves: a panel for the mean reward, and one for each of five quantities.
 
-    `runs` has the rows of `progress.jsonl` of each training run. If the rows contain evaluations,
-    further panels show the results on each suite (family of cases) after each call of PPO.
+    The x axis is the number of cases for which the policy has decided the order and times of
+    catches. `runs` has the rows of `progress.jsonl` of each training run. If they contain
+    evaluations, further panels show results on each suite (family of cases) after each call of PPO.
     """
     curve = [[row for row in rows if "reward" in row] for rows in runs]
     evaluated = [[row for row in rows if "suites" in row] for rows in runs]
@@ -96,12 +97,6 @@ def _line(
     relative: bool = False,
     **look: Any,
 ) -> None:
-    """Draw the mean of a quantity over runs; for several runs also a band around it.
-
-    The band is one standard deviation wide to each side. The x axis is the number of decisions.
-    `value` extracts the quantity from a row, and `scale` multiplies it. With `relative` each run's
-    values are divided by the run's first value. `look` has keyword arguments of `Axes.plot`.
-    """
     num = min(len(rows) for rows in runs)
     values = scale * np.array([[value(row) for row in rows[:num]] for rows in runs], float)
     if relative:

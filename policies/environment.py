@@ -170,8 +170,8 @@ def evaluate_actions(cases: CatchCase, actions: Array, iterations: int) -> dict[
 
     Args:
         cases: batch of B cases with N targets each.
-        actions: (B, N, 2), from -1 to 1 for each target: a handicap, which delays the target in the
-            order of catches, and a stretch, the scaled logarithm of a factor on its catch time.
+        actions: (B, N, 2), from -1 to 1 for each target: a handicap in units of 4 s, which delays
+            it in the order of catches, and twice the logarithm of a factor on its catch time.
         iterations: number of planner iterations; for zero an estimate is used, not the planner.
 
     Returns:

@@ -1,13 +1,15 @@
 """Progress of a training: rows of `progress.jsonl`, a progress bar, and TensorBoard event files.
 
-Each line of `progress.jsonl` is a row in JSON. A row has the number of the `part` of the training,
-and the number of `decisions` since the start of the training. There are two kinds of rows:
+In a decision, the policy chooses order and times of the catches in one random case, a planning
+problem. Each line of `progress.jsonl` is a row in JSON. A row has the number of the `part` (call of
+PPO) of the training, and the number of `decisions` since its start. There are two kinds of rows:
 
-* Rows of the learning curve hold means over the decisions since the previous row. These are
-  `reward`, the share `solved`, `last` and `ratio` of solved cases, and `violation` of unsolved
-  cases, which `environment.evaluate_actions` defines. They also hold the number of decisions
-  `per_second`, the KL `divergence` of a PPO update, the `learning_rate`, and `spread`, the standard
-  deviation of the actions.
+* Rows of the learning curve hold means over the decisions since the previous row: `reward`; the
+  fraction `solved`; for solved cases `last`, the fraction by which the last catch is earlier than
+  with the greedy order, and `ratio`, the relative difference of decided and planned times; for
+  unsolved cases `violation`, the greatest relative excess over a limit. They also hold the number
+  of decisions `per_second`, the KL `divergence` of a PPO update, the `learning_rate`, and `spread`,
+  the standard deviation of the actions.
 * Rows with `suites` hold an evaluation of the policy with the full number of planner iterations.
 
 The first line of the file instead holds the format, the number of rows and their digest.
@@ -47,8 +49,8 @@ _EVENTS = "tensorboard"
 def report_terms() -> Iterator[None]:
     """Make Brax's PPO report the mean reward and its unweighted terms, within the `with` block.
 
-    The loss function of Brax is replaced by one that adds these means to the metrics. Brax itself
-    reports them for 100 environments only, through callbacks from the compiled program to Python.
+    The loss function of Brax is replaced by a function that adds these means to the metrics. Brax
+    itself reports them only for 100 environments, by callbacks from the compiled program to Python.
     JAX does not store programs with such callbacks in its compilation cache.
     """
     plain = losses.compute_ppo_loss
@@ -110,14 +112,15 @@ class Progress:
     ) -> Iterator[Callable[[int, Mapping[str, Any]], None]]:
         """Provide the callback by which Brax reports progress in one part (PPO run) of a training.
 
-        Brax calls it with the number of decisions and the metrics. Rows of this part and of later
-        parts, which an interrupted run may have left, are removed first.
+        Brax calls it with the number of cases that the policy has decided in this part, and with
+        its own metrics by name, such as the mean reward. Rows of this part and of later parts,
+        which an interrupted run may have left, are removed first.
 
         Args:
             number: number of the part.
             title: title of the progress bar.
-            before: number of decisions in all earlier parts.
-            decisions: number of decisions in this part.
+            before: number of cases that the policy has decided in all earlier parts.
+            decisions: number of cases that it decides in this part.
         """
         self.rows = [row for row in self.rows if row["part"] < number]
         place, suffix = self._folder / _EVENTS, f".part-{number:03d}"
@@ -148,7 +151,10 @@ class Progress:
         self.add(number, decisions, {"suites": suites})
 
     def add(self, number: int, decisions: int, row: Mapping[str, Any]) -> None:
-        """Add a row for part (PPO run) `number` after `decisions` decisions; rewrite the file."""
+        """Add the entries `row` to the rows of part (PPO run) `number`; rewrite `progress.jsonl`.
+
+        `decisions` is the number of cases that the policy has decided since the training's start.
+        """
         self.rows.append({"part": number, "decisions": decisions, **row})
         RunFolder(self._folder).write_text(FILE, to_text(self.rows))
 
@@ -161,7 +167,7 @@ def to_text(rows: Sequence[Mapping[str, Any]]) -> str:
 
 
 def read_rows(folder: Path) -> list[dict[str, Any]]:
-    """Read the rows of a training run from `progress.jsonl`, in the order of their decisions.
+    """Read the rows of a training run from `progress.jsonl`, in the order of their creation.
 
     Raises:
         ArgumentError: the folder does not hold a training, or the file does not match its digest.

@@ -267,17 +267,7 @@ def _train_part(
     params: Any,
     tell: Callable[[int, Mapping[str, Any]], None],
 ) -> Any:
-    """Run one part (call of PPO) of a training; return its final parameters as NumPy arrays.
-
-    Args:
-        training: settings of the training.
-        part: settings of the part.
-        number: number of the part, from which its seed is computed.
-        network: network of the policy, a Flax module.
-        params: parameters before the part, in the form of Brax.
-        tell: callback that Brax calls for each row of the learning curve, with the number of
-            decisions and the metrics.
-    """
+    """Run one part (call of PPO) of a training; return its final parameters as NumPy arrays."""
     env = _environment(training, part)
     rows, each = _rows_and_updates(part, training.num_envs)
     how: dict[str, Any] = dict(

@@ -32,9 +32,10 @@ _TRUST = 0.1  # gain of the pose estimator: fraction of the innovation that a st
 
 @dataclasses.dataclass(frozen=True)
 class DriveLoop:
-    """World and sensing of a simulated drive; static under `jax.jit`.
+    """World and sensing of a simulated drive.
 
-    A change of the noise alone does not compile the program again.
+    The noise's standard deviations are copied to `DriveState`, whose leaves are arguments of the
+    compiled program. Another noise therefore needs no other program.
 
     Raises:
         ValueError: the world has no car, or its time step is not the period of control.

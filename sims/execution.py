@@ -62,7 +62,7 @@ class _Setting:
 class Executed:
     """The result of executing B courses (timed joint motions), in float64 arrays (B, ...).
 
-    Errors and torques are evaluated from the earliest start of an arm until its planned contact.
+    Errors and torques are evaluated in the interval from `since` to `until` that `execute` gets.
     """
 
     times: np.ndarray  # (S,) [s], times of the frames; the first is 0

@@ -148,7 +148,10 @@ class Scene:
         return wanted[np.isfinite(wanted).all(axis=1)]
 
     def find_last_contact(self) -> int:
-        """Return the index of the sample at the last contact, or of the last sample."""
+        """Return the index of the first sample after the last contact of a ball with the robot.
+
+        If the flight has no contact, this is the last sample with a moving object.
+        """
         end = np.nanmax(np.append(self.met, -np.inf))
         at = int(np.searchsorted(self.times, end)) if np.isfinite(end) else self.num_samples
         return min(at, self.num_samples - 1)

@@ -196,9 +196,10 @@ def _record(loop: Loop, pilot: Pilot, flight: FlightState, drag: Array) -> Recor
 
 
 def in_parts(flights: FlightState) -> bool:
-    """Return whether planning and flying are compiled as separate programs.
+    """Return whether planning and flying are separate programs, which compile at the same time.
 
-    They are for up to 1024 flights on a GPU, where compiling takes longer than the flights do.
+    They are for up to 1024 flights on a GPU. The flights then run longer, but compiling, which
+    takes longer than these flights, takes half as long.
     """
     (device,) = flights.time.devices()
     return device.platform != "cpu" and len(flights.time) <= _FEW
@@ -207,17 +208,6 @@ def in_parts(flights: FlightState) -> bool:
 def _next_period(
     loop: Loop, pilot: Pilot, flights: FlightState, cases: Any, drag: Array, begin: Callable
 ) -> tuple[FlightState, Any]:
-    """Fly one period and plan meanwhile; return the flights (B, ...) and their records.
-
-    Args:
-        loop: settings of the flights' loop.
-        pilot: the task's part of the loop.
-        flights: the B flights at the start of the period.
-        cases: cases of the task, leaves (B, ...).
-        drag: (B, N), true drag coefficients K_D [1/m] of N balls.
-        begin: function that starts one part of the period with its arguments, and returns a
-            function that waits for the result.
-    """
     outlook, asked = _pose_problems(loop, pilot, flights, cases)
     found = [begin(_search_plans, pilot, number, asked) for number in range(len(pilot.searches))]
     flown_on = begin(_fly, loop, pilot, flights, drag, 1)

@@ -100,7 +100,7 @@ class FlySettings:
 
     @property
     def rate(self) -> float:
-        """The rate of replanning [Hz]; by default `RATE` for the task's first planner, else 0."""
+        """The rate of replanning [Hz]; by default `RATE`, or 0 if the planner cannot replan."""
         if self.replan is not None:
             return self.replan
         return self.RATE if self._is_first else 0.0
@@ -110,7 +110,7 @@ class FlySettings:
         return self.planner == next(iter(self.TASK.planners))
 
     def check_rate(self) -> None:
-        """Raise `ValueError` unless the flights can replan at the rate `self.rate` [Hz]."""
+        """Raise `ValueError` if the rate of replanning [Hz] is negative; subclasses check more."""
         require(self.rate >= 0.0, "replan", ">= 0", self.rate)
 
     def flight(self) -> Any:
@@ -383,7 +383,10 @@ class BlockFly(FlySettings):
         return super().flight()
 
     def check_rate(self) -> None:
-        """Raise `ValueError` if the drives are invalid, or `rate` is not 0 without perception."""
+        """Raise `ValueError` if the arm's drives are invalid, or it shall replan without a camera.
+
+        Without a camera (`perception`) the planner knows the ball's true flight, and plans once.
+        """
         rule = ">= 0, and 0 without perception: a block is planned once"
         most = math.inf if self.perception else 1e-9
         require(0.0 <= self.rate < most, "replan", rule, self.rate)

@@ -90,7 +90,7 @@ def limits_of(
     values = {name: vars(own)[name] for name in names}
     values |= {"min_thrust": least, "max_thrust": most}
     values |= {name: value for name, value in given.items() if value is not None}
-    # If only one bound of the thrust is specified, the lower one is 0 or the upper one infinite.
+    # If only one bound of the thrust is specified, the other is 0 (lower) or infinite (upper).
     if values["max_thrust"] is None and values["min_thrust"] is not None:
         values["max_thrust"] = np.inf
     if values["min_thrust"] is None and values["max_thrust"] is not None:

@@ -44,9 +44,10 @@ from planner_jax.trajectory import polynomial
 class ProportionalMinco:
     """Constant float64 matrices of splines of M pieces with least integral |p^(s)|^2.
 
-    The matrices multiply C = 2s + O columns [b; y]: 2s boundary rows b (scaled states at both ends)
-    and O whitened waypoint offsets y (scaled deviations from the smoothest spline). h is the mean
-    duration of a piece.
+    The matrices multiply C = 2s + O rows [b; y]. The boundary rows b are the derivatives d = 0 to
+    s - 1 of the position at both ends, times h^d for the mean duration h [s] of a piece. The O
+    offsets y of the waypoints from the smoothest spline are in linear coordinates in which the
+    energy grows by a multiple of |y|^2.
     """
 
     order: int  # s
@@ -63,11 +64,11 @@ class ProportionalMinco:
         return len(self.proportions)
 
     def sample_matrix(self, nodes: int, derivative: int) -> np.ndarray:
-        """Return the matrix from end states and waypoint offsets (C columns) to samples.
+        """Return the matrix (M nodes + 1, C) from end states and waypoint offsets to samples.
 
-        Each of M pieces has `nodes` + 1 samples of a derivative (0 is the position). Neighbours
-        share one sample, so that the shape is (M nodes + 1, C). The product of matrix and columns
-        must be divided by h^derivative, for a mean piece duration h [s].
+        Each of M pieces has `nodes` + 1 samples of a derivative (0 is the position); neighbours
+        share one sample. The samples are derivatives by time in units of h, the mean duration of a
+        piece: for a derivative by seconds divide them by h^derivative.
         """
         degree = 2 * self.order - 1
         factors = polynomial.derivative_factors(degree, derivative)
@@ -89,11 +90,6 @@ def _hermite_map(order: int) -> np.ndarray:
 
 
 def _energy(coefficients: np.ndarray, shares: np.ndarray) -> np.ndarray:
-    """Return the matrix (C, C) of the integral of a spline's |p^(s)|^2, a quadratic form.
-
-    The C numbers, end states and waypoint offsets, define the spline: `coefficients` (M, 2s, C) map
-    them to polynomials of M pieces with durations `shares` (M,).
-    """
     s = coefficients.shape[1] // 2
     root = np.linalg.cholesky(polynomial.energy_form(2 * s - 1, s)[0][s:, s:]).T
     parts = root @ coefficients[:, s:] / np.sqrt(shares[:, None, None] ** (2 * s - 1))
@@ -189,8 +185,9 @@ def sample_motion(
     Args:
         maps: constant maps of M pieces.
         nodes: intervals of each piece. Neighbouring pieces share one of N = M nodes + 1 samples.
-        columns: (C, 3) boundary rows (scaled end states), then whitened waypoint offsets y.
-        piece_duration: () h = T / M [s].
+        columns: (C, 3), derivatives d < s of the position at both ends times h^d, then the offsets
+            of the waypoints from the smoothest spline, in the coordinates of `maps.offsets`.
+        piece_duration: () h [s], mean duration of a piece.
         orders: 4, or 5 to sample the snap as well.
     """
     matrices = np.stack([maps.sample_matrix(nodes, d) for d in range(orders)])
@@ -207,8 +204,9 @@ def by_pieces(
     """Apply a function to the motion of each piece, one piece after another to save memory.
 
     The function takes the motion at `nodes` + 1 samples of a piece, and the piece's duration [s].
-    The results of the M pieces are stacked on a leading axis. `columns` (C, 3) are boundary rows
-    (scaled end states), then waypoint offsets. `piece_duration` () [s] is the mean of the pieces.
+    The results of the M pieces are stacked on a leading axis. `piece_duration` h () [s] is the mean
+    of the pieces. `columns` (C, 3) are derivatives d < s of the position at both ends times h^d,
+    then the waypoints' offsets from the smoothest spline, in the coordinates of `maps.offsets`.
     """
     each = np.stack([maps.sample_matrix(nodes, d) for d in range(4)])
     indices = np.arange(maps.num_pieces)[:, None] * nodes + np.arange(nodes + 1)
@@ -223,8 +221,6 @@ def by_pieces(
 
 
 def _motion(matrices: Array, columns: Array, piece_duration: Array) -> polynomial.Motion:
-    # One matrix product computes all derivatives, because on a CPU a call takes longer than its
-    # arithmetic. The matrix is the left factor, so that a batch adds columns to the right factor.
     orders = matrices.shape[0]
     unit = jnp.matmul(
         matrices.reshape(-1, matrices.shape[-1]), columns, precision=lax.Precision.HIGHEST
@@ -240,25 +236,27 @@ def _motion(matrices: Array, columns: Array, piece_duration: Array) -> polynomia
 def trajectory_energy(maps: ProportionalMinco, rows: Array, offsets: Array, piece_duration: Array):
     """Return the integral () of |p^(s)|^2 of a spline p(t) of M pieces, with s = `maps.order`.
 
-    `rows` (2s, 3) are the boundary rows, the scaled states at both ends, and `offsets` (O, 3) the
-    whitened deviations of the waypoints from the smoothest spline.
+    `rows` (2s, 3) are derivatives d < s of the position at both ends times h^d, where h [s] is the
+    mean duration `piece_duration` of a piece. `offsets` (O, 3) are the waypoints' offsets from the
+    smoothest spline, in the coordinates of `maps.offsets`.
     """
     boundary = boundary_energy(maps, rows, piece_duration)
     return boundary + offset_energy(maps, offsets, piece_duration)
 
 
 def boundary_energy(maps: ProportionalMinco, rows: Array, piece_duration: Array) -> Array:
-    """Return the least integral () of |p^(s)|^2 for boundary rows (2s, 3): scaled end states.
+    """Return the least integral () of |p^(s)|^2 of splines p(t) between two states.
 
-    p(t) is the spline through these states, and s = `maps.order`.
+    `rows` (2s, 3) are derivatives d < s of the position at both ends times h^d, where h [s] is the
+    mean duration `piece_duration` of a piece, and s = `maps.order`.
     """
     return _boundary_form(maps, rows) * reciprocal(piece_duration) ** (2 * maps.order - 1)
 
 
 def offset_energy(maps: ProportionalMinco, offsets: Array, piece_duration: Array) -> Array:
-    """Return the increase () of the integral of |p^(s)|^2 by waypoint offsets (O, 3).
+    """Return the increase () of the integral of |p^(s)|^2 by offsets (O, 3) of the waypoints.
 
-    p(t) is the spline and s = `maps.order`. Without offsets the integral is least.
+    The offsets are from the smoothest spline, whose integral is least; s = `maps.order`.
     """
     rate = reciprocal(piece_duration)
     return maps.offset_energy * jnp.sum(offsets**2) * rate ** (2 * maps.order - 1)
@@ -266,7 +264,6 @@ def offset_energy(maps: ProportionalMinco, offsets: Array, piece_duration: Array
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _boundary_form(maps: ProportionalMinco, rows: Array) -> Array:
-    """Return the least integral () of |p^(s)|^2 for end states (2s, 3), for a mean piece of 1 s."""
     return jnp.sum(rows * _by_rows(maps, rows))
 
 
@@ -287,7 +284,12 @@ def _by_rows(maps: ProportionalMinco, rows: Array) -> Array:
 def proportional_trajectory(
     maps: ProportionalMinco, rows: Array, offsets: Array, piece_duration: Array
 ) -> polynomial.PiecewisePolynomial:
-    """Return the trajectory of boundary rows (scaled end states) and whitened waypoint offsets."""
+    """Return the trajectory through end states and waypoints, as a piecewise polynomial.
+
+    `rows` (2s, 3) are derivatives d < s of the position at both ends times h^d, where h [s] is the
+    mean duration `piece_duration` of a piece. `offsets` (O, 3) are the waypoints' offsets from the
+    smoothest spline, in the coordinates of `maps.offsets`.
+    """
     unit = jnp.einsum(
         "mkc,ci->mki",
         jnp.asarray(maps.coefficients, rows.dtype),
@@ -303,15 +305,15 @@ def proportional_trajectory(
 
 @struct.dataclass
 class Chain:
-    """N segments of a trajectory: scaled end states, waypoint offsets and mean piece durations."""
+    """N consecutive segments of a trajectory, each a spline between two states via waypoints."""
 
-    rows: Float[Array, "N rows 3"]
-    offsets: Float[Array, "N offsets 3"]  # scaled deviations from the smoothest waypoints
+    rows: Float[Array, "N rows 3"]  # d-th derivatives at both ends * piece_duration^d
+    offsets: Float[Array, "N offsets 3"]  # of waypoints, as defined by `ProportionalMinco.offsets`
     piece_durations: Float[Array, " N"]  # [s], mean duration of each segment's pieces
 
     @property
     def columns(self) -> Float[Array, "N columns 3"]:
-        """Columns that define each segment: its scaled end states, then its waypoint offsets."""
+        """The arrays `rows` and `offsets`, joined: end states, then waypoints of each segment."""
         return jnp.concatenate([self.rows, self.offsets], axis=1)
 
 
@@ -320,7 +322,7 @@ def chain_rows(
     tail_states: Float[Array, "N 4 3"],
     piece_durations: Float[Array, " N"],
 ) -> Float[Array, "N 8 3"]:
-    """Return the boundary rows (scaled position to jerk at both ends) of N consecutive segments."""
+    """Return position to jerk at both ends of N segments, times piece_duration^(0, 1, 2, 3)."""
     heads = jnp.concatenate([head_state[None], tail_states[:-1]])
     return jax.vmap(boundary_rows)(heads, tail_states, piece_durations)
 

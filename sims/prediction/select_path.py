@@ -110,8 +110,8 @@ def select(
     The median is zero unless turns to one side are more probable than all other alternatives
     together. Weak turns are therefore shrunk towards zero, and the path does not jump as
     observations change (posterior median thresholding [Johnstone2004]). If `threshold` is passed,
-    the path is instead the least-squares turn if its gain exceeds the threshold, and else the
-    least-squares line. The error estimates average over all turn rates in either case.
+    the path is instead the least-squares turn if 2 log(its likelihood / likelihood of the best
+    line) exceeds the threshold, and else this line. The error estimates average over all rates.
 
     A residual far above the noise means that neither model fits the target. Do not trust such a
     prediction. With fewer than three observations, or four if the noise is estimated, the path is
@@ -238,10 +238,6 @@ def chance_within(prediction: Prediction, time: ArrayLike, radius: ArrayLike) ->
 
 
 def _errors(prediction: Prediction, time: ArrayLike) -> tuple[Array, Array]:
-    """Return offsets (K, 2) [m] of K alternative paths from the selected path at a time () [s].
-
-    Also return the part (K,) [m^2] of their position variances that `velocity_variance` causes.
-    """
     among = prediction.alternatives
     time = jnp.asarray(time, among.middle.dtype)
     ahead, aside = arc(among.turn_rate, time - among.middle)

@@ -55,11 +55,11 @@ _SMALL_MARGIN = (
     ("nodes", 12),
     ("velocities", True),
 )
-_VELOCITY_SCALE = 2.0  # unit of the offsets of velocities; measured units range from 0.6 to 7
-_PASSING = 0.9  # greatest speed at the ball in a starting point / speed limit
+_VELOCITY_SCALE = 2.0  # entry of `scale` for the variables that change velocities at waypoints
+_PASSING = 0.9  # greatest speed of the racket in a starting point, divided by the speed limit
 # Starting points, the most successful first. Columns: time of the impact / time at which the ball
 # would land without a hit; flight time after the impact [s]; thrust per unit mass / gravity. A
-# network may improve the first row. The second row repeats it, and stays as it is.
+# network may replace the first row by a better one. The second row repeats the unimproved row.
 _GUESSES = np.array(
     [
         (0.92, 1.7, 1.2),
@@ -163,7 +163,7 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
 
     @property
     def maps(self) -> ProportionalMinco:
-        """Constant matrices that map end states and waypoint offsets to the trajectory."""
+        """Constant matrices that map the states at both ends and the waypoints to a trajectory."""
         return proportional_minco(4, self.proportions, self.velocities)
 
     @property
@@ -196,7 +196,7 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
         return load_network(self.package, "exact-12" + "-supple" * self.velocities)
 
     def start_features(self, context: HitContext) -> Array:
-        """Return the network's inputs, a vector: ball, target, state of the quadrotor, limits."""
+        """Return the inputs of the network for starting points: ball, target, state and limits."""
         case, landing = context.case, context.landing_time
         head, limits, stroke = case.head_state, case.limits, case.hit_limits
         balls = [target_at(context.path, share * landing) for share in _FEATURE_TIMES]
@@ -233,8 +233,9 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
     def guess_ends(self, context: HitContext, num: int) -> Array:
         """Return the variables of the impact in `num` starting points, (num, 1, 8).
 
-        They are the logarithms of the impact time, of the flight time after the impact and of the
-        thrust, two speeds of the racket across its normal, and the jerk (3,).
+        The axis of length 1 counts the trajectory's segments: a hit has one, which ends at the
+        impact. The 8 variables are the logarithms of the impact time, of the flight time after the
+        impact and of the thrust, two speeds of the racket across its normal, and the jerk (3,).
         """
         fraction, flight_time, thrust = jnp.asarray(_GUESSES[:num], context.landing_time.dtype).T
         time = fraction * jnp.maximum(context.landing_time, 0.1)
@@ -246,11 +247,6 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
         return natural[:, None]
 
     def _set_passing_speed(self, natural: Array, context: HitContext) -> Array:
-        """Set the racket's speeds across its normal in the variables of an impact, (8,).
-
-        The velocity is the final velocity of a motion from the start to the impact at constant
-        acceleration. Its magnitude is limited to `_PASSING` times the speed limit.
-        """
         impact, case = self.impact(natural, context), context.case
         start, time = case.head_state, impact.stroke.time
         vel = 2.0 * (impact.tail_state[0] - start[0]) / time - start[1]
@@ -271,10 +267,12 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
         return (index >= self._num_places) & (index < 2 * self._num_places)
 
     def meet(self, natural: Array, context: HitContext) -> ChainEnds:
-        """Return the impact as the end of the trajectory, from the 8 variables of `guess_ends`.
+        """Return the impact, at which the trajectory ends, and its excess over limits.
 
-        The excess (5,) has two entries for the apex of the returned ball, below and above the
-        limits, and three entries for the quadrotor's speeds along x, y and z.
+        `natural` (1, 8) are logarithms of the impact time, of the flight time after it and of the
+        thrust, two speeds of the racket across its normal, and the jerk. The excess (5,) has two
+        entries for the apex height of the returned ball, below and above its limits, and three
+        entries for the quadrotor's speeds along x, y and z.
         """
         impact, limits = self.impact(natural[0], context), context.case.hit_limits
         apex = apex_excess(impact.apex, limits.min_apex, limits.max_apex)
@@ -288,10 +286,10 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
         )
 
     def relative_excess(self, excess: Array) -> Array:
-        """Return the relative excess (5,) over limits from the result of `meet`.
+        """Convert the excess (5,) of an impact, as `meet` returns it, to relative excesses.
 
-        For a speed v at the impact with the limit v_max, `meet` returns v^2 / v_max^2 - 1, and this
-        method returns v / v_max - 1.
+        For each of three speeds v with the limit v_max, v^2 / v_max^2 - 1 becomes v / v_max - 1.
+        The two entries for the apex height of the returned ball are already relative and stay.
         """
         return jnp.concatenate([excess[:2], Measure.ABOVE.relative(excess[2:])])
 
@@ -343,7 +341,7 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
         )
 
     def replanner(self) -> "ReplanHit":
-        """Return the planner that `pj.replan` uses."""
+        """Return the planner by which `pj.replan` updates plans of this planner in flight."""
         from planner_jax.task.hit.replan import ReplanHit
 
         return ReplanHit(self)

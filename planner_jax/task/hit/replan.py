@@ -27,8 +27,8 @@ from planner_jax.task.hit.plan import HitPlan
 from planner_jax.trajectory.polynomial import evaluate, states_at, total_duration
 
 _SHORTEST = 0.01  # [s] least time to the impact in a starting point
-# Step lengths that a search tries. They include small ones, because the direction of the first
-# iteration ignores the cost's curvature and is too long.
+# Step lengths that L-BFGS tries, relative to its proposed step. Small lengths are needed, because
+# the first step ignores the cost's curvature and is too long.
 _TRIALS = (1.0, 0.2, 0.04)
 
 
@@ -55,7 +55,7 @@ class ReplanHit(OptimisedPlanner):
 
     @property
     def inner(self) -> ExactHit:
-        """The planner of hits that makes the new plans, from the remainders of cases."""
+        """The planner of hits that plans what remains of each hit."""
         return self.planner
 
     def begin(
@@ -68,11 +68,12 @@ class ReplanHit(OptimisedPlanner):
         drag: ArrayLike | None = None,
         head_state: ArrayLike | None = None,
     ) -> Replanning:
-        """Return the case, or the batch, as it remains `elapsed` seconds into its plan.
+        """Return what remains of hits `elapsed` [s] after the start of their plans `previous`.
 
-        `pj.replan` describes `cases`, `previous`, `elapsed` and the errors. The estimated `ball`
-        has leaves (3,), or (B, 3) for B cases. The drag coefficient `drag` [1/m] is by default the
-        drag of the cases, and the quadrotor's `head_state` (..., 4, 3) its planned state.
+        `cases` are one hit or a batch of B hits as they were planned. `ball` is the new estimate of
+        the ball's state, leaves (3,) or (B, 3), and `drag` [1/m] its drag coefficient, by default
+        as in `cases`. `head_state` (..., 4, 3) has position, velocity, acceleration and jerk of the
+        quadrotor, by default as planned.
         """
         elapsed = check_elapsed(cases, elapsed)
         own = states_at(previous.trajectory, elapsed)
@@ -99,16 +100,16 @@ class ReplanHit(OptimisedPlanner):
         return planner.join(jnp.zeros((1, planner.num_offsets // 3, 3), sizes.dtype), natural[None])
 
     def guesses(self, context: ReplanHitContext, num: int) -> Array:
-        """Return `num` starting points: the previous impact, then guesses as for a new case."""
+        """Return `num` starting points: the previous plan's impact, then guesses for a new hit."""
         first = context.start[None]
         if num == 1:
             return first
         return jnp.concatenate([first, self.planner.guesses(context.hit, num - 1)])
 
     def objective(self, point: Array, context: ReplanHitContext) -> Evaluation:
-        """Return cost and violation that `planner` computes at n decision variables, (n,)."""
+        """Return the cost, and the largest relative excess over a limit, at n variables `point`."""
         return self.planner.objective(point, context.hit)
 
     def decode(self, point: Array, context: ReplanHitContext) -> HitPlan:
-        """Return the plan that `planner` makes of n decision variables, (n,)."""
+        """Return the plan of the remaining hit that the n decision variables `point` describe."""
         return self.planner.decode(point, context.hit)

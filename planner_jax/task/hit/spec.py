@@ -2,7 +2,7 @@
 
 from planner_jax.core.registry import Task
 
-# [1/m], coefficient K_D of the ball's quadratic drag, fitted to the published landing points.
+# [1/m], coefficient K_D of the ball's quadratic drag, fitted to the landing points of [Yu2023bat].
 DRAG = 0.0616
 # [m], hover position of the quadrotor at time 0. [Yu2023bat] gives no numbers; its figure shows the
 # quadrotor at the line between the near and the far region of its half court.

@@ -22,7 +22,7 @@ from planner_jax.task.hit.case import GRAVITY, HitCase, case
 from planner_jax.task.hit.court import fly, landing
 from planner_jax.task.hit.spec import DRAG, START
 
-# The distribution of serves, fitted to the published serves: position and velocity are uniform
+# The distribution of serves, fitted to the serves of [Yu2023bat]: position and velocity are uniform
 # under the conditions below, and the ball must land in the landing region of its scenario.
 SERVE_HEIGHT = 2.0  # [m], height of the ball at the serve
 DEPTH = 4.5  # [m] from the net, end of the far and side regions for serves and landing points
@@ -61,20 +61,20 @@ class Serves:
 
 
 def read_serves(folder: str | os.PathLike) -> Serves:
-    """Read the serves of the published trial files in a folder.
+    """Read the serves of the trial files that are published with [Yu2023bat], in a folder.
 
     A file is named "S_L_T_M.csv". S, L and T are serve, landing and target region (1 near, 2 far,
     3 left, 4 right), and M is the planner (p Bat, l Bat-Lite, b Juggle). Files with equal S_L_T
     contain the same serves in the same order; some may be missing. Other files are ignored.
 
     Returns:
-        Row 1 of every scenario, then row 2 of every scenario and so on, so that the first rows
-        cover all scenarios evenly. `published` is NaN where a file is missing.
+        The serves: row 1 of every scenario, then row 2 of every scenario and so on. The field
+        `published` tells whether each of the three planners solved the serve; NaN without a file.
 
     Raises:
         ArgumentError: the folder does not exist or contains no such file, or a row does not parse,
-            is not finite, does not land in the hitting half, or differs between the files of a
-            scenario. `value` lists all such rows.
+            is not finite, does not land in the quadrotor's half court, or differs between the files
+            of a scenario. The error's `value` lists all such rows.
     """
     return pkgutil.resolve_name("planner_jax.baselines.hit.published:read_serves")(folder)
 
@@ -82,16 +82,15 @@ def read_serves(folder: str | os.PathLike) -> Serves:
 def generate_serves(
     num: int, seed: int, scenarios: Sequence[str] | None = None, *, first: int = 0
 ) -> Serves:
-    """Draw random serves with the distribution of the published serves, equally many per scenario.
+    """Draw random serves, distributed like the serves of [Yu2023bat], equally many per scenario.
 
     A scenario is a set of regions for serve, landing and target. Serves come in groups that contain
-    each scenario once, in random order. Serve k of a seed and a list of scenarios is always the
-    same serve. The ranges are constants of this module, such as `SERVE_HEIGHT`. Landing point p and
-    vertical speed are drawn uniformly. To make the horizontal velocity v uniform, a draw is
-    accepted with a probability proportional to |det (dv / dp)|.
+    each scenario once, in random order. The result has the serves number `first` to `first` + `num`
+    - 1 of the `seed`. The ranges are constants of this module, such as `SERVE_HEIGHT`. Landing
+    point p and vertical speed are drawn uniformly. To make the horizontal velocity v uniform, a
+    draw is accepted with a probability proportional to |det (dv / dp)|.
 
-    The `scenarios` are names in court.SCENARIOS, by default all. See `pj.hit.draw` for the other
-    arguments and the errors.
+    The `scenarios` are names in court.SCENARIOS, by default all.
     """
     names = court.SCENARIOS if scenarios is None else tuple(scenarios)
     require_draw(num, seed, first)
@@ -158,8 +157,6 @@ def _draw(scenario: np.ndarray, random: np.random.Generator):
 
 
 class _AimTable(NamedTuple):
-    """Quantities of serves as splines over horizontal distance [m] and vertical speed [m/s]."""
-
     speed: RectBivariateSpline  # [m/s], horizontal speed that reaches the distance
     density: RectBivariateSpline  # [1/s^2], |d horizontal velocity / d landing point|
     time: RectBivariateSpline  # [s], from the serve to the floor
@@ -172,19 +169,14 @@ def _aim_table() -> _AimTable:
     axes = np.linspace(shortest, longest, 40), np.linspace(*RISE_SPEED, 12)
     distance, rise = np.meshgrid(*axes, indexing="ij")
     speed, slope, time = _aim(distance, rise)
-    # The determinant of d velocity / d landing point is the product of two derivatives: `slope`
-    # along the line to the landing point, and speed / distance across the line.
+    # The determinant of d(horizontal velocity) / d(landing point) is a product of two derivatives:
+    # `slope` along the line to the landing point, and speed / distance across the line.
     density = slope * speed / distance
     tables = (RectBivariateSpline(*axes, values) for values in (speed, density, time))
     return _AimTable(*tables, max_density=float(density.max()))
 
 
 def _aim(distance: np.ndarray, rise: np.ndarray):
-    """Return the horizontal speeds [m/s] of serves that land after a horizontal `distance` [m].
-
-    Their vertical speeds are `rise` [m/s]. The other results are the derivatives of the speeds by
-    distance [1/s], and flight times [s].
-    """
     drag_free_time = (rise + np.sqrt(rise**2 + 2.0 * GRAVITY * SERVE_HEIGHT)) / GRAVITY
     speed = distance / drag_free_time * (1.0 + 0.5 * DRAG * distance)
     position = np.array([0.0, 0.0, SERVE_HEIGHT])
@@ -214,7 +206,7 @@ def advance(serves: Serves, delay: float) -> Serves:
 
 
 def uniform_starts(index: np.ndarray, seed: int) -> np.ndarray:
-    """Return random hover positions (N, 3) [m] in the half court, by serve indices and seed."""
+    """Return random hover positions (N, 3) [m] in the half court, one for each serve's index."""
     starts = np.empty((len(index), 3))
     for block in np.unique(index // _STARTS):
         rows = index // _STARTS == block
@@ -235,9 +227,11 @@ def to_cases(
     robot: QuadrotorModel = PAPER_HITTER,
     dtype=jnp.float32,
 ) -> HitCase:
-    """Make a batch of cases from serves, by default with the numbers of [Yu2023bat].
+    """Make a batch of hits to plan from serves, by default with the numbers of [Yu2023bat].
 
-    Arguments and errors are as in `pj.hit.draw`. The seed is used only if `start` is "uniform".
+    `start` (3,) [m] is the hover position of the quadrotor `robot`. If it is "uniform", positions
+    in the quadrotor's half court are drawn with `seed`. When planning starts, the balls have flown
+    for `delay` [s]. `limit_scale` multiplies the limits of speed, acceleration and body rate.
     """
     require_scalar("limit_scale", limit_scale)
     require_scalar("delay", delay)

@@ -35,7 +35,7 @@ def draw(
 
     "easy" (default), "medium" and "hard" have ever more obstacles, "storm" and "gale" many moving
     ones, "maze" long walls with gaps, and "rush" little time. Suites of other packages are also
-    accepted. Arguments and errors are as for `pj.hit.draw`.
+    accepted. The batch has the cases number `first` to `first` + `num` - 1 of suite and `seed`.
     """
     suite = suite_named(suite, "easy")
     if suite not in SUITES:

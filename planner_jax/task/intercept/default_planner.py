@@ -111,7 +111,8 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
     ) -> tuple[SmoothIntercept, StartedCase]:
         """Plan cases; return a planner and cases by which `pj.gradient` differentiates the plans.
 
-        `plan_of(planner, cases)` makes the plans; by default the first search makes them.
+        `plan_of(self, cases)` makes the plans. By default `solve` makes them with the first entry
+        of `attempts`, the searches of this planner.
         """
         if plan_of is None:
             plans = self.solve(lax.stop_gradient(cases), self.attempts[0])
@@ -172,7 +173,11 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
         return self._explain(case, attempt, found, plan)
 
     def load_attempt(self, attempt: Search, cases: InterceptCase) -> LoadedSearch:
-        """Return a search whose numbers are arguments of a compiled program, shared by searches."""
+        """Return the search `attempt` in the form of the second argument of the compiled `solve`.
+
+        Its settings become arrays, so that on a CPU all searches share one program; see
+        `load_search`. The cases are not used.
+        """
         if isinstance(attempt, LoadedSearch):
             return attempt
         attempts = self.attempts if attempt in self.attempts else (attempt,)
@@ -181,11 +186,6 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
     def _guess(
         self, case: InterceptCase, found: Reachability, noise: PathNoise, attempt: Search
     ) -> Guess:
-        """Draw a random path of cells that meets the target; return the starting point along it.
-
-        The path ends at the case's time if `meet` is "given", at one of the two earliest times at
-        which the car can meet the target if "early", and at any such time if "least".
-        """
         layer = found.grid.num
         if self.problem.is_time_free:
             allowed = found.layers
@@ -204,7 +204,7 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
 
 
 def quick(**fields: object) -> SpacetimeIntercept:
-    """Make a `SpacetimeIntercept` that is fast: it tries fewer paths, with fewer steps each."""
+    """Make a fast `SpacetimeIntercept` with fewer paths and steps; `fields` set other fields."""
     return SpacetimeIntercept(**{"searches": QUICK, **fields})
 
 

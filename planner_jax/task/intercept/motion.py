@@ -36,14 +36,19 @@ class Motion:
     # both ends of its piece, the end time of the motion, and the three components of a twist (rigid
     # displacement in the plane) of all earlier pieces.
     slope: Array  # (K, S, 4, 8)
-    # Derivatives of the twist (displacement) of later pieces by speed and curvature at this end.
+    # Derivatives of the twist (rigid displacement) of all later pieces by speed and curvature at
+    # the end of each piece (`right`) and at its start (`left`).
     right: Array  # (K, 2, 3)
-    left: Array  # (K, 2, 3), the same derivatives by speed and curvature at the piece's start
+    left: Array  # (K, 2, 3)
 
 
 @struct.dataclass
 class Quadratic:
-    """Half the gradient and Hessian of a cost, by samples and by the variables of each piece."""
+    """Half the first and second derivatives of a sum of squares, which omits their factor 2.
+
+    The cost has terms that depend on x, y, heading and time of one sample, and terms that depend on
+    the five variables of one piece: speed and curvature at its start and end, and the end time.
+    """
 
     push: Array  # (K, S, 4), half gradient by x, y, heading and time of every sample
     stiffness: Array  # (K, S, 4, 4), half Hessian by x, y, heading and time of every sample
@@ -53,18 +58,16 @@ class Quadratic:
 
 @functools.cache
 def _weights(samples: int) -> tuple[np.ndarray, ...]:
-    """Return the integration weights of one piece with S samples.
+    """Return constant matrices for the integrals over one piece of a motion with S samples.
 
-    The position u on the piece is from 0 to 1. The speed and the curvature are combinations of the
-    hat functions l = 1 - u and r = u of the piece's two knots. There are 2 S + 1 equally spaced
-    nodes; every second node is a sample.
+    Let u be the time since the start of the piece, divided by its duration. Speed and curvature are
+    combinations of l = 1 - u and r = u. Of 2 S + 1 equally spaced nodes every second is a sample.
 
     Returns:
-        turned: (3, 2 S + 1), integrals of l^2, l r and r^2 from 0 to each node.
-        weights: (2 S + 1, 9 S), nine blocks of S columns that are applied to values f at the nodes.
-            Block 0 selects f at the samples. Blocks 1 and 2 are the integrals of f l and f r up to
-            each sample by Simpson's rule. Blocks 3 to 8 are the integrals of f times l, then r,
-            times each of the three integrals in `turned`.
+        turned: (3, 2 S + 1), integrals of l^2, l r and r^2 up to each node, for the heading.
+        weights: (2 S + 1, 9 S), maps f, cosine or sine of the heading at the nodes, to nine values
+            at each sample: f; the integrals of f l and f r, for the position; and the integrals of
+            f times l or r times each row of `turned`, for the derivatives of the position.
     """
     u = np.linspace(0.0, 1.0, 2 * samples + 1)
     hats = np.stack([1.0 - u, u])
@@ -79,7 +82,7 @@ def _weights(samples: int) -> tuple[np.ndarray, ...]:
 
 
 def motion(start: Array, time: Array, speed: Array, curvature: Array, samples: int) -> Motion:
-    """Compute the samples of a car motion of K pieces, and their derivatives.
+    """Compute samples of a car motion of K pieces, and their derivatives by speeds and curvatures.
 
     Args:
         start: (3,) x, y [m] and heading [rad] at time 0.
@@ -137,8 +140,8 @@ def motion(start: Array, time: Array, speed: Array, curvature: Array, samples: i
     after = jnp.stack(  # twists of later pieces by the five variables of a piece, (5, K, 3)
         [last[:, 0] + last[:, 2] * end_y, last[:, 1] - last[:, 2] * end_x, last[:, 2]], axis=-1
     )
-    # Variables of a piece also deform earlier pieces, and so displace the piece rigidly: the end
-    # time deforms all earlier pieces, the values at the piece's start only the previous piece.
+    # The variables of a piece also deform earlier pieces, which displaces the piece rigidly: the
+    # end time deforms all earlier pieces, speed and curvature at its start the previous piece.
     zero = jnp.zeros((1, 3), dtype)
     before = jnp.stack(
         [

@@ -68,12 +68,15 @@ class Guess:
 
 @dataclasses.dataclass(frozen=True)
 class MotionProblem:
-    """The least-squares problem that `SpacetimeIntercept` solves, whose fields it copies."""
+    """The least-squares problem of an interception, which `SpacetimeIntercept` solves.
 
-    meet: Literal["given", "early", "least"] = "given"
-    pieces: int = 32
-    samples: int = 3
-    checked: int = 10
+    `meet` selects the time of the meeting: the case's time, the earliest, or that of least effort.
+    """
+
+    meet: Literal["given", "early", "least"] = "given"  # as in `SpacetimeIntercept`
+    pieces: int = 32  # number of pieces of speed and curvature
+    samples: int = 3  # samples of each piece at which the cost checks obstacles
+    checked: int = 10  # samples of each piece at which the finished plan is checked
 
     @property
     def is_time_free(self) -> bool:
@@ -113,8 +116,8 @@ class MotionProblem:
     def guess_along(self, case: InterceptCase, grid: Grid, path: CellPath, layer: Array) -> Guess:
         """Return a starting point whose motion follows a path of cells, headings and speeds.
 
-        The path has one cell for each time of the grid, the layers. It meets the target at the
-        layer with the index `layer` () int32.
+        The path has one cell for each of the grid's equally spaced times. It meets the target at
+        the time with the index `layer` () int32.
         """
         width = 2.0 * np.pi / grid.lattice.headings
         pace = case.limits.speed / (grid.lattice.levels - 1)
@@ -200,7 +203,11 @@ class MotionProblem:
         )
 
     def list_stages(self, attempt: Search) -> list[Stage]:
-        """Return the stages of least squares from a starting point along a path of grid cells."""
+        """Return the three stages of least squares that start along a path of grid cells.
+
+        They follow the path, keep all limits, and reduce acceleration or meeting time. The settings
+        `attempt` determine their numbers of steps, tolerances and margins.
+        """
         return [Stage(_FOLLOWING, attempt.following), *self.list_last_stages(attempt)]
 
     def list_last_stages(self, attempt: Search | Warm) -> list[Stage]:
@@ -275,7 +282,7 @@ class MotionProblem:
 
 @struct.dataclass
 class StartedCase(InterceptCase):
-    """A case, and the unknowns of a plan of it, from which least squares start."""
+    """An interception to plan, and the unknowns of a known plan, from which least squares start."""
 
     start_point: Array  # (n,) unknowns, treated as constant when the case is differentiated
 
@@ -313,7 +320,10 @@ class SmoothIntercept(OptimisedPlanner):
         )
 
     def guesses(self, context: _Context, num: int) -> Array:
-        """Minimise the cost near the case's start; return the unknowns, repeated in `num` rows."""
+        """Minimise the cost, from the plan stored in the case; return the n unknowns, (num, n).
+
+        All rows are equal, because there is only one stored plan.
+        """
         fixed = lax.stop_gradient(context)
         start = fixed.case.start_point
         end = least_squares(lambda x: self._exact_model(x, fixed), start, self.solver)
@@ -326,14 +336,10 @@ class SmoothIntercept(OptimisedPlanner):
         return problem.build_model(point, context.moving, context.field, weights, positions)
 
     def _exact_model(self, point: Array, context: _Context) -> Model:
-        """Return the quadratic model with the gradient of the cost by automatic differentiation.
-
-        The gradient of `build_model` is approximate: it neglects that the conversion from the rate
-        of curvature to the steering rate depends on the curvature.
-        """
+        # The gradient of `build_model` neglects that the ratio of steering rate to rate of
+        # curvature depends on the curvature. Automatic differentiation is exact.
         model = self._model(point, context)
         gradient = jax.grad(lambda x: self.objective(x, context).cost)(point)
-        # The field `gradient` of a `Model` is half the gradient of the cost.
         return dataclasses.replace(model, gradient=0.5 * gradient)
 
     def objective(self, point: Array, context: _Context) -> Evaluation:

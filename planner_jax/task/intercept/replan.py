@@ -47,7 +47,7 @@ class ReplanIntercept(Planner[Replanning, InterceptPlan]):
 
     @property
     def attempts(self) -> tuple[Attempt, ...]:
-        """The attempts: from the previous plan, then, to save time, only one from scratch."""
+        """The attempts at a new plan: from the previous plan, then by one search from scratch."""
         return (self.warm, self.search)
 
     @property
@@ -67,13 +67,13 @@ class ReplanIntercept(Planner[Replanning, InterceptPlan]):
         speed: ArrayLike | None = None,
         curvature: ArrayLike | None = None,
     ) -> Replanning:
-        """Return the case, or the batch, as it remains `elapsed` seconds into its plan.
+        """Return what remains of interceptions `elapsed` [s] after the start of their plans.
 
         Args:
-            cases: one case or a batch, as for `pj.replan`, which also describes the errors.
+            cases: one case or a batch of B cases, as they were planned.
             previous: the plans that are being driven.
             elapsed: () [s], time since the start of the plans, or (B,) for B cases.
-            target: the expected path; its times count from this moment.
+            target: the expected path of the target; its time 0 is the moment of re-planning.
             movers: the moving obstacles at this moment; by default the obstacles of the cases,
                 moved at their velocities.
             start: (3,) or (B, 3) x, y [m], heading [rad] of the rear axle; by default as planned.
@@ -111,7 +111,11 @@ class ReplanIntercept(Planner[Replanning, InterceptPlan]):
         return Replanning(case=remainder, previous=previous, elapsed=elapsed)
 
     def load_attempt(self, attempt: Search | Warm, tasks: Replanning) -> PyTree:
-        """Return an attempt whose numbers are arguments of the compiled program of its type."""
+        """Return settings of an attempt in the form of an argument of the compiled `solve`.
+
+        The planner from scratch converts a `Search`, for which it gets the cases of `tasks`.
+        `Warm` settings are constants of a compiled program of their own.
+        """
         if isinstance(attempt, Search):
             return self.planner.load_attempt(attempt, tasks.case)
         return super().load_attempt(attempt, tasks)
@@ -145,7 +149,6 @@ class ReplanIntercept(Planner[Replanning, InterceptPlan]):
 
 @jax.jit
 def _state(plan: InterceptPlan, time: Array) -> tuple[Array, Array, Array]:
-    """Return pose (3,), speed [m/s] and curvature [1/m] of a plan at one time [s]."""
     time = jnp.minimum(time, plan.time)
     old = plan.time * jnp.linspace(0.0, 1.0, plan.speed.shape[0])
     return (

@@ -21,8 +21,8 @@ from planner_jax.plane.distance_field import DistanceField, distance_field
 from planner_jax.task.intercept.case import InterceptCase
 from planner_jax.task.intercept.terms import discs_of, wrap
 
-# Estimated memory of a search for each path, and for each 32-bit word of its set of reachable
-# cells, in units of the memory for one starting point of a planner with few unknowns.
+# Estimated memory of a search for each path, and for each 32-bit word of the bits that mark the
+# reachable cells. The unit is the memory of one starting point of the library's other planners.
 _PATH_STARTS = 8
 _WORD_STARTS = 1 / 32768
 _PADDED = ("paths", "candidates")
@@ -64,7 +64,7 @@ class Search(Attempt):
 )
 @dataclasses.dataclass(frozen=True)
 class LoadedSearch(Search):
-    """A `Search` whose numbers are arguments of a compiled program, shared by several searches."""
+    """A `Search` whose settings are arrays, so that several searches share a compiled program."""
 
     _: dataclasses.KW_ONLY
     noise: cell_paths.PathNoise  # random numbers that select each path
@@ -76,7 +76,7 @@ class LoadedSearch(Search):
 
 @cached_by_precision
 def load_search(search: Search, searches: tuple[Search, ...], is_apart: bool) -> LoadedSearch:
-    """Return one of a planner's searches, with its numbers as arguments of a compiled program.
+    """Return one of a planner's searches, with its settings as arguments of a compiled program.
 
     All searches share one program. Its arrays of random numbers, which select the paths, are as
     large as in the search with most paths and most candidates for a path. If `is_apart` is true,
@@ -160,12 +160,15 @@ class Reachability:
 
 
 def make_grid(case: InterceptCase, lattice: reach.Lattice) -> reach.Grid:
-    """Return the grid of a case: cells that cover its map, at times up to the case's time."""
+    """Return the grid of a case: cells that cover its map, at times up to the case's time.
+
+    `lattice` has the numbers of the grid's cells, times, speeds and headings.
+    """
     return reach.grid_of(lattice, case.start, case.time, case.limits.speed, case.lower, case.upper)
 
 
 def make_field(case: InterceptCase, grid: reach.Grid) -> DistanceField:
-    """Compute the distance from the walls at `_FIELD` nodes along each side of the map."""
+    """Compute the distances [m] from the walls at 128 x 128 nodes of a grid over the map."""
     spacing = grid.cell * (grid.lattice.cells / _FIELD)
     return distance_field(case.walls, grid.corner, spacing, _FIELD)
 
@@ -218,7 +221,11 @@ def draw_cell_path(
     noise: cell_paths.PathNoise,
     directness: Array | float,
 ) -> cell_paths.CellPath:
-    """Draw a random path of grid cells that meets the target at time number `layer` () int32."""
+    """Draw a random path of grid cells that meets the target at the time of index `layer` ().
+
+    `noise` holds the random numbers that select the path. The greater `directness` >= 0, the
+    straighter are the paths, and the more even is their speed.
+    """
     cells, is_reached = _meeting_cells(case, found.grid, found.reach, layer)
     draw = cell_paths.draw_path
     return draw(found.grid, found.reach, layer, cells, is_reached, noise, directness)

@@ -64,7 +64,7 @@ def draw_with_counts(
 ) -> Drawn:
     """Draw a batch of cases in float64, cast it to `dtype`, and count the rejected candidates.
 
-    `suite` is a key of `SUITES`. Other arguments and the errors are as for `pj.hit.draw`.
+    `suite` is a key of `SUITES`. The batch has its cases number `first` to `first` + `num` - 1.
     """
     require_name(SUITES, "suite", suite)
     spec, randoms, dtype = SUITES[suite], make_generators(suite, num, seed, first), floating(dtype)
@@ -123,11 +123,6 @@ def _unit(angle: np.ndarray) -> np.ndarray:
 
 
 def _candidates(suite: Suite, kinds: np.ndarray, uniform: np.ndarray) -> Draws:
-    """Make one candidate for each of B cases from uniform random numbers of [0, 1).
-
-    `kinds` (B, 3) is the same for all candidates of a case: it determines whether the target turns,
-    and the numbers of walls and moving obstacles. `uniform` is (B, `_count_numbers(suite)`).
-    """
     turning, count_walls = kinds[:, 0] < 0.5, _integer(kinds[:, 1], *suite.num_walls)
     count_movers = _integer(kinds[:, 2], *suite.num_movers)
     u, walls, movers = np.split(uniform, np.cumsum([7, suite.wall_room[0] * (2 + _SHAPE)]), axis=1)
@@ -171,7 +166,8 @@ def anywhere(uniform: np.ndarray) -> np.ndarray:
 def target_to(meeting: np.ndarray, time: float, turning: np.ndarray, uniform: np.ndarray) -> Draws:
     """Return B random targets that are at the points `meeting` (B, 2) [m] at the time `time` [s].
 
-    Targets drive in a circle where `turning` (B,) is true. `uniform` (B, 4) are numbers of [0, 1).
+    Targets drive in a circle where `turning` (B,) is true, else straight. The random numbers
+    `uniform` (B, 4) of [0, 1) determine heading, speed, turn rate, and the side of the turn.
     """
     side = np.where(uniform[:, 3] < 0.5, 1.0, -1.0)
     rate = np.where(turning, side * _between(uniform[:, 2], 0.03, 0.1), 0.0)
@@ -181,7 +177,6 @@ def target_to(meeting: np.ndarray, time: float, turning: np.ndarray, uniform: np
 
 
 def _shorten_time(suite: Suite, draws: Draws) -> Draws:
-    """Set each meeting `suite.spare` [s] after the car's estimated earliest arrival."""
     with jax.enable_x64(True):
         cases = jax.tree.map(np.asarray, cases_of(draws, jnp.float64))
         num = len(draws["time"])
@@ -192,7 +187,6 @@ def _shorten_time(suite: Suite, draws: Draws) -> Draws:
     return {**draws, "time": time, "reached": reached, "meeting": draws["pos"] + moved}
 
 
-# Compiled for one case, so that rounding errors do not depend on the size of the batch.
 _earliest = jax.jit(earliest_arrival)
 
 
@@ -214,19 +208,14 @@ def _across(uniform: np.ndarray, count: np.ndarray) -> np.ndarray:
 def _maze(
     uniform: np.ndarray, across: np.ndarray, count: np.ndarray, start: np.ndarray, end: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return corners (B, 12, 6, 2) [m] of the rectangles of B mazes, and which exist, (B, 12).
-
-    The first `count` (B,) walls at the x positions `across` (B, 3) [m] exist. Dead ends lie on the
-    straight line from start to end. Of the random numbers `uniform` only `uniform[:, :3]` are used.
-    """
     u = np.moveaxis(uniform[:, :3], 2, 0)
     gap, half = _between(u[1], 0.8, SIZE - 0.8), 0.5 * _between(u[2], 0.7, 1.1)
     length, mouth = _between(u[3], 0.5, 0.8), 0.5 * _between(u[4], 0.8, 1.4)
     outer = mouth + THICKNESS
     slope = (end[:, 1:] - start[:, 1:]) / (end[:, :1] - start[:, :1])
     line = start[:, 1:] + slope * (across - start[:, :1])
-    # y position [m] of the dead end: where the straight line crosses the wall, moved as little as
-    # possible so that the dead end does not close the wall's gap.
+    # y position [m] of the dead end in front of each wall: where the straight line from start to
+    # meeting crosses the wall, moved as little as possible so that the wall's gap remains open.
     below = np.where(gap - half >= 2.0 * outer, np.clip(line, outer, gap - half - outer), np.inf)
     fits = SIZE - gap - half >= 2.0 * outer
     above = np.where(fits, np.clip(line, gap + half + outer, SIZE - outer), np.inf)
@@ -306,17 +295,12 @@ def _middle(draws: Draws) -> np.ndarray:
 
 
 def _is_too_far(_: Suite, draws: Draws) -> np.ndarray:
-    """Return in which of B cases even a straight drive at full speed would be late, (B,) bool."""
     return np.linalg.norm(draws["meeting"] - _middle(draws), axis=1) > TOP_SPEED * draws["time"]
 
 
 def _gap(
     draws: Draws, kind: str, points: np.ndarray, times: float | np.ndarray = 0.0
 ) -> np.ndarray:
-    """Return least distances (B,) [m] of points from obstacles, which are "walls" or "movers".
-
-    There are one or M points for each of B cases, (B, 2) or (B, M, 2); `times` [s] are for movers.
-    """
     corners, points = draws[kind], points if points.ndim == 3 else points[:, None]
     if kind == "movers":
         times = np.broadcast_to(times, len(points))[:, None, None, None]
@@ -330,7 +314,6 @@ def _gap(
 
 
 def _distance(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """Return distances [m] of points (..., 2) from convex polygons of V corners; 0 inside."""
     edge = np.roll(corners, -1, axis=-2) - corners
     away = points[..., None, :] - corners
     square = np.maximum((edge**2).sum(axis=-1), 1e-12)
@@ -341,7 +324,6 @@ def _distance(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
 
 
 def _is_separated(_: Suite, draws: Draws) -> np.ndarray:
-    """Return in which of B cases walls bar a disc as wide as the car from the meeting, (B,)."""
     count = round(SIZE / _CELL)
     middles = (np.arange(count) + 0.5) * _CELL
     separated = np.zeros(len(draws["start"]), bool)

@@ -138,7 +138,10 @@ class SumOfSquares:
                     self._sums[a, b] = self._sums.get((a, b), 0.0) + weight * (left * right)
 
     def matrix(self, like: Array) -> Array:
-        """Return the matrices (..., size, size) for residuals of the shape (...) of `like`."""
+        """Return the sums as matrices (..., size, size) for residuals of the shape (...).
+
+        `like` is an array of this shape; entries that are constants are repeated to fill it.
+        """
         indices = range(self._size)
         sums = [
             jnp.broadcast_to(self._sums.get((min(a, b), max(a, b)), 0.0), like.shape)

@@ -8,9 +8,9 @@ import dataclasses
 from planner_jax.core.errors import ArgumentError
 
 # [N m], torque limits of the six joints of an IRB 1600-6/1.2. They are an assumption, since its
-# maker publishes no torques. Plans with accelerations up to 60 rad/s^2, the greatest limit of
-# the block task, hardly exceed these limits in joints 1 to 3. The wrist needs far less, because
-# neither the motors' rotors nor the shield have a mass in the model.
+# maker publishes no torques. Plans that block thrown balls, with accelerations up to 60 rad/s^2,
+# hardly exceed these limits in joints 1 to 3. The wrist needs far less, because neither the motors'
+# rotors nor the shield have a mass in the model.
 TORQUES = (700.0, 700.0, 250.0, 10.0, 5.0, 2.0)
 
 

@@ -40,7 +40,8 @@ def with_rest(trajectory: PiecewisePolynomial) -> PiecewisePolynomial:
     coeffs = trajectory.coeffs
     missing = 8 - coeffs.shape[1]
     coeffs = jnp.pad(coeffs, ((0, 0), (0, missing), (0, 0)))
-    # Pieces for balls that are absent come last and have zero duration.
+    # Plans of catches have pieces for every ball. The pieces of balls that are not caught come last
+    # and have a duration of 0 s.
     last = jnp.max(jnp.where(trajectory.durations > 0.0, jnp.arange(coeffs.shape[0]), 0))
     piece = PiecewisePolynomial(coeffs[last][None], trajectory.durations[last][None])
     unit = jnp.asarray([_BRAKING**k for k in range(8)], coeffs.dtype)[:, None]
