@@ -14,7 +14,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 BATCH = 64  # number of cases of the batch whose programs are listed
-# Tasks whose default planners are examined, with a suite if it is not the task's default suite.
+# Tasks whose default planners are examined, as "TASK" or "TASK SUITE": the suite is the family of
+# random cases that are planned, by default the first of the task.
 _EXAMINED = ("hit", "catch throws", "catch triangle3", "intercept hard", "block")
 _SMALL = 0.05  # [s] programs that compile faster have no row, and only count in the sums
 # NAME of JAX's event /jax/core/compile/NAME_duration -> field of `Program` that sums its durations.
@@ -86,7 +87,7 @@ def format_rows(planner: str, num: int, seconds: float, programs: dict[str, Prog
 
 
 def report() -> None:
-    """Print the programs of all default planners, for one case and for a batch."""
+    """Print the compiled programs of each task's default planner, for one case and for a batch."""
     import jax
     import numpy as np
 

@@ -85,7 +85,7 @@ def _read_number(flag: str, kind: Callable[[str], float], word: str) -> float:
 
 
 def add_settings(parser: Parser, kind: Any, task: Task | None = None) -> None:
-    """Add an option for every field of the dataclass `kind`, the settings of a command."""
+    """Add an option for each field of `kind`, with the planners and suites of `task`, if any."""
     hints = typing.get_type_hints(kind)
     names = {"planner": task.all_planners(), "suite": task.all_suites()} if task else {}
     defaults: dict[str, object] = {name: next(iter(known)) for name, known in names.items()}

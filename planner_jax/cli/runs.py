@@ -1,4 +1,4 @@
-"""Commands on folders of sweeps, flights or trained policies: `sweep`, `fly`, `report`, ..."""
+"""Commands on folders of many planned cases, simulated flights or policies: `sweep`, `fly`, ..."""
 
 import contextlib
 import datetime
@@ -217,7 +217,6 @@ def _how_to_continue(out: Path, again: str, sign: str = "manifest.json") -> str:
 def _tell_how_to_continue(
     remainder: Callable[[], str], rule: str = "--out must be a folder that can be written"
 ) -> Iterator[None]:
-    """Append the advice that `remainder()` returns to errors raised within the `with` block."""
     try:
         yield
     except KeyboardInterrupt:

@@ -66,7 +66,7 @@ def _write_answer(single: "Single", answer: "Answer", out: Path, rate: float | N
     written = [out / "plan.npz"]
     answer.plan.save(written[0])
     if answer.success:
-        # "brake" exports the stop at the end, too: the plan's own recovery trajectory, unchanged.
+        # The file of setpoints ends with the plan's own trajectory to standstill, if it has one.
         how = {"rate": rate, "recovery": None if answer.plan.recovery is None else "brake"}
         written.append(export(answer.plan, to="csv", out=out / "setpoints.csv", **how))
     written += write_pictures(single.task, str(single.settings.planner), answer, out)

@@ -180,8 +180,6 @@ def require_path(
 
 @functools.lru_cache(maxsize=256)
 def _shape_of_positions(tree: PyTree, layout: tuple, axes: tuple[int, ...]) -> tuple[int, ...]:
-    """Return the shape of the positions that `at` returns; cached, because tracing `at` is slow."""
-
     def at(path: _Path, time: Numbers) -> PyTree:
         state = path.at(time)
         return getattr(state, "pos", state)  # `at` may return the position alone

@@ -17,7 +17,7 @@ SCALES = (1e-3, 1e3)  # least and greatest plausible factor on the limits of a c
 def require(
     holds: bool, name: str, rule: str, value: object = None, *, shown: str | None = None
 ) -> None:
-    """Raise `ArgumentError` about the argument `name` unless `holds` is true."""
+    """Raise "NAME must be RULE, got VALUE" unless `holds` is true; `shown` replaces the value."""
     if not holds:
         raise ArgumentError(name, rule, value, shown=shown)
 
@@ -42,7 +42,7 @@ def require_seed(value: object) -> None:
 
 
 def require_scale(value: float) -> None:
-    """Raise `ArgumentError` unless the factor `limit_scale` on limits is in the range `SCALES`."""
+    """Raise `ArgumentError` unless `limit_scale`, the factor on all limits, is from 1e-3 to 1e3."""
     least, most = SCALES
     require(least <= value <= most, "limit_scale", f"from {least:g} to {most:g}", value)
 

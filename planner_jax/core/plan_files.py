@@ -94,7 +94,7 @@ def _read(path: str | os.PathLike) -> tuple[object, object, dict[str, np.ndarray
 
 
 def leaves_by_name(tree: PyTree, prefix: str = "") -> dict[str, PyTree]:
-    """Return a nested dataclass as a dict of arrays by dotted names, without static fields."""
+    """Return the arrays of a nested dataclass by `prefix` and name, such as "limits.speed"."""
     leaves = {}
     defaults = {field.name: field.default for field in dataclasses.fields(tree)}
     for name, value in nodes_of(tree).items():
@@ -107,7 +107,7 @@ def leaves_by_name(tree: PyTree, prefix: str = "") -> dict[str, PyTree]:
 
 
 def build_tree(kind: type[Kind], prefix: str, arrays: dict[str, PyTree]) -> Kind:
-    """Build a dataclass from arrays by the names of its fields; remove them from `arrays`."""
+    """Build a dataclass from the `arrays` named `prefix` + field name, and remove these from it."""
     types = typing.get_type_hints(kind)
     values = {}
     for field in dataclasses.fields(kind):  # type: ignore[arg-type]

@@ -53,7 +53,8 @@ class Drive(Protocol):
         """Plan a batch by the listed attempts (searches) of a planner, by default by all of them.
 
         Returns:
-            The plans, and either a count of unsolved cases or a bool array of which are unsolved.
+            The plans, and a bool array, true for unsolved cases; or, for a batch outside of
+            compiled programs, the number of unsolved cases.
         """
         ...
 
@@ -106,9 +107,9 @@ class Planner(Generic[CaseT, PlanT]):
         return Fixed(attempt)
 
     def divides(self, attempt: PyTree, /) -> bool:
-        """Return whether `pj.plan` runs an attempt's search from each start as its own problem.
+        """Return whether `pj.plan` solves a case from each starting point as a separate problem.
 
-        Only an `OptimisedPlanner` has such attempts (settings of a search).
+        Attempts (settings of a search) then share a program for any number of starting points.
         """
         return False
 
@@ -153,11 +154,15 @@ class Planner(Generic[CaseT, PlanT]):
         raise NotImplementedError
 
     def starts_long(self, cases: CaseT) -> bool:
-        """Return whether already the first attempt (search) takes long; see `DecidedPlanner`."""
+        """Return whether the first attempt (search) for these cases takes long.
+
+        A planner that tries several choices for a case, such as orders of targets, then makes later
+        attempts only if no choice has solved the case.
+        """
         return False
 
     def replanner(self) -> "Planner":
-        """Return the planner that continues from existing plans; see `pj.replan`."""
+        """Return the planner that `pj.replan` uses to continue from existing plans."""
         return self
 
     def begin(self, *args: PyTree, **news: PyTree) -> Case:
@@ -196,8 +201,8 @@ class Planner(Generic[CaseT, PlanT]):
     def with_effort(self, effort: str) -> Self:
         """Return a copy of the planner that continues to lower the cost when every limit holds.
 
-        With the effort "feasible" it is the planner itself, which stops at a case as soon as every
-        limit holds. See `OptimisedPlanner.with_effort` for the efforts "good" and "best".
+        The effort "good" allows a short and "best" a long further search. The effort "feasible"
+        returns the planner itself, which stops at a case as soon as every limit holds.
 
         Raises:
             ArgumentError: the effort is unknown, or the planner does not minimise a cost.
@@ -239,7 +244,7 @@ def require_planner(planner: object) -> None:
 
 
 def require_fit(planner: Planner, cases: object) -> None:
-    """Raise unless `planner` is a pytree with an attempt (search), for cases of this class."""
+    """Raise unless `planner` is a pytree with at least one attempt (search), for these cases."""
     require_planner(planner)
     if jax.tree_util.all_leaves([planner]) and planner.kind is not Kind.HOST:
         rule = "a pytree: put @jax.tree_util.register_static over its frozen dataclass, or make it "

@@ -1,4 +1,4 @@
-"""Plans and their statuses, the rule that selects the best plan, attempts (searches), decisions."""
+"""Results of planning with their status, the rule that selects the best, and search settings."""
 
 import dataclasses
 import enum
@@ -37,7 +37,7 @@ class Status(enum.IntEnum):
 
     @property
     def message(self) -> str:
-        """A sentence for the user, with the remedy."""
+        """A sentence that explains the status, and how the user may solve the case."""
         return _MESSAGES[self]
 
     @classmethod
@@ -178,7 +178,7 @@ class Attempt:
     """Settings of one search for cases that earlier attempts left unsolved; static under jit."""
 
     starts: int = 1  # number of starting points from which each case is solved
-    # The search is made only at cases whose plan has at most this violation; None means at all.
+    # Greatest violation (relative excess over a limit) of a plan that is searched again; None: any.
     within: float | None = dataclasses.field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
@@ -204,10 +204,10 @@ class Decision(Protocol):
     """
 
     def check(self, cases: PyTree, /) -> None:
-        """Raise `ArgumentError` on the host if the rule does not apply to these cases."""
+        """Raise `ArgumentError` on the host if this decision is not possible for these cases."""
 
     def propose(self, case: PyTree, /) -> PyTree:
-        """Return F choices for a case, best first; each array of the pytree is (F, ...); pure."""
+        """Return F choices, such as orders of the targets, best first: arrays (F, ...); pure."""
         ...
 
     def rank(self, plans: PyTree, /) -> Array:
@@ -215,7 +215,7 @@ class Decision(Protocol):
         return plans.cost
 
     def explain(self, case: PyTree, status: Array, /) -> Array:
-        """Return the status () of an unsolved case, or a status that states the reason; pure."""
+        """Return `status` () of an unsolved case, or one that tells why it is unsolved; pure."""
         return status
 
 

@@ -48,7 +48,7 @@ class Task:
     suites: Mapping[str, str]  # name -> a sentence about its cases; default first
     # Planner that reads a file, as in "library:motions.bin" -> command that writes the file.
     from_file: Mapping[str, str] = dataclasses.field(default_factory=dict)
-    # Classes with the settings of the task's sweeps, and of its simulated flights in `sims`.
+    # Classes with the settings of the task's sweeps (runs of many cases) and simulated flights.
     sweep: str = "planner_jax.runs.settings:SweepSettings"
     flight: str | None = None
     # Class with the options of `planner-jax plan`, which specify one case; None: no such command.
@@ -56,7 +56,8 @@ class Task:
     # Keyword arguments with which speed benchmarks call `planner`.
     bench: Mapping[str, object] = dataclasses.field(default_factory=dict)
     contact: str | None = None  # dotted name of the contact times in a plan, such as "stroke.time"
-    # Planner whose plans' costs are the reference for cost gaps; None: a longer search's costs.
+    # Planner with whose costs the costs of other planners are compared; None: no such planner.
+    # Planners that minimise a cost are compared with a longer search of their own.
     yardstick: str | None = None
 
     @property
@@ -66,7 +67,7 @@ class Task:
 
     @property
     def draw(self) -> "Callable[..., PyTree]":
-        """Function `draw(num, suite=None, seed=0, *, first=0)`: random cases of a named family."""
+        """Function `draw(num, suite, seed, first)`: cases of a random suite from number `first`."""
         return self._function("draw")
 
     @property

@@ -118,7 +118,7 @@ def part_at(tree: PyTree, name: str) -> PyTree:
 
 
 def has_rules(cases: PyTree) -> bool:
-    """Return whether the class of the cases, or of a part of them, has a table of rules."""
+    """Return whether the class of the cases, or of a part of them, defines rules of its numbers."""
     return any(True for _ in _parts(cases))
 
 

@@ -32,13 +32,13 @@ Rate = Callable[[Motion, PyTree], Array]
 
 @dataclasses.dataclass(frozen=True)
 class Along:
-    """Constants of a planner that define its penalties: the integrand and the quadrature.
+    """Constants of a planner that define its penalties for exceeding limits along a trajectory.
 
-    The penalty of a trajectory's segment is the integral, by the trapezoid rule, of the weighted
-    smoothed hinges of excess + margin, plus the integral of `rate`, if given. E is the number of
-    limits, K the number of samples of a segment, and h the mean duration of its pieces. A segment
-    is given by h and C columns: scaled states at both ends, and whitened waypoint offsets (scaled
-    deviations of waypoints from the smoothest trajectory).
+    The penalty of a trajectory's segment is the integral over time, by the trapezoid rule at K
+    samples, of weighted smoothed hinges of excess + margin for E limits, plus the integral of
+    `rate`, if given. C vectors (3,), called columns, and the mean duration h of the polynomial
+    pieces determine a segment. Columns are the states at both ends, with the d-th derivative
+    multiplied by h^d, and waypoint offsets: scaled deviations from the smoothest trajectory.
     """
 
     maps: ProportionalMinco
@@ -71,9 +71,10 @@ class Along:
         return f"Along{(*shape, *code, *hinges, self.rate is None, self.orders)}"
 
     def matrices(self) -> np.ndarray:
-        """Return matrices (K, orders, C) from C columns to position, velocity, ... at K samples.
+        """Return matrices (K, orders, C) from C columns to the motion at K samples.
 
-        The mean duration of a piece is h = 1 s.
+        Columns are end states and waypoint offsets. The motion has position, velocity, ... for a
+        mean duration of 1 s.
         """
         each = [self.maps.sample_matrix(self.nodes, d) for d in range(self.orders)]
         return np.stack(each, axis=1)
@@ -95,10 +96,11 @@ def integrate_along(
 
     Args:
         along: functions of the excess over limits, and the quadrature.
-        columns: (N, C, 3), C columns of each segment: boundary rows (scaled states at its ends) and
-            whitened waypoint offsets.
-        piece_durations: (N,) [s], mean duration h of the pieces of each segment.
-        parameters: second argument of the excess functions, the same for all segments.
+        columns: (N, C, 3), the columns of each segment: states at its ends, with the d-th
+            derivative multiplied by h^d, and waypoint offsets (scaled deviations from the smoothest
+            trajectory).
+        piece_durations: (N,) [s], mean duration h of the polynomial pieces of each segment.
+        parameters: numbers that the excess functions need, such as gravity, for all segments.
 
     Returns:
         penalties: (N,).
@@ -112,8 +114,10 @@ def greatest_along(
 ) -> tuple[Array, ...]:
     """Return the greatest excess over each limit along N segments: one array (N,) for each limit.
 
-    The arguments are the same as for `integrate_along`. The result is differentiable. Peaks between
-    the samples are estimated by parabolas (`penalty.greatest_by_parabolas`).
+    `columns` (N, C, 3) are the scaled end states and waypoint offsets of the segments,
+    `piece_durations` (N,) [s] the mean durations of their pieces, and `parameters` the numbers that
+    the excess functions need. Parabolas estimate peaks between the samples. The result is
+    differentiable.
     """
     return _greatest(along)(columns, piece_durations, parameters)
 
@@ -133,7 +137,6 @@ def _greatest(along: Along) -> Callable:
 
 @functools.cache
 def _integral(along: Along) -> Callable:
-    """Make the function behind `integrate_along`, with CUDA kernels for values and derivatives."""
     values = _with_kernel(_values, along, "values")
     slopes = _with_kernel(_slopes, along, "slopes")
     curvature = _with_kernel(_curvature, along, "curvature")

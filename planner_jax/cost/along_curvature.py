@@ -1,8 +1,9 @@
 """Penalties of `cost.along` with first and second derivatives, for Newton's method.
 
-Samples of a segment are linear in its columns, which are scaled end states and waypoint offsets. A
-limit depends on few derivatives of the motion. So the Hessian is one product with a constant matrix
-for each pair of axes, where `jax.hessian` would need one tangent for each unknown.
+The motion at a sample is linear in a segment's columns: scaled end states and waypoint offsets.
+Each part of the Hessian, for a pair of axes such as (x, y), is therefore one product of a constant
+matrix and the penalty's second derivatives by the motion. `jax.hessian` would need one tangent for
+each unknown.
 """
 
 import dataclasses
@@ -29,9 +30,9 @@ Slot = tuple[int, int]  # order of a derivative of the motion, and its axis
 class AlongCurvature:
     """Penalties of one segment, with derivatives by its C variable columns and theta = log h.
 
-    Columns are boundary rows (scaled end states) and whitened waypoint offsets. h is the mean
-    duration of a piece. The first columns can be fixed: they are rows of the initial state, and the
-    row of the d-th derivative is proportional to h^d.
+    A column is a d-th derivative of the position at an end of the segment, multiplied by h^d, or a
+    waypoint offset (scaled deviation from the smoothest trajectory). h is the mean duration of a
+    piece. Columns of a known initial state are fixed except for the factor h^d.
     """
 
     penalty: Array  # ()
@@ -48,14 +49,14 @@ class AlongCurvature:
 def curvature_along(
     along: Along, columns: Array, piece_duration: Array, parameters: PyTree, given: int = 0
 ) -> AlongCurvature:
-    """Integrate the penalties of one segment, with first and second derivatives.
+    """Integrate the penalties of one segment, with derivatives by its columns and by log h.
 
     Args:
         along: functions of the excess over limits, and the quadrature.
-        columns: (G + C, 3), G fixed and C variable columns: boundary rows (scaled end states) and
-            whitened waypoint offsets.
-        piece_duration: () [s], mean duration of the pieces.
-        parameters: second argument of the excess functions.
+        columns: (G + C, 3), G fixed and C variable columns: scaled end states, then waypoint
+            offsets (scaled deviations from the smoothest trajectory).
+        piece_duration: () [s], mean duration h of the pieces.
+        parameters: second argument of the excess functions, such as gravity and limits.
         given: G, the number of fixed columns, which precede the variable columns.
     """
     constants = _constants(along, given)
@@ -111,7 +112,11 @@ def curvature_along(
 
 
 def columns_columns(along: Along, at_samples: tuple[Array, ...], given: int = 0) -> Array:
-    """Return the Hessian (C, 3, C, 3) of a segment's penalty by its C end states and offsets."""
+    """Return the Hessian (C, 3, C, 3) of a segment's penalty by its C variable columns.
+
+    Columns are scaled end states and waypoint offsets, the first `given` of them fixed.
+    `at_samples` are the second derivatives at the samples, the field of `AlongCurvature`.
+    """
     num = _constants(along, given).num_moving
     every = [(c, f) for c in range(num) for f in range(num)]
     return _square(_entries(along, given, every, at_samples), num)
@@ -122,9 +127,8 @@ def block_and_diagonal(
 ) -> tuple[Array, Array]:
     """Return a part of the second derivatives of a segment's penalty by its C variable columns.
 
-    Columns are vectors (3,) that, with the durations, determine the motion: boundary rows (scaled
-    end states) and whitened waypoint offsets. All derivatives that are in neither result below are
-    left out.
+    Columns are vectors (3,) that, with the durations, determine the motion: scaled end states and
+    waypoint offsets. All derivatives that are in neither result below are left out.
 
     Args:
         along: functions of the excess over limits, and the quadrature.
@@ -221,9 +225,7 @@ def _square(entries: dict[tuple[int, int], Array], num: int) -> Array:
 
 @dataclasses.dataclass(frozen=True)
 class _Constants:
-    # (3 * orders * K, G + C) Three stacked matrices from G fixed and C variable columns to all
-    # derivatives at K samples. The second and third are for derivatives by log h: fixed column d
-    # is proportional to h^d, so it has the factor d in the second and d^2 in the third matrix.
+    # (3 * orders * K, G + C), maps end states and offsets to samples and two derivatives by log h.
     samples: np.ndarray
     moving_samples: np.ndarray  # (orders, K, C)
     groups: tuple[tuple[Slot, ...], ...]

@@ -68,7 +68,7 @@ def grid_of(
 ) -> tuple[Grid, tuple[int, ...]] | None:
     """Return the grid for a kernel's arguments, and the leading axes that `vmap` has added to them.
 
-    `points` has the arguments of `integrate_along`; the mode "curvature" adds a second tuple, their
+    `points` has (columns, durations, parameters); the mode "curvature" adds a second tuple, their
     tangents. `leaves` are all arrays in `points`. None: the kernel does not support the arguments.
     """
     *_, num_columns, _, lanes = points[0][0].shape
@@ -136,9 +136,11 @@ def call_on_grid(
 def along_kernel(
     along: Along, mode: str, *, interpret: bool = False
 ) -> Callable[[Treedef, Sequence[Array]], Sequence[Array] | None]:
-    """Make the CUDA kernel that computes the results listed at `MODES`; `interpret` needs no GPU.
+    """Make the CUDA kernel that computes penalties along trajectories; `interpret` needs no GPU.
 
-    The mode "curvature" takes a point and a direction. The direction's parameters may be None.
+    The `mode` "values" returns penalties and greatest excesses, "slopes" also derivatives by
+    columns (end states, waypoint offsets) and durations, "slopes by all" by the limits, too.
+    "curvature" returns directional derivatives of these; the direction of the limits may be None.
     """
 
     def kernel(treedef: Treedef, leaves: Sequence[Array]) -> Sequence[Array] | None:
@@ -208,14 +210,14 @@ def _result_shapes(mode: str, treedef: Treedef, num_columns: int) -> list[tuple[
 
 
 def load_numbers(ref: Ref) -> PyTree:
-    """Load one number for each lane (problem), or C columns (3) for each lane from a 3-D array."""
+    """Load numbers of all lanes (problems): one number each, or C vectors from (C, 3, lanes)."""
     if len(ref.shape) != 3:
         return ref[...]
     return [[ref[c, axis] for axis in range(3)] for c in range(ref.shape[0])]
 
 
 def load_row(matrices: Ref, sample: Array, num_columns: int) -> Vectors:
-    """Load the factors (4, C) of C columns in a sample's position, velocity, acceleration, jerk."""
+    """Load a sample's matrix (4, C) from end states and waypoint offsets to position, ..., jerk."""
     return [[matrices[sample, d * num_columns + c] for c in range(num_columns)] for d in range(4)]
 
 
@@ -231,7 +233,7 @@ def _store(refs: Sequence[Ref], values: Iterable[Array]) -> None:
 
 
 def unit_motion(row: Vectors, columns: Vectors) -> Vectors:
-    """Return a sample's height, velocity, acceleration, jerk from C columns, if pieces last 1 s."""
+    """Multiply a sample's matrix (4, C) and C columns: height, velocity, ... for pieces of 1 s."""
     return [
         [_total(row[d][c] * columns[c][axis] for c in range(len(columns))) for axis in axes]
         for d, axes in enumerate(_AXES)
@@ -240,8 +242,6 @@ def unit_motion(row: Vectors, columns: Vectors) -> Vectors:
 
 @dataclasses.dataclass
 class _Sample:
-    """The constants of a trajectory's sample: the linear map to its motion, and its weight."""
-
     row: Vectors  # factors of the C columns, for position, velocity, acceleration and jerk
     weight: Array
 
@@ -284,8 +284,8 @@ def _of_sample(
 def sample_excess(along: Along, unit: Vectors, duration: Array, given: PyTree) -> tuple[Array, ...]:
     """Return the excess over each limit at one sample of a trajectory.
 
-    `unit` is the sample's motion for pieces of 1 s mean duration (see `unit_motion`), `duration`
-    the true mean duration [s] of a piece, and `given` the gravity and the limits.
+    `unit` is the sample's height, velocity, acceleration and jerk for pieces of 1 s mean duration,
+    `duration` the true mean duration [s] of a piece, and `given` the gravity and the limits.
     """
     rate = reciprocal(duration)
     rates = [rate, rate * rate, rate * rate * rate]

@@ -154,7 +154,7 @@ class Dislike:
     weight: Numbers  # () [1/s]; the planners' other costs are of the order of 1e-5 to 1
 
     def cost(self, pos: Numbers, vel: Numbers, acc: Numbers) -> Numbers:
-        """Return weight * (1 - distance^2 / radius^2)^2 inside, zero outside."""
+        """Return weight * (1 - r^2 / radius^2)^2 at a distance r < radius from centre, else 0."""
         inside = 1.0 - ((pos - _beside(self.centre, pos)) ** 2).sum(-1) / self.radius**2
         return self.weight * inside.clip(0.0, 1.0) ** 2
 
@@ -207,9 +207,9 @@ def greatest_extras(
 ) -> tuple[Array, ...]:
     """Return the greatest excess () over each limit that the user added, along one segment.
 
-    It is never too small if the excess is concave between samples: see
-    `penalty.greatest_by_tangents`. `maps`, `columns` and `duration` describe one segment, as for
-    `cost.along`.
+    `columns` (C, 3), end states and waypoint offsets, and the mean piece duration `duration` () [s]
+    determine the segment. The result is never too small if the excess is concave between samples,
+    since tangents at neighbouring samples intersect above it.
     """
     if not num_limits(extras):
         return ()
@@ -231,7 +231,7 @@ def greatest_extras(
 
 
 def extra_rate(motion: Motion, given: tuple) -> PyTree:
-    """Return the total cost per second (N,) at N samples; the user's terms are `given[-1]`."""
+    """Return the sum (N,) of the user's costs per second, `given[-1]`, at N samples."""
     samples = motion.pos, motion.vel, motion.acc
     rates = (extra.cost(*samples) for extra in given[-1] if isinstance(extra, ExtraCost))
     return sum(rates, jnp.zeros_like(motion.height))

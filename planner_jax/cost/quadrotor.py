@@ -116,7 +116,7 @@ class Measure(enum.Enum):
 
     @property
     def factor(self) -> float:
-        """Ratio of a small excess by this formula to q / limit - 1: 2 for squares, else 1."""
+        """Slope of this formula by q / limit at q = limit: 2 for formulas with squares, else 1."""
         return 1.0 if self is Measure.PLAIN else 2.0
 
     def relative(self, excess: Array) -> Array:
@@ -204,10 +204,10 @@ def relative_excess(limits: QuadrotorLimits, excess: Sequence[Array]) -> list[Ar
 def flight_along(
     maps: ProportionalMinco, nodes: int, case: QuadrotorCase, margin: float, hinge_width: float
 ) -> Along:
-    """Return the penalties along a flight, for `integrate_along`.
+    """Return the penalties for exceeding the limits of a case along the segments of a flight.
 
     They start at a relative distance `margin` before each limit, are smoothed over `hinge_width`,
-    and are sampled at `nodes` intervals of each piece.
+    and are sampled at `nodes` intervals of each polynomial piece.
     """
     factors = [measure.factor for measure in flight_measures(case.limits)]
     factors += [1.0] * num_limits(case.extras)
@@ -219,7 +219,6 @@ def flight_along(
 
 
 def _groups(limits: QuadrotorLimits) -> tuple[tuple[tuple[int, int], ...], ...]:
-    """Group the derivatives of the position, (order, axis), that occur together in a limit."""
     together: list[set[int]] = []
     for kind in _kinds(limits):
         joined = set(kind.orders).union(*(each for each in together if each & set(kind.orders)))
@@ -235,8 +234,9 @@ def greatest_excess(
 ) -> list[Array]:
     """Return the greatest relative excess over each limit: an array (N,) for N segments of a plan.
 
-    Peaks between samples are included, by parabolas for limits of flight and by tangents for the
-    user's limits (`extras`). The other arguments are as for `greatest_along`.
+    `columns` (N, C, 3), scaled end states and waypoint offsets, and mean piece durations
+    `durations` (N,) [s] determine the segments. A piece has `nodes` intervals between samples, and
+    estimates of peaks between the samples are included.
     """
     along = flight_along(maps, nodes, dataclasses.replace(case, extras=()), 0.0, 1.0)
     greatest = greatest_along(along, columns, durations, (case.gravity, case.limits, ()))

@@ -88,8 +88,8 @@ def export(
         out: path of the new file, whose extension selects the variant of the format.
         rate: setpoints per second [Hz], 100 by default; not allowed for `crazyflie`.
         recovery: which trajectory to standstill is appended to a plan that does not end at
-            standstill. "brake" stops where this costs least, "home" at the robot's first position.
-            None exports the plan up to its last contact.
+            standstill. "brake" stops at any position, "home" at the robot's first position. None
+            exports the plan up to its last contact.
         case: case of the plan, whose limits the recovery trajectory keeps.
 
     Returns:
@@ -131,7 +131,8 @@ def stream(
     """Send one plan to a UDP port of this machine, in real time; return the number of messages.
 
     Only the format "px4" can be sent. `udp` is the number of the port, and `rate` the number of
-    messages per second [Hz], 100 by default. The other arguments are described at `export`.
+    messages per second [Hz], 100 by default. `recovery` and `case` append a trajectory to
+    standstill, as in `export`.
 
     Raises:
         ArgumentError: an argument is invalid, or no program listens on the port.
@@ -144,7 +145,7 @@ def stream(
 
 
 def default_name(source: str | os.PathLike, row: int | None, to: str) -> str:
-    """Return the default file name, SOURCE-ROW-FORMAT, for a plan of a run's folder or a file."""
+    """Return the default name, SOURCE-ROW-FORMAT, of an exported file; no ROW if `row` is None."""
     extension = next(iter(FORMATS[_require_name(to)].writers))
     index = "" if row is None else f"-{row}"
     return f"{Path(os.path.abspath(source)).stem}{index}-{to}{extension}"
@@ -155,8 +156,8 @@ def bring_to_rest(plan: Plan, recovery: str | None, case: Case | None = None) ->
 
     Args:
         plan: solved plan of a robot. If it ends at standstill, it is returned unchanged.
-        recovery: "brake" stops where this costs least, "home" at the robot's first position. None
-            removes the recovery trajectory.
+        recovery: "brake" stops at any position, "home" at the robot's first position. None removes
+            the recovery trajectory.
         case: case of the plan; needed unless the plan ends at standstill.
 
     Raises:
@@ -207,7 +208,6 @@ def _require_format(to: str, plan: Plan) -> Format:
 
 
 def _resolve(writer: str, purpose: str) -> Callable:
-    """Import a writer "module:name" of this package; raise `MissingExtra` without its packages."""
     try:
         return pkgutil.resolve_name(f"planner_jax.export.{writer}")
     except ModuleNotFoundError as error:

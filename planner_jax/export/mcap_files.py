@@ -18,7 +18,7 @@ _TYPES = {
 
 
 def write_trajectory(plan: Plan, rate: float, file: BinaryIO) -> None:
-    """Write a plan as one message of `trajectory_msgs`; see `ros2.trajectory`."""
+    """Write a plan as one message of ROS's `trajectory_msgs`, with setpoints at `rate` [Hz]."""
     kind, fields = ros2.trajectory(plan, rate)
     with Writer(file) as writer:
         schema = writer.register_msgdef(_full_name(kind), _definition(kind))
@@ -26,7 +26,7 @@ def write_trajectory(plan: Plan, rate: float, file: BinaryIO) -> None:
 
 
 def write_setpoints(plan: QuadrotorPlan, rate: float, file: BinaryIO) -> None:
-    """Write a plan as messages `px4_msgs/TrajectorySetpoint`; see `px4.trajectory_setpoints`."""
+    """Write a plan as messages `px4_msgs/TrajectorySetpoint`, one for each setpoint."""
     fields = px4.trajectory_setpoints(plan, rate)
     with Writer(file) as writer:
         schema = writer.register_msgdef(_full_name(SETPOINT), _definition(SETPOINT))

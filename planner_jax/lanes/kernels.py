@@ -74,8 +74,6 @@ def _has_triton() -> bool:
 
 @dataclasses.dataclass
 class _Entry:
-    """A compiled function that has a CUDA kernel: the kernel's factory, and shapes of arrays."""
-
     path: str
     constants: tuple[Hashable, ...]
     treedef: Treedef  # tree structure of the function's arguments
@@ -96,9 +94,10 @@ def with_kernel(
     Args:
         function: takes pytrees of arrays of ONE lane (problem), and returns a pytree of arrays.
         path: "module:name" of a factory of kernels, which takes the constants. A kernel takes the
-            tree of the arguments and their leaves with the lanes last, and returns the leaves of
-            the results, or None. `jax.vmap` within a lane adds axes in front of some leaves. If it
-            adds an axis elsewhere, such as after a matrix product, the kernel is not called.
+            tree of the arguments and their leaves with the lanes last. It returns the leaves of the
+            results, or None if it does not support the shapes; then `function` is evaluated.
+            `jax.vmap` within a lane may only add axes in front of leaves, else `function` is
+            evaluated.
         constants: arguments of the factory. Functions of one path with different constants must
             have a different `repr` of them, which identifies programs in the compile cache.
         jvp: derivative as for `jax.custom_jvp`, with zeros as `SymbolicZero`; by default JAX's own.

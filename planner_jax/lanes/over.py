@@ -82,7 +82,6 @@ def _widen(value: _Value, shape: tuple[int, ...], lanes: int) -> Array:
 
 
 def _full_results(closed: ClosedJaxpr, leaves: Sequence[Array], lanes: int) -> list[Array]:
-    """Evaluate the jaxpr of one lane (problem) for all lanes, the last axis of every array."""
     values = _evaluate(closed, [_Lanes(leaf) for leaf in leaves], lanes)
     pairs = zip(values, closed.jaxpr.outvars, strict=True)
     return [_widen(value, shape_of(out), lanes) for value, out in pairs]
@@ -104,7 +103,6 @@ def _evaluate(closed: ClosedJaxpr, args: Sequence[_Value], lanes: int) -> list[_
 
 
 def _outputs(eqn: JaxprEqn, inputs: list[_Value], lanes: int) -> list[_Value]:
-    """Evaluate one JAX operation for all lanes (problems), by a kernel or rule if there is one."""
     name = eqn.primitive.name
     if name in _CALLS:
         inner = eqn.params["jaxpr"] if "jaxpr" in eqn.params else eqn.params["call_jaxpr"]
@@ -208,7 +206,6 @@ def _pad(eqn: JaxprEqn, inputs: list[_Value], lanes: int) -> list[Array] | None:
 
 
 def _dot_general(eqn: JaxprEqn, inputs: list[_Value], lanes: int) -> list[Array] | None:
-    """Multiply by a matrix that all lanes (problems) share: one product, with lanes as columns."""
     (left, right), ((left_dims, right_dims), batch) = inputs, eqn.params["dimension_numbers"]
     if isinstance(left, _Lanes) and isinstance(right, _Lanes) or batch != ((), ()):
         return None

@@ -78,7 +78,8 @@ def kernel_by_lanes(
     """Make a `kernel_call` in float32 whose blocks contain all numbers of `width` lanes (problems).
 
     `inputs` and `outputs` are the arrays' shapes without the last axis, the lanes. `threads` is by
-    default one for each lane of a block. The other arguments are as for `kernel_call`.
+    default one for each lane of a block. The first `in_place` inputs are overwritten by the
+    outputs, and `interpret` runs the kernel without a GPU.
     """
 
     def block(shape: tuple[int, ...]) -> Block:

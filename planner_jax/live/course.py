@@ -78,7 +78,7 @@ class Query:
 
 
 def setpoints_of(num: int, _: None, query: Query) -> Float[Array, "K 20"]:
-    """Sample a trajectory at `num` times; the columns of the result are `packets.FIELDS`."""
+    """Sample `num` rows: pos, vel, acc, jerk, quat_wxyz, body_rate, thrust; `_` is unused."""
     path, gravity = query.course.path, query.course.gravity
     times = query.elapsed + query.period * np.arange(num)
     end = total_duration(path)

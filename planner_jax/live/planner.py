@@ -111,7 +111,7 @@ class LivePlanner(Generic[CaseT, PlanT]):
         self.report.end()
 
     def warm_up(self) -> None:
-        """Compile all programs by planning for an invented ball, and start the report."""
+        """Compile all programs by planning for an invented ball; then count later compilations."""
         state = np.asarray(self.stroke.case.head_state)
         self._setpoints(self._recover(state, 0.0), 0.0)
         ball = None
@@ -158,7 +158,7 @@ class LivePlanner(Generic[CaseT, PlanT]):
             return self._pack(packet, fault, due)
 
     def record_sent(self, data: bytes, received: float) -> None:
-        """Record the time of a sent answer; then plan the standstill after the current plan."""
+        """Record the time of a sent answer; then extend a new plan by a stop at its end."""
         taken = time.perf_counter() - received
         self.report.counts["answered"] += 1
         self.report.counts["missed"] += taken > self.deadline

@@ -17,7 +17,7 @@ PORT = 5560  # default UDP port of the server
 
 @dataclasses.dataclass(frozen=True)
 class ServeSettings:
-    """Options of `planner-jax serve` for both tasks; an invalid value raises `ArgumentError`."""
+    """Options that `planner-jax serve hit` and `serve catch` share, checked for their ranges."""
 
     port: int = option(PORT, "N", "UDP port of this machine; 0 selects a free port")
     rate: float = option(100.0, "HZ", "rate of the setpoints in an answer [Hz]")

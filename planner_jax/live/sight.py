@@ -36,7 +36,7 @@ class Observation:
 
 @struct.dataclass
 class Estimate:
-    """Output of one step of the Kalman filter: belief after an observation, and a prediction."""
+    """Output of a Kalman filter step: belief after an observation, and the ball at a later time."""
 
     belief: EkfState
     is_outlier: Array  # () bool, whether the observation was rejected
@@ -45,7 +45,6 @@ class Estimate:
 
 
 def _filter(flight: Flight, model: EkfModel, seen: Observation) -> Estimate:
-    """Update the belief about a ball with an observation, and predict the ball's state."""
     belief = estimation.ekf_predict(seen.belief, seen.since, model, flight=flight)
     away = seen.pos - belief.mean[:3]
     noise = jnp.diag(jnp.ones(3, away.dtype) * model.observation_std**2)

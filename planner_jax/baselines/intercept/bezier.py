@@ -103,13 +103,14 @@ def joints(degree: int, orders: int, pieces: int) -> np.ndarray:
 
 
 def rows_of_pieces(of_piece: np.ndarray, pieces: int) -> np.ndarray:
-    """Expand rows (W, n + 1) for the n + 1 control points of one piece into rows for K pieces.
+    """Build the matrix of values at points of K pieces from the matrix (W, n + 1) of one piece.
 
-    A row computes a value at a point of a piece. The first point of a piece is the last point of
-    the previous piece, so that its row is left out.
+    The matrix of one piece maps its n + 1 control points to the values at W points, from the
+    piece's start to its end. A start that is the end of the previous piece gets no second row. K is
+    `pieces`.
 
     Returns:
-        (K (W - 1) + 1, K (n + 1)).
+        (K (W - 1) + 1, K (n + 1)), maps the control points of all pieces.
     """
     rows = np.kron(np.eye(pieces), of_piece)
     return np.delete(rows, np.arange(1, pieces) * len(of_piece), axis=0)
@@ -118,8 +119,8 @@ def rows_of_pieces(of_piece: np.ndarray, pieces: int) -> np.ndarray:
 def bounds_of_pieces(lower: Array, upper: Array) -> tuple[Array, Array]:
     """Convert bounds (K, W) on W values of each of K pieces into bounds (K (W - 1) + 1,).
 
-    The rows of `rows_of_pieces` compute the bounded values. Where two pieces meet, the stricter
-    bound applies.
+    The last value of a piece is the first value of the next piece: of their two bounds, the
+    stricter one applies.
     """
 
     def flat(bounds: Array, at_joints: Array) -> Array:

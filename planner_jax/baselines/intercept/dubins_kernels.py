@@ -64,10 +64,10 @@ SENSES = np.array(
 
 @njit(cache=True)
 def words_to_point(x, y, lengths):
-    """Compute the two paths of an arc and a straight line from the origin to a point (x, y).
+    """Compute the two paths of a turn, then a straight line, from the origin to a point (x, y).
 
-    `lengths` (6, 3) receives the lengths of arc and line: in row 0 for a left turn, in row 3 for a
-    right turn. Other rows are infinite.
+    Row 0 of `lengths` (6, 3) receives the path that starts with a left turn, row 3 the path with a
+    right turn: length of turn, length of line, 0. All other rows become infinite.
     """
     lengths[:] = np.inf
     for side in range(2):

@@ -47,7 +47,7 @@ class Goal(NamedTuple):
 
 
 class Rules(NamedTuple):
-    """The settings and limits of a search."""
+    """Settings of a search: greatest curvature, grid, costs, and greatest number of nodes."""
 
     curvature: float  # [1/m], greatest curvature
     cell: float  # [m], side of a square cell of the search grid
@@ -233,11 +233,7 @@ def _sinc(x):
 
 @njit(cache=True)
 def _is_free_along(pose, parts, senses, curvature, scene, field):
-    """Return whether a Dubins path, three arcs or lines, from a pose is collision-free.
-
-    `parts` (3,) [m] are the lengths of the parts, `senses` (3,) their turning directions: 1 left, 0
-    straight, -1 right.
-    """
+    """Return whether a Dubins path of three arcs or lines from a pose is collision-free."""
     x, y, heading = pose[0], pose[1], pose[2]
     for k in range(3):
         if parts[k] > 0.0:
@@ -313,7 +309,6 @@ def _cell_of(x, y, heading_bin, field, headings):
 
 @njit(cache=True)
 def _is_free_primitive(tree, node, p, primitives, scene, field):
-    """Return whether the body touches nothing along arc `p` from a node."""
     x, y, k = tree.place[node, 0], tree.place[node, 1], tree.bin[node]
     # The node's heading is the heading of the first sample on the straight arc.
     cos, sin = primitives.directions[k, PRIMITIVES // 2, 0]
@@ -328,10 +323,6 @@ def _is_free_primitive(tree, node, p, primitives, scene, field):
 
 @njit(cache=True)
 def _trace_back(tree, node, primitives, lengths, senses, curvature):
-    """Return curvatures [1/m] and lengths [m] of a path's parts, from the start to the goal.
-
-    The path leads along arcs to a node, then along three parts with `lengths` and `senses`.
-    """
     count, back = 0, node
     while tree.parent[back] >= 0:
         back = tree.parent[back]
@@ -354,7 +345,6 @@ def _enter(tree, node, parent, primitive, x, y, cost, heading_bin):
 
 @njit(cache=True)
 def _expand(node, num, best_cost, start, goal, scene, rules, field, primitives, tree, heap):
-    """Add neighbours below `best_cost` to tree and heap; return the new number of nodes."""
     x, y, cost, k = tree.place[node, 0], tree.place[node, 1], tree.place[node, 2], tree.bin[node]
     cos, sin = primitives.directions[k, PRIMITIVES // 2, 0]
     last = primitives.moves.shape[1] - 1
@@ -388,15 +378,16 @@ def _expand(node, num, best_cost, start, goal, scene, rules, field, primitives, 
 
 @njit(cache=True)
 def search(start, goal, scene, rules, node_of):
-    """Run Hybrid A* from a pose to a goal; see the module `hybrid_astar`.
+    """Run Hybrid A*, a search over cells of position and heading, from a pose to a goal.
 
     Args:
         start: (3,) x, y [m] of the rear axle and heading [rad].
         goal: goal of the path.
         scene: obstacles, map and body.
         rules: settings and limits.
-        node_of: (cells * heading bins,) int32 zeros, overwritten. They are an argument, since NumPy
-            allocates zeros much faster than numba.
+        node_of: (cells * heading bins,) int32 zeros, overwritten with the node that the search
+            reached in each cell. They are an argument, since NumPy allocates zeros much faster than
+            numba.
 
     Returns:
         Status (FOUND, NOT_FOUND or BLOCKED), curvatures (P,) [1/m] and lengths (P,) [m] of the P

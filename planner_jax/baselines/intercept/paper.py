@@ -110,7 +110,8 @@ class PaperIntercept(Planner):
             upper=case.upper,
             settings=self.smoothing,
         )
-        # At 1.2 times the initial or mean speed, the path must keep the limit of the steering rate.
+        # The planned speed varies: the limit of the steering rate must hold at 1.2 times the mean
+        # speed, or at 1.2 times the initial speed if this is greater.
         pace = _PACE * jnp.maximum(case.speed, smooth.length / case.time)
         rate = case.limits.steering_rate / (case.body.wheelbase * pace)
         return path_beside(

@@ -34,7 +34,7 @@ class Path:
 
 
 def path_along(start: Array, length: Array, curvature: Array) -> Path:
-    """Return the path of a length [m] from a pose (3,), with curvatures (N,) [1/m] at points."""
+    """Return the path of a length [m] from a pose (3,), with curvatures (N,) [1/m] at N points."""
     drive = motion(start, length, jnp.ones_like(curvature), curvature, 1)
     return Path(
         pos=jnp.concatenate([start[None, :2], drive.pos[:, 0]]),
@@ -99,8 +99,8 @@ def path_beside(
     Args:
         start: (3,) x, y [m] and heading [rad].
         curvature: () [1/m], at the start.
-        points: (N, 2) [m], given points at equal distances, the first at the start; N - 1 is a
-            multiple of `config.stride`.
+        points: (N, 2) [m], given points at equal distances, the first at the start. A knot is at
+            every `config.stride`-th point, so N - 1 is a multiple of this number.
         curvatures: (N,) [1/m], curvature at the points, the initial guess.
         length: () [m], length of the path.
         most: () [1/m], limit of the curvature.
@@ -146,10 +146,10 @@ def path_beside(
 
 
 def nearness(push: Array, miss: float) -> Quadratic:
-    """Return the quadratic model of a cost: (distance of a sample from a given point / miss)^2.
+    """Return the quadratic model of the cost |x - p|^2 / miss^2 of samples x near given points p.
 
-    `push` (K, S, 2) is (sample - given point) / miss^2, which is half of the cost's gradient, for S
-    samples in each of K pieces. `miss` is in metres.
+    `push` (K, S, 2) [1/m] is (x - p) / miss^2, half of the cost's gradient, for S samples in each
+    of K pieces of a path. A sample at the distance `miss` [m] from its point costs 1.
     """
     num, samples, _ = push.shape
     stiffness = jnp.zeros((4, 4), push.dtype).at[jnp.arange(2), jnp.arange(2)].set(miss**-2)

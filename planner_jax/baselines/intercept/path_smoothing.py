@@ -82,8 +82,8 @@ def smooth_path(
     A path breaks a limit if it touches a wall, leaves the map, or exceeds the greatest curvature.
 
     Args:
-        poses: (N, 3) x, y [m] and heading [rad], at equal distances; N - 1 is a multiple of
-            `settings.stride`.
+        poses: (N, 3) x, y [m] and heading [rad], at equal distances. Every `settings.stride`-th
+            pose becomes a control point of the smooth path.
         curvatures: (N,) [1/m], curvature at the poses.
         length: () [m], length of the given path.
         walls: standing obstacles.
@@ -95,7 +95,8 @@ def smooth_path(
         settings: weights and numbers of the descent.
 
     Raises:
-        ArgumentError: N - 1 is not a multiple of the stride, or less than four times the stride.
+        ArgumentError: N - 1 is not a multiple of the stride, or there are fewer than five control
+            points: the first two and the last two are fixed.
     """
     pieces, rest = divmod(poses.shape[0] - 1, settings.stride)
     if rest or pieces < 4:
@@ -108,10 +109,6 @@ def smooth_path(
     middle = 0.5 * (body[0] + body[1])
 
     def evaluate(share: Array) -> tuple[Array, Array, Array, Array]:
-        """Return poses, curvatures and length of a partly smoothed path, and whether it is valid.
-
-        Its points are moved by the fraction `share` of the shift to the smooth points.
-        """
         points = given + share * (smooth - given)
         found, bent, total = resample(points, poses[0, 2], poses[-1, 2], poses.shape[0])
         x, y, heading = found.T

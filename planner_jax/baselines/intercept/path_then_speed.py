@@ -156,9 +156,11 @@ class PathThenSpeed(Planner):
         return jax.tree.map(lambda leaf: leaf[best_of(drives)], drives)
 
     def rank_paths(self, problems: StationTimeProblem, violation: Array) -> Array:
-        """Return the indices (P,) of P paths, sorted by the least acceleration that they need.
+        """Return the indices (P,) of P paths, first those with a drive of little acceleration.
 
-        Paths that violate a limit come last.
+        Dynamic programming finds each path's drive past the moving obstacles. Paths with a
+        `violation` (P,), the relative excess over a limit, above 0 come later, paths without a
+        drive last.
         """
         grid = (self.step.speed or SPEED_PLANNERS["trapezoid"]).grid
         lines = jax.vmap(lambda problem: reference_line(problem, grid))(problems)
@@ -178,26 +180,27 @@ def best_of(plans: InterceptPlan) -> Array:
 
 
 def lattice(**fields: object) -> PathThenSpeed:
-    """Create the planner `lattice`, which plans a speed along each of eight paths.
+    """Create the planner `lattice`: it searches eight paths, and plans a speed along each of them.
 
-    `fields` are the planner's options.
+    The cheapest solved plan is returned. `fields` are fields of the planner that replace defaults.
     """
     return dataclasses.replace(PathThenSpeed(), **fields)
 
 
 def em(**fields: object) -> PathThenSpeed:
-    """Create the planner `em`: the path of least acceleration, with the speed of [Fan2018].
+    """Create the planner `em`: one of eight searched paths, with the speed planner of [Fan2018].
 
-    The speed has 20 polynomial pieces, as in `lattice`; `fields` are the planner's options.
+    The path allows the least acceleration past the moving obstacles in a search on a grid of times
+    and distances along the path. The speed has 20 polynomial pieces, whose bounds hold at 5 samples
+    each. `fields` are fields of the planner that replace defaults.
     """
     speed = dataclasses.replace(SPEED_PLANNERS["em"], pieces=20, samples=5)
     return PathThenSpeed(**{"tries": 1, "step": SpeedStep(speed=speed), **fields})
 
 
 def constant(**fields: object) -> PathThenSpeed:
-    """Create the planner that drives the path of least acceleration at constant speed.
+    """Create a planner that ignores moving obstacles and drives at constant speed after a ramp.
 
-    The speed ignores moving obstacles, and starts with a short ramp from the initial speed.
-    `fields` are the planner's options.
+    `fields` are fields of the planner that replace defaults.
     """
     return PathThenSpeed(**{"tries": 1, "step": SpeedStep(speed=None), **fields})

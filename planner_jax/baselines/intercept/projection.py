@@ -20,9 +20,10 @@ from planner_jax.baselines.intercept.station_time import Blocked, StationTimePro
 from planner_jax.plane.obstacles import Obstacles
 from planner_jax.robot.car import CarBody, CarLimits
 
-# Slopes tried for the edges of a quadrangle, in units of (range of path lengths) / (duration).
+# Slopes tried for a quadrangle's lower and upper edge, in units of its range of stations (distances
+# along the path) divided by its duration.
 _SLOPES = np.linspace(-2.0, 2.0, 17)
-_BEFORE = 0.05  # fraction of the horizon by which the projected time is extended at both ends
+_BEFORE = 0.05  # blocked times, maybe infinite, are cut at -0.05 and 1.05 times the horizon
 
 
 @dataclasses.dataclass(frozen=True)
@@ -91,9 +92,10 @@ def speed_limits(path: Path, body: CarBody, limits: CarLimits) -> Array:
 def project_obstacles(
     path: Path, movers: Obstacles, body: CarBody, horizon: Array, projection: Projection
 ) -> Blocked:
-    """Return the quadrangles that cover everything that M moving obstacles block on a path.
+    """Return the quadrangles that cover all times and stations at which M obstacles block a path.
 
-    There are `projection.runs * projection.slabs` quadrangles for each obstacle.
+    A station is a distance along the path. Each obstacle has `projection.runs` sequences of
+    consecutive blocked path points, and `projection.slabs` quadrangles for each sequence.
     """
     half_step = 0.5 * path.length / (path.curvature.shape[0] - 1)
     begin, finish = overlap(path, movers, body, half_step, projection.margin)
@@ -118,9 +120,9 @@ def overlap(
 ) -> tuple[Array, Array]:
     """Return when the body overlaps M obstacles at N path points: start and end [s], (M, N) each.
 
-    The body is enlarged by `margin` [m], and so far that an interval holds for all points of the
-    path within `half_step` () [m] of its point. Without an overlap the interval starts after its
-    end. For an obstacle at standstill the interval may be infinite.
+    The body is enlarged by `margin` [m]. A further enlargement makes the interval of a path point
+    hold for all positions on the path within `half_step` () [m] of this point. Without an overlap
+    the interval starts after its end. For an obstacle at standstill it may be infinite.
     """
     turned = half_step * jnp.abs(path.curvature)
     ahead, behind = body.length - body.rear_overhang, body.rear_overhang
@@ -182,11 +184,6 @@ def _least(values: list[Array]) -> Array:
 def _cover_run(
     own: Array, begin: Array, finish: Array, station: Array, half_step: Array, slabs: int
 ) -> Blocked:
-    """Return `slabs` quadrangles that cover when an obstacle blocks consecutive points of a path.
-
-    `own` (N,) bool selects the points among N points of the path. The obstacle blocks each point
-    from `begin` to `finish` (N,) [s].
-    """
     any_own = jnp.any(own)
     first = jnp.min(jnp.where(own, begin, jnp.inf))
     last = jnp.max(jnp.where(own, finish, -jnp.inf))
@@ -202,7 +199,6 @@ def _cover_run(
     right = jnp.clip(finish - middle, -0.5 * width, 0.5 * width)
 
     def edge(side: float) -> Array:
-        """Return stations (slabs, 2) [m] of lines above (side 1) or below (-1) all rectangles."""
         height = side * station + half_step
         highest = jnp.max(jnp.where(is_in, height, -jnp.inf), axis=1)
         lowest = jnp.min(jnp.where(is_in, height, jnp.inf), axis=1)

@@ -29,8 +29,9 @@ class QpTemplate:
     """The arrays that programs with equal matrices share, computed by `qp_template`.
 
     A program has n unknowns x, q equalities E x = e and M bounded rows R x. The vectors that fulfil
-    the equalities are x = base e + Z y, with d free coordinates y. If the equalities fix a row of
-    R x, its row of `normals` is 0 and its scale 1.
+    the equalities are x = base e + Z y, with d free coordinates y. Bounds on a row of R x are
+    planes in the space of y; `normals` are their unit normals, the rows of R Z divided by `scales`.
+    If the equalities alone determine a row of R x, its normal is 0 and its scale 1.
     """
 
     base: Array | np.ndarray  # (n, q), maps e to the optimum without bounds
@@ -56,7 +57,7 @@ class QpSolution:
 
 @dataclasses.dataclass(frozen=True)
 class QpConfig:
-    """Limits of the dual method; a program that needs more gets the status MAX_STEPS."""
+    """Greatest numbers of active bounds and steps; if they do not suffice: status MAX_STEPS."""
 
     active: int = 64  # greatest number of active bounds
     max_steps: int = 60  # greatest number of steps; a step adds or drops one active bound
@@ -201,7 +202,6 @@ def solve_qp(
 def _search(
     normals: Numbers, is_free: Array, low: Array, high: Array, slack: Array, config: QpConfig
 ) -> _Search:
-    """Run the dual method from no active bounds to an optimum, or until no step is possible."""
     num, size = normals.shape
     slots = min(config.active, size)
     dtype = normals.dtype
@@ -220,7 +220,8 @@ def _search(
         reached = jnp.sum(normal * s.point)
         side = jnp.where(low[row] - reached > reached - high[row], 1.0, -1.0).astype(dtype)
         gap = jnp.maximum(low[row] - reached, reached - high[row])
-        # Direction in which the point moves, and rates at which the multipliers decrease.
+        # While the multiplier of the entering bound grows by 1, the point moves by `move`, and the
+        # multipliers of the active bounds decrease by `fall`.
         both = _product(s.maps, side * normal)
         move, fall = both[:size], both[size:]
         freedom = jnp.sum(move**2)

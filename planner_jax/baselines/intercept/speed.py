@@ -137,10 +137,7 @@ def speed_template(planner: SpeedPlanner) -> QpTemplate:
 
 
 def _rows_of_piece(planner: SpeedPlanner, order: int) -> np.ndarray:
-    """Return the matrix from a piece's control points to the values that have bounds.
-
-    These values are stations for `order` 0, speeds for 1, and accelerations for 2.
-    """
+    """Return the matrix from control points to stations (`order` 0), speeds or accelerations."""
     rows = hodograph(planner.degree, order, planner.pieces)
     if planner.samples is None:
         return rows
@@ -148,11 +145,7 @@ def _rows_of_piece(planner: SpeedPlanner, order: int) -> np.ndarray:
 
 
 def _shares(planner: SpeedPlanner) -> np.ndarray:
-    """Return the positions in a piece, as fractions from 0 to 1, at which stations are bounded.
-
-    If control points are bounded, control point i of a piece of degree n is at i / n. A curve lies
-    above a straight line if each control point lies above the line at its position.
-    """
+    """Return the positions in a piece, as fractions from 0 to 1, at which stations are bounded."""
     num = planner.samples or planner.degree
     return np.arange(num + 1) / num
 
@@ -160,10 +153,12 @@ def _shares(planner: SpeedPlanner) -> np.ndarray:
 def speed_bounds(
     problem: StationTimeProblem, reference: ReferenceLine, planner: SpeedPlanner
 ) -> tuple[Array, Array, Array]:
-    """Return right sides (3,) of equalities, and bounds (M,) of M rows, of a quadratic program.
+    """Return equality values (3,), lower and upper bounds (M,) of a plan's quadratic program.
 
-    Lengths are in units of the path length, times in units of the horizon. The bounds keep the
-    curve on the reference line's side of each polygon.
+    The equalities fix initial speed, initial acceleration and final station (distance along the
+    path). Stations, speeds and accelerations, in this order, have lower and upper bounds, which
+    keep the curve on the reference line's side of each polygon. The units are path length and
+    horizon.
     """
     pieces = planner.pieces
     around = corridor(problem, reference.station, pieces, planner.lines)

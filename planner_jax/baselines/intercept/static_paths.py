@@ -32,7 +32,7 @@ _OTHER_SIDE = 8.0  # [m], added to the distance of two paths that pass a wall on
 
 @struct.dataclass
 class StaticPaths:
-    """P different paths of one case, each refined by least squares."""
+    """P paths that pass the standing obstacles of a case on different sides, without speeds."""
 
     paths: Path  # leaves (P, ...)
     violation: Array  # (P,), largest relative excess over a limit; <= 0 if all limits hold
@@ -55,7 +55,7 @@ class PathSource:
     ) -> StaticPaths:
         """Find several paths of one case; the attempt's field `paths` is their number.
 
-        `layers` () is the number of equal time steps of the search, see `search_reach`.
+        `layers` () is the number of equal time steps of the search, by default chosen for the case.
         """
         still = without_movers(case)
         found = search_reach(still, attempt, is_time_free=True, layers=layers)
@@ -92,9 +92,10 @@ class PathSource:
     def guess(
         self, case: InterceptCase, found: Reachability, layer: Array, noise: PathNoise
     ) -> tuple[Array, Guess]:
-        """Draw a random path through the cells `found`, which the car can reach, to the target.
+        """Draw a random path to the target, as arrival time [s] and initial guess of the motion.
 
-        It arrives in time step `layer`. Return its time [s] and an initial guess of the motion.
+        The path leads through cells in `found`, which the car can reach, and ends in time step
+        `layer`. The random numbers `noise` select the cells.
         """
         grid = found.grid
         path = draw_cell_path(case, found, layer, noise, 0.0)

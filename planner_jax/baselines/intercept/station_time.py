@@ -242,15 +242,14 @@ def corridor(
 
     Time is divided into equal pieces. If a polygon covers the whole duration of a piece, the
     polygon's edge is the bound. If a polygon starts or ends within the piece, the bound is a line
-    through the polygon's corner. The paper continues the edge, which excludes much free space. A
-    bound with the slope of the reference line ("tilted") excludes less.
+    through the polygon's corner. The paper continues the edge, which excludes much free space.
 
     Args:
         problem: one problem.
         station: (N + 1,) [m], the line, at equally spaced times from 0 to the horizon.
         pieces: number of pieces.
-        lines: slope of the bounds: "tilted", of the line where this is valid; "edges", of the
-            polygon's edge; "flat", 0.
+        lines: slope of the bounds: "tilted", of the line `station` unless the bound would then
+            enter the polygon; "edges", of the polygon's edge; "flat", 0.
     """
     blocked = problem.blocked
     length = problem.horizon / pieces
@@ -295,11 +294,10 @@ def corridor(
 
 
 def _speed_limits(problem: StationTimeProblem, joints: Array) -> tuple[Array, Array, Array]:
-    """Return least station, greatest station and greatest speed in each of K time intervals.
+    """Return least station, greatest station [m] and speed limit [m/s] in each of K intervals.
 
-    The speed is the least limit on the parts of the path that the reference line passes in the
-    interval. The two stations exclude parts with a lower limit. `joints` (K + 1,) [m] are the
-    line's stations at the ends of the intervals.
+    Between the two stations no part of the path has a lower limit. The line has the stations
+    `joints` (K + 1,) [m] at the ends of the intervals.
     """
     limit = problem.speed_limit
     edge = jnp.linspace(0.0, 1.0, limit.shape[-1] + 1)[None] * problem.end_station

@@ -32,7 +32,8 @@ SingleT = TypeVar("SingleT", bound=SingleSettings)
 
 _SAMPLES = 4001  # number of times at which a plan is compared with the limits
 
-# Quantity of a flight with an upper limit -> unit. `PANELS` has a function to compute each one.
+# Quantities of a flight with an upper limit, and their units. `sweep.figures.PANELS` has functions
+# that compute the quantities from samples of the flight.
 _ABOVE = {"speed": "m/s", "acceleration": "m/s^2", "body_rate": "rad/s"}
 
 
@@ -189,12 +190,12 @@ def _table(margins: Sequence[Margin]) -> list[str]:
 
 @dataclasses.dataclass(frozen=True)
 class OneRow(RunRows):
-    """The case of `planner-jax plan` in the form of a sweep's row, for the figures of sweeps."""
+    """One planned case in the form of a finished run of many cases, to draw the same figures."""
 
     row: Row
 
     def same_case(self) -> list[tuple[str, Row]]:
-        """Return [(planner's name, row with its plan)]; only one planner has planned the case."""
+        """Return the name of the planner and the planned case, as a list with one pair."""
         return [(self.manifest["parameters"]["planner"], self.row)]
 
 

@@ -29,7 +29,7 @@ class SingleHit(Single[SingleHitSettings]):
         ]
 
     def task_margins(self, answer: Answer) -> list[Margin]:
-        """Return the margins of a hit: ball's distance from racket's centre, speeds, and apex."""
+        """Return margins: ball's distance from racket, racket's speeds, returned ball's apex."""
         limits, verdict = answer.case.hit_limits, answer.verdict
         end = float(np.sum(answer.plan.trajectory.durations))
         speeds = np.abs(np.asarray(verdict.hitting_velocity))

@@ -80,7 +80,7 @@ def _numbers(value: object) -> list[float]:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class SingleHitSettings(SingleSettings):
-    """Options of `planner-jax plan hit`: a ball, a target, and numbers that replace defaults."""
+    """Options of `planner-jax plan hit`: ball, target, limits, and constants of racket and ball."""
 
     pos: tuple[float, ...] = option(MISSING, "X Y Z", "initial position of the ball [m]")
     vel: tuple[float, ...] = option(MISSING, "X Y Z", "initial velocity of the ball [m/s]")
