@@ -31,7 +31,6 @@ GOOD = [0, 6, 7]  # cases of the fixture `planned` that can be planned
 
 
 def library(pieces=6, has_pole=True):
-    """Build a library whose stored motions are straight, to poses that block the ball `BALL`."""
     case = pj.block.case(*BALL, scene=paper_scene(has_pole=has_pole))
     found = jax.jit(lambda case: end_poses(case, flight_of(case), 10, 6))(case)
     good = np.flatnonzero(np.asarray(found.effort) <= 0.99)

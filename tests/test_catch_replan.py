@@ -41,7 +41,6 @@ def states_of(targets, time):
 
 
 def ahead(cases, elapsed, noise=0.0):
-    """Return the targets' states `elapsed` (B,) [s] later, with noise on position and velocity."""
     ball = states_of(cases.targets, np.asarray(elapsed, np.float32))
     random = np.random.default_rng(1)
     disturb = lambda x: np.asarray(x + noise * random.standard_normal(x.shape), np.float32)  # noqa: E731
@@ -49,7 +48,6 @@ def ahead(cases, elapsed, noise=0.0):
 
 
 def assert_same_flight(old, new, elapsed, until, atol):
-    """Assert that new plans fly for `until` [s] as the old ones do from `elapsed` [s] on."""
     for share in np.linspace(0.0, 1.0, 23):
         found = states_at(new.trajectory, share * until)
         expected = states_at(old.trajectory, elapsed + share * until)

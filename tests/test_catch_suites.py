@@ -31,7 +31,6 @@ float64 = pytest.mark.usefixtures("float64")
 
 @jax.jit
 def states(targets, times):
-    """Return the states of targets (B, N) at times (B, N, T) [s], leaves (B, N, T, 3)."""
     return jax.vmap(jax.vmap(lambda path, t: jax.vmap(path.at)(t)))(targets, times)
 
 

@@ -45,7 +45,6 @@ OF_THEIR_OWN = ("hit exact", "intercept spacetime")
 
 
 def assert_close(ours, theirs, tolerance=1e-3):
-    """Assert equal statuses, and arrays equal relative to their largest finite number."""
     np.testing.assert_array_equal(ours.status, theirs.status)
     for a, b in zip(jax.tree.leaves(ours), jax.tree.leaves(theirs), strict=True):
         # NaN and infinity do not count for the tolerance; the assertion requires them to be equal.

@@ -23,8 +23,6 @@ fly_many = jax.jit(jax.vmap(functools.partial(fly, num_steps=80), in_axes=(0, No
 
 
 def filter_path(initial, times, observations, model, *, flight=linear_drag_flight):
-    """Return the Kalman filter's states after N observations (N, 3) [m] at `times` (N,) [s]."""
-
     def advance(state, seen):
         duration, observation = seen
         after = ekf_update(ekf_predict(state, duration, model, flight=flight), observation, model)

@@ -95,7 +95,6 @@ def middle(free):
 
 @pytest.fixture(scope="module")
 def blocked(hits, middle):
-    """Return the hits with a forbidden sphere near the middle of each unconstrained trajectory."""
     centre = middle + np.array([0.0, 0.03, 0.0])
     return having(hits, centre=centre, radius=np.array([0.2, 0.25, 0.15, 0.2]))
 

@@ -27,7 +27,6 @@ fall_and_slope = jax.jit(fall(flight.drag_free_fall_time))
 
 @jax.jit
 def linear_drag_and_rates(ball, duration, drag):
-    """Return a ball's state, and its derivatives by time and by equal drag on all axes."""
     fly_on = functools.partial(linear_drag_flight, gravity=GRAVITY)
     state, in_time = jax.jvp(lambda t: fly_on(ball, t, drag), (duration,), (jnp.ones(()),))
     _, in_drag = jax.jvp(lambda k: fly_on(ball, duration, k), (drag,), (jnp.ones(3),))

@@ -54,7 +54,6 @@ def gaps(poses, walls):
 
 
 def least_length(start, meeting):
-    """Return the least length of Dubins paths to a meeting point over 720 headings there."""
     goals = [rear(meeting, heading) for heading in 2.0 * np.pi * np.arange(720) / 720]
     return dubins_from(start, np.stack(goals)).min()
 

@@ -29,7 +29,6 @@ def numbers(case):
 
 @pytest.fixture(scope="module")
 def study():
-    """Return two serves with tight limits, and a function that differentiates their best plans."""
     with jax.enable_x64(True):
         batch = to_cases(generate_serves(8, 3), delay=0.4, limit_scale=0.7, dtype=jnp.float64)
 

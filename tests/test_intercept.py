@@ -16,7 +16,7 @@ from planner_jax.task.intercept.motion import Quadratic, by_unknowns, motion
 from planner_jax.task.intercept.searches import Search, make_field, make_grid
 from planner_jax.task.intercept.terms import Weights
 
-# A single search, so that a single program is compiled.
+# Planners in these tests make one search, so that only one program is compiled.
 SEARCHES = (Search(12, lattice=Lattice(layers=22)),)
 PLANNER = pj.intercept.planner(searches=SEARCHES)
 START = np.array([0.8, 4.0, 0.3])
@@ -207,7 +207,6 @@ def test_an_unsolvable_case_has_a_status_and_others_are_solved(scenes, name):
 
 
 def widen(obstacles, num, size):
-    """Add absent obstacles at the front, and repeat corners, up to `num` of `size` corners."""
     corners = np.asarray(obstacles.corners)
     more = size - corners.shape[2]
     wide = obstacles.replace(corners=np.concatenate([corners, *[corners[:, :, -1:]] * more], 2))
@@ -231,7 +230,6 @@ def test_absent_obstacles_and_repeated_corners_change_no_plan(planned, scenes):
     ours, theirs = (pj.intercept.judge(each, plans) for each in (wide, cases))
     for name in ("success", "wall_clearance", "mover_clearance"):
         np.testing.assert_array_equal(getattr(ours, name), getattr(theirs, name))
-    # An absent wall has no effect wherever it is.
     batch, expected = scenes
     walls, across = batch.walls, np.array(WALL + WALL[-1:] * 4, np.float32)
     corners = np.where(walls.present[..., None, None], walls.corners, across)

@@ -24,7 +24,7 @@ from planner_jax.task.intercept.searches import Search
 from planner_jax.task.intercept.suites import SIZE
 from tests.trees import as_numpy
 
-# A single search, so that a single program is compiled.
+# Planners in these tests make one search, so that only one program is compiled.
 SEARCH = Search(12, LevenbergConfig(40), lattice=Lattice(layers=22))
 LEGS = SpacetimeIntercept(meet="early", pieces=16, searches=(SEARCH,))
 

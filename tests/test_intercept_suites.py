@@ -32,7 +32,6 @@ def batches():
 
 
 def least_distance(group, points, time=0.0):
-    """Return the distances of points (B, M, 2) from obstacles at one time, by the referee."""
     leaves = {name: getattr(group, name) for name in ("velocity", "corners", "present")}
     leaves["centre"] = group.centre + time * group.velocity
     leaves["velocity"] = 0.0 * group.velocity

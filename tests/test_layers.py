@@ -1,4 +1,4 @@
-"""Imports go downwards: no module imports a package of a later layer."""
+"""No module imports a package that comes later in the list of layers, `LAYERS`."""
 
 import sys
 

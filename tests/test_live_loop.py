@@ -1,4 +1,4 @@
-"""The live loop, from packets with observations to setpoints."""
+"""The live planner, which receives packets with observations and answers with setpoints."""
 
 import re
 import signal

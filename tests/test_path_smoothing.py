@@ -24,8 +24,6 @@ def walls_of(polygons=WALLS):
 
 
 def paths(goals):
-    """Return Dubins paths (B, NUM, 3) at 0.8 of the curvature limit, curvatures and lengths."""
-
     def one(goal):
         path = dubins(jnp.asarray(START), goal, 0.8 * CURVATURE)
         poses = sample_dubins(path, NUM)

@@ -290,7 +290,6 @@ def test_noisy_depth_images_have_the_noise_that_is_asked_for():
 
 
 def views(rng, std, num=12):
-    """Return poses of camera, board and flange, the board's points, and their observations."""
     facing = Rotation.from_matrix(np.asarray(CAMERA.rotation, float)).as_matrix()
     camera = pose(facing, np.asarray(CAMERA.position, float))
     board = pose(Rotation.from_rotvec([0.2, -0.4, 1.0]).as_matrix(), np.array([0.02, 0.05, 0.1]))

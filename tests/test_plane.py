@@ -39,7 +39,6 @@ def test_the_distance_of_a_polygon_is_the_distance_to_its_boundary(float64):
     np.testing.assert_allclose(distance[0][outside], expected, atol=1e-5)
     assert outside.any() and not outside.all()
     np.testing.assert_allclose(np.hypot(*away)[0], 1.0, rtol=1e-6)
-    # An absent polygon is far away, and the direction is the gradient of the distance.
     assert (distance[1] > 100.0).all()
     step = 1e-6
     for axis in range(2):
@@ -172,7 +171,7 @@ def test_a_distance_field_interpolates_distances_and_returns_its_own_derivatives
     np.testing.assert_allclose(far[outside], exact[outside], atol=0.0625**2 / (4.0 * 0.1))
     assert np.all(far >= exact - 1e-3) and np.all(far[exact < -0.1] < 0.0)
     step = 1e-6
-    # Use points inside of cells, because the interpolation has kinks at the borders of cells.
+    # Use points inside the grid's cells, because the slope jumps at the borders of cells.
     inner = np.all(np.abs(np.mod([x / spacing, y / spacing], 1.0) - 0.5) < 0.49, axis=0)
     for slope, (right, up) in zip(slopes, step * np.eye(2), strict=True):
         change = near(x + right, y + up)[0] - near(x - right, y - up)[0]

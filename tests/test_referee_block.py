@@ -45,8 +45,6 @@ def shield(angles):
 
 
 def angles_for(middle, normal):
-    """Return joint angles of a shield pose, with the last joint within 45 degrees of home."""
-
     def off(angles):
         rotation, place = shield(angles)
         return np.concatenate([place - middle, rotation[:, 0] - normal])
@@ -63,10 +61,6 @@ ROTATION = shield(GOAL)[0]
 
 
 def motion(shape, end=GOAL, durations=PIECES, start=HOME):
-    """Return the coefficients (M, D + 1, 6) of a motion from start to end, cut into pieces.
-
-    `shape` holds the coefficients of a polynomial in time / total time.
-    """
     total = sum(durations)
     shifted = np.polynomial.Polynomial(np.array(shape) / total ** np.arange(len(shape)))
     pieces, begin = [], 0.0

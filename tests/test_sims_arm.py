@@ -49,7 +49,6 @@ MOVING = 0.5  # [s], duration of a motion
 
 
 def motion(turn, duration=MOVING, ends_at_rest=True):
-    """Return a motion from home by joint angles (6,) [rad], straight, and as quick as possible."""
     shape = profiles(10, ends_at_rest)[-1]
     steps = jnp.asarray(shape[:, None] * turn, jnp.float32)
     return polynomial(jnp.asarray(HOME), jnp.zeros(6), steps, jnp.float32(duration))
@@ -149,10 +148,6 @@ def test_noise_lag_and_mass_errors_hardly_matter_and_a_seed_gives_the_same_bits(
 
 
 def throw_at_shield(places, speed=8.0):
-    """Return balls that fly straight at the shield of an arm at home, and reach it after 0.5 s.
-
-    `places` (B, 2) [m] are the positions on the shield, relative to its centre.
-    """
     turn, middle = map(np.asarray, shield_pose(irb1600(), jnp.asarray(HOME)))
     goal = middle + np.asarray(places) @ turn[:, 1:].T
     vel = np.tile(-speed * turn[:, 0], (len(places), 1))

@@ -211,7 +211,6 @@ def test_court_and_machine_are_visible_and_touch_nothing(world):
 
 
 def moments(gap_before, gap_after, aside):
-    """Return the states before and after a step: a tool at the origin, a ball above or below it."""
     tool = [jnp.zeros(3)] * 3 + [jnp.array([0.0, 0.0, 1.0])]
     vel = jnp.array([[0.0, 0.0, -5.0]])
     places = (jnp.array([[aside, 0.0, NET.height + gap]]) for gap in (gap_before, gap_after))

@@ -40,7 +40,6 @@ def gap_of(name, bodies):
 
 
 def least_distances(name, bodies):
-    """Compute distances (N,) by bounded least squares over all points of both bodies."""
     results = []
     for pair in zip(*(np.asarray(body, float) for body in bodies), strict=True):
         first, columns = gap_of(name, pair)

@@ -141,7 +141,6 @@ def test_a_serve_drawn_late_that_breaks_a_rule_leaves_nothing_behind(tmp_path):
 
 
 def trial_files(folder, num_rows=3):
-    """Write trial files of scenario NNN: planner bat solves the odd rows, juggle solves none."""
     folder.mkdir(exist_ok=True)
     serve = "2.5 -0.3 2,-4.3 0.02 7.{},-2.9 -0.3 0,1.75 0 0"
     for letter in "pb":

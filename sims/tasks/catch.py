@@ -52,7 +52,7 @@ from planner_jax.task.catch.suites import LAUNCH, draw, earliest_throw
 from planner_jax.task.hit.spec import DRAG  # of hits, since [Yu2023catch] reports none
 
 CATCH_WORLD = World(Quadrotor(PAPER_CATCHER), GRAVITY, mouth=LAUNCH)
-# [s], flight time of a ball before the plan for it starts: over 2 m of path [Yu2023catch, VII-A].
+# [s], time of flight before a ball's plan starts; the ball flies over 2 m [Yu2023catch, VII-A].
 SEEN = 0.3
 _AFTER = 0.05  # [s], simulated time after the end of the last ball's horizon
 

@@ -84,9 +84,9 @@ def predict_case(loop: Loop, flights: FlightState, new: Array, horizon: Array) -
 
 
 def until_last_catch(flight: FlightState, new: Array) -> Array:
-    """Return the time [s] until the last planned catch of a ball outside the mask `new`.
+    """Return the time [s] until the last planned catch of the balls that are not newly seen.
 
-    The time is 0 if no such catch is left.
+    `new` (N,) is true for newly seen balls. The time is 0 if no catch of another ball is left.
     """
     planned = CatchPilot().times(flight.plan) - (flight.time - flight.began)
     return jnp.maximum(jnp.max(jnp.where(flight.present & ~new, planned, 0.0)), 0.0)

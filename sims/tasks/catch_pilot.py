@@ -60,7 +60,7 @@ class CatchPilot:
     def pose_problem(
         self, case: CatchCase, plan: CatchPlan, outlook: Outlook
     ) -> Replanning[CatchCase, CatchPlan]:
-        """Return the problem of replanning the catches of `plan` that are due after `outlook`."""
+        """Return the problem of replanning later catches of `plan` from the predicted `outlook`."""
         made = plan.times <= outlook.elapsed
         first = jnp.argsort(made, stable=True)  # indices of catches, the remaining catches first
         order, times = plan.order[first], plan.times[first] - outlook.elapsed

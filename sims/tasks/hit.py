@@ -47,7 +47,7 @@ from planner_jax.task.hit.replan import ReplanHit
 from planner_jax.task.hit.spec import REAL_SCENARIOS
 from planner_jax.task.hit.suites import DEPTH, SERVE_HEIGHT, generate_serves, to_cases
 
-# [s], flight time of a serve before its first plan starts: over 2 m of path [Yu2023catch, VII-A].
+# [s], time of flight before the first plan starts; a serve flies over 2 m [Yu2023catch, VII-A].
 SEEN = 0.25
 _AFTER = 0.1  # [s], simulated time after the last planned impact
 _LONGEST = 1.9  # [s], duration of the longest flight of a serve

@@ -47,7 +47,7 @@ def plan_at(point, case: MeetCase) -> tuple:
 
 
 def excess(acc: Array, case: MeetCase) -> Array:
-    """Return (2,) |acceleration| / limit - 1 at start and meeting; between them it is not more."""
+    """Return |acceleration| / limit - 1, (2,), at start and meeting; it is convex between them."""
     return jnp.sqrt(jnp.sum(acc**2, axis=1) + 1e-12) / case.most - 1.0
 
 
