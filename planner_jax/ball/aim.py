@@ -1,8 +1,8 @@
 """The initial velocity with which a ball reaches a target in a specified time, and its apex.
 
-The planner of hits computes the ball's return with this module. Custom derivative rules use forward
-mode, since a flight has few inputs: reverse mode would store and retrace every integration step.
-Shapes and units are as in `ball.flight`.
+The planner of hits computes the ball's return with this module. Drag is K_D () [1/m], quadratic in
+the speed; gravity is a magnitude () [m/s^2]; positions are (3,) [m]. Custom rules differentiate the
+velocity and the apex by all arguments in forward mode, which stores no integration steps.
 """
 
 from collections.abc import Sequence

@@ -36,7 +36,7 @@ class PathTable:
     resolution: Array  # () [s], > 0
 
     def at(self, time: Array) -> BallState:
-        """Return position and velocity at one time () [s]; see `target_at`."""
+        """Return position [m] and velocity [m/s] at one time () [s], by cubic convolution."""
         return target_at(self, time)
 
 

@@ -30,9 +30,10 @@ def table_kernel(
 
     Args:
         num_nodes: number N of nodes.
-        moving: indices of 1 velocity, 2 resolution, 3 drag, 4 gravity. If there are any, the kernel
-            returns derivatives by these arguments instead of states: first the derivatives of the
-            nodes' positions, then the derivatives of the nodes' velocities.
+        moving: arguments by which states are differentiated: 1 velocity, 2 resolution, 3 drag, 4
+            gravity; the initial position only shifts a path. If there are any, the kernel returns
+            derivatives instead of states: the positions' derivatives (N, 3) by each argument, or
+            (N, 3, 3) by the velocity, in the order of `moving`, then the velocities' derivatives.
         interpret: run the kernel in Pallas's interpreter, without a GPU, for tests.
     """
 
@@ -53,11 +54,11 @@ def table_kernel(
 class _Direction:
     """One scalar input by which the states at the nodes are differentiated."""
 
-    # Index of the kernel's result that holds the derivatives of positions by this input.
+    # Index of the result array (N, 3) or (N, 3, 3) with derivatives of positions by this input.
     result: int
-    index: tuple[int, ...]  # the input's index on the last axis of this result; () for a scalar
+    index: tuple[int, ...]  # component of the velocity (last axis of the array); () for a scalar
     vel: tuple[float, ...]  # (3,) tangent of the velocity at time 0
-    numbers: tuple[float, ...]  # (3,) tangent of resolution, drag and gravity
+    numbers: tuple[float, ...]  # (3,) tangent: of the scalars resolution, drag and gravity
 
 
 def _directions(moving: tuple[int, ...]) -> list[_Direction]:

@@ -117,7 +117,6 @@ def _evaluate(times: np.ndarray, values: list[PyTree], at: np.ndarray, order: in
 
 
 def _fewest_nodes(times: np.ndarray, values: list[PyTree], error: float) -> int:
-    """Return the least of 16, 32, 64, ... nodes with which a table keeps the bound `error` [m]."""
     if any(isinstance(value, Tracer) for value in values):
         raise ArgumentError("nodes", "passed if positions are traced", shown="none")
     require_number("error", error, POSITIVE)

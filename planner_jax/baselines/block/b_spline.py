@@ -117,12 +117,10 @@ def _spans(degree: int, num: int) -> int:
 
 
 def _knots(degree: int, spans: int) -> np.ndarray:
-    """Return the knots 0, 1, ..., `spans`; the first and the last occur degree + 1 times."""
     return np.clip(np.arange(spans + 2 * degree + 1) - degree, 0, spans)
 
 
 def _basis(degree: int, num: int, place: np.ndarray) -> np.ndarray:
-    """Return the values (..., num) of all basis functions at positions (...) in knot spans."""
     spans = num - degree
     knots = _knots(degree, spans)
     span = np.minimum(np.floor(place), spans - 1)  # the last span includes its end

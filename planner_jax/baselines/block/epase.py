@@ -46,7 +46,7 @@ class State:
 
 
 class OpenStates:
-    """The unexpanded states, sorted by path length + weight * distance to the goal, in rad."""
+    """Unexpanded states of weighted A*, by path length + weight * distance to the goal [rad]."""
 
     def __init__(self, start: State, goal: np.ndarray, weight: float) -> None:
         self._goal, self._weight = goal, weight
@@ -55,7 +55,7 @@ class OpenStates:
         self._lengths, self._closed = {_cell_of(start.angles): 0.0}, set()
 
     def pop(self) -> State | None:
-        """Remove and return the cheapest state in a cell without an expanded state, or None."""
+        """Remove and return the first state of the order whose grid cell has no expanded state."""
         while self._states:
             state = heapq.heappop(self._states)[2]
             if (cell := _cell_of(state.angles)) not in self._closed:
@@ -64,7 +64,7 @@ class OpenStates:
         return None
 
     def steps_from(self, state: State) -> list[State]:
-        """Return a state's neighbours, except in grid cells expanded or with a shorter path."""
+        """Return neighbours in unexpanded grid cells to which no path as short is known."""
         neighbours = state.angles + STEPS
         lengths = state.length + np.linalg.norm(neighbours - state.angles, axis=1)
         return [
@@ -88,7 +88,7 @@ def _cell_of(angles: np.ndarray) -> tuple[int, ...]:
 
 @dataclasses.dataclass(frozen=True)
 class EpaseBlock(PathThenTime):
-    """The planner `epase`: weighted A* to poses that meet the ball; needs the extra `arm-peers`."""
+    """The planner `epase`: weighted A* to poses that meet the ball; needs pip extra `arm-peers`."""
 
     # [s], longest search for one end pose. Few searches that take longer succeed.
     longest: float = 0.05

@@ -93,9 +93,10 @@ class InsatBlock(PoseByPose):
     def motion_to(
         self, case: BlockCase, free: FreeSpace, goal: Goal, left: Clock
     ) -> HostMotion | None:
-        """Return the first collision-free motion along a spline that precedes the ball, or None.
+        """Return the first collision-free spline to the goal that the search finds, or None.
 
-        `free` checks collisions, and `left` returns the remaining search time [s].
+        It lasts at most `goal.available` [s], so that the arm is there before the ball. `free`
+        checks collisions, and `left` returns the remaining search time [s].
         """
         start = np.asarray(case.angles, float)
         first = State(start, 0.0, spline=start[None])
@@ -114,7 +115,7 @@ class InsatBlock(PoseByPose):
         return None
 
     def lift(self, case: BlockCase, free: FreeSpace, goal: Goal, state: State) -> bool:
-        """Store in a state its cheapest collision-free spline; return False if there is none."""
+        """Store in `state` the best spline from the start to it; return False if there is none."""
         found = self.best_spline(case, free, goal, state, rests=False)
         if found is None:
             return False
@@ -126,9 +127,9 @@ class InsatBlock(PoseByPose):
     ) -> tuple[np.ndarray, float, float, np.ndarray] | None:
         """Return the cheapest collision-free spline from the start to a state, or None.
 
-        The cost is [Natarajan2024, eq. 4a]; the spline lasts at most `goal.available` [s]. Each
-        candidate extends the spline of one of the state's ancestors. If `rests` is True, the arm
-        must stand still at the end.
+        The cost is (duration [s]) + 0.1 (length [rad]), as in [Natarajan2024, eq. 4a]. A spline
+        lasts at most `goal.available` [s]. Each candidate extends the spline of one ancestor of the
+        state. If `rests` is True, the arm must stand still at the end.
 
         Returns:
             The spline's control points (m, 6) [rad], its duration [s], its length [rad] and its
@@ -209,7 +210,7 @@ def _optimise(
     bounds: Bounds,
     config: lbfgs.LbfgsConfig,
 ) -> Splines:
-    """Minimise [Natarajan2024, eq. 4a] for A splines between two poses; return all iterates.
+    """Minimise duration + 0.1 * length of A splines between two poses; return all K iterates.
 
     Args:
         start: (6,) [rad], joint angles at the start.

@@ -89,10 +89,6 @@ def time_path(
 
 
 def _grid(knots: np.ndarray) -> np.ndarray:
-    """Return up to `PIECES` + 1 positions along a path, at nearly equal distances.
-
-    Each span between two neighbouring `knots` is divided into equal parts.
-    """
     spans = np.diff(knots)
     parts = 1 + np.floor((PIECES - len(spans)) * spans / spans.sum()).astype(int)
     cut = [knots[k] + spans[k] * np.arange(count) / count for k, count in enumerate(parts)]

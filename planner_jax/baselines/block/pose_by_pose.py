@@ -81,7 +81,7 @@ class PoseByPose(Planner, abc.ABC):
     def motion_to(
         self, case: BlockCase, free: FreeSpace, goal: Goal, left: Clock
     ) -> HostMotion | None:
-        """Return a collision-free motion to one end pose, or None if none is found in time.
+        """Return a collision-free motion to one end pose, or None if the search time ends.
 
         `free` checks collisions, and `left` returns the remaining search time [s].
         """
@@ -92,7 +92,7 @@ class PoseByPose(Planner, abc.ABC):
         return jax.tree.map(lambda *leaves: np.stack(leaves), *plans)
 
     def plan_of(self, case: BlockCase) -> BlockPlan:
-        """Return one case's plan: the first motion before the ball, else the least late motion."""
+        """Return one case's plan: the first motion that is in time, else the least late motion."""
         hopeless, angles, contacts, shares = (np.asarray(x) for x in _list_goals(case, self.points))
         if hopeless != Status.NO_PATH:
             return self._plan(case, Status(int(hopeless)))
@@ -157,7 +157,7 @@ def _list_goals(case: BlockCase, points: int) -> tuple[Array, Array, Array, Arra
     """Return C end poses of a case, eight for each point of the ball's trajectory.
 
     Returns:
-        status: () int32, NO_PATH if a plan is possible, else the reason why none exists.
+        status: () int32, NO_PATH (the status until a path is found), or why no plan can exist.
         angles: (C, 6) [rad], joint angles of the end poses.
         contact: (C,) [s], when the ball arrives at each pose.
         share: (C,), (duration of a bang-bang motion) / (time until the ball arrives); infinite if

@@ -23,7 +23,6 @@ _SEED = 1  # seed of OMPL's random generator, set once per process
 
 @functools.cache
 def _ompl() -> tuple[ModuleType, ModuleType]:
-    """Import OMPL's modules `base` and `geometric`, silence its log and seed its generator."""
     util = import_extra("ompl.util")
     util.setLogLevel(util.LOG_ERROR)
     util.RNG.setSeed(_SEED)

@@ -89,18 +89,14 @@ class MppCatch(Planner):
     - [Yu2023catch, eq. 25]: the net must face the target. Every sampled acceleration turns the net
       towards the target.
     - Assumptions, since the paper does not report them: the sampled values; the height of 1.2 m,
-      about the height of the net at the start; the ramp of `minimum_jerk_after_ramp`, without
-      which the body rate would jump at time 0 and after every catch. Several targets are caught in
-      the case's order.
+      about the height of the net at the start; a linear change of the jerk during the first 0.02 s
+      of each segment, without which the body rate would jump. Several targets are caught in the
+      case's order.
 
-    Success on two suites (families of random cases) depends on the height of the catches:
-
-        height [m]                                       0.8    1.2    1.9
-        `throws`, one ball [%]                            99   ~ 80     68
-        `hard`, one ball that is seen later [%]           51   ~ 40     27
-
-    Failures exceed the body rate limit. In the paper this planner succeeds on 14 % of the throws;
-    the paper reports neither the limits nor the height.
+    Success on the suite `throws` (random throws of one ball) is 99, some 80 and 68 % for catches at
+    0.8, 1.2 and 1.9 m. On the suite `hard`, with less time, it is 51, some 40 and 27 %. Failures
+    exceed the body rate limit. In the paper this planner succeeds on 14 % of the throws; the paper
+    reports neither the limits nor the height.
 
     A case is unsolved if a target does not fall through the height in time, or if it does so
     before the previous target.
@@ -163,10 +159,11 @@ class MppCatch(Planner):
         )
 
     def times(self, context: CatchContext) -> tuple[Array, Array]:
-        """Return increasing catching times (N,) [s] of N targets, and excesses (N,), <= 0 if valid.
+        """Return increasing catching times (N,) [s] of N targets, and numbers (N,) > 0 if invalid.
 
-        A time is valid if the target falls through the height then, after the previous target.
-        Targets that are absent from the case come last and have the time of the last catch.
+        A time is valid if the target falls through the height `self.height` then, later than the
+        previous target. The number is the missing time [s] between the two falls, or 1 if the
+        target does not fall. Absent targets come last and have the time of the last catch.
         """
         height = jnp.asarray(self.height, context.horizon.dtype)
         find = lambda target, end: falling_time(target, height, end, self.time_nodes)  # noqa: E731

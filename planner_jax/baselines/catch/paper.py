@@ -94,8 +94,8 @@ class Catch:
     durations: Array  # (N,) [s], durations of the segments that end with a catch
     tail_states: Array  # (N, 4, 3), position to jerk of the quadrotor at the catches
     miss: Array  # (N,) [m], distance from the net's centre to the ball
-    # (N,), cosine of the greatest angle minus cosine of the angle between the net's axis and the
-    # reversed ball velocity; <= 0 if the net faces the ball.
+    # (N,), cos(greatest permitted angle) - cos(angle between the net's axis and the reversed ball
+    # velocity); <= 0 if the net faces the ball.
     angle_excess: Array
 
 
@@ -229,7 +229,6 @@ class PaperCatch(OptimisedPlanner):
         )
 
     def _unpack(self, point: Array, context: CatchContext) -> tuple[Chain, Catch]:
-        """Return the segments and the catches that a vector of decision variables describes."""
         scale = jnp.asarray(self.scale, point.dtype)
         natural = point.reshape(-1, scale.size) * scale[None]
         catch = self.catches(natural[:, self.num_offsets :], context)
@@ -258,7 +257,7 @@ class PaperCatch(OptimisedPlanner):
         )
 
     def objective(self, point: Array, context: CatchContext) -> Evaluation:
-        """Return the cost [Yu2023catch, eqs 18-28] of variables `point`, divided by `COST_UNIT`.
+        """Return the sum of snap, time and penalties [Yu2023catch, eqs 18-28] over `COST_UNIT`.
 
         The reported violation is always zero, so that the solver does not prefer iterates that keep
         the limits, and returns its last iterate.

@@ -39,9 +39,9 @@ _ORDER = 4  # derivative whose square is minimised: snap
 _COST_UNIT = 1e4  # divisor of the cost, so that the Hessian has moderate entries
 _DECODE_NODES = 24  # number of samples per piece at which the plan's violation is evaluated
 
-# Fractions alpha, eta, phi of [Yu2023bat, Section VI-A], used by `transition_point`. The paper does
-# not define phi. Here the point at fraction phi from the ball's origin to its target lies on the
-# line along which the racket swings.
+# Fractions in `transition_point` [Yu2023bat, Section VI-A]: alpha from the quadrotor's start to the
+# hit; phi from the ball's origin to its target (an assumption, since the paper does not define
+# phi); eta from the line through hit and phi's point to alpha's point.
 _ALPHA, _ETA, _PHI = 0.5, 2.0 / 3.0, 0.5
 _SLOWING = np.array([0.5, 0.5, 1.0 / 3.0])  # (velocity at transition) / (velocity at hit), x, y, z
 _ACCELERATION_SHARE = 2.0 / 3.0  # (acceleration at transition) / (acceleration at hit)
@@ -188,7 +188,7 @@ class BatHit(OptimisedPlanner):
         return 3 * (self.num_pieces - 1)
 
     def prepare(self, case: HitCase) -> HitContext:
-        """Tabulate the incoming ball's trajectory of a case by `prepare_hit`."""
+        """Tabulate the incoming ball's positions and velocities at equal time steps."""
         return prepare_hit(case, self.num_table_nodes)
 
     def impact(self, natural: Array, context: HitContext) -> tuple[Impact, Array]:
@@ -208,7 +208,7 @@ class BatHit(OptimisedPlanner):
         return impact, hit.defect
 
     def guesses(self, context: HitContext, num: int) -> Array:
-        """Return the initial guess (1, n) of the variables, by [Yu2023bat, Section VI-A]."""
+        """Return the initial guess (1, n), a minimum-jerk motion [Yu2023bat, Section VI-A]."""
         require(num == 1, "starts", "1", num)
         case, dtype = context.case, context.landing_time.dtype
         stages = self.stage_times if self.transition else self.stage_times[:1]
@@ -264,7 +264,6 @@ class BatHit(OptimisedPlanner):
         return offsets, rows, duration, impact, defect
 
     def _terminal_penalty(self, impact: Impact, defect: Array, case: HitCase) -> Array:
-        """Return the penalty on apex, hitting speed, defect [Yu2023bat, eqs 21, 24a and 13-14]."""
         limits = case.hit_limits
         excess = jnp.concatenate(
             [
@@ -290,7 +289,7 @@ class BatHit(OptimisedPlanner):
         return self.limit_weight * duration * jnp.sum(hinges * weights[None])
 
     def objective(self, point: Array, context: HitContext) -> Evaluation:
-        """Return the cost [Yu2023bat, eq. 20] of the variables `point`, divided by `_COST_UNIT`.
+        """Return the sum of snap, time and penalties [Yu2023bat, eq. 20], over `_COST_UNIT`.
 
         The reported violation is always zero, so that the solver does not prefer iterates that keep
         the limits, and returns its last iterate.

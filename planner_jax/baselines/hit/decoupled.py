@@ -19,7 +19,7 @@ _LEAST_PUSH = 1e-3  # [s], least (change of the ball's velocity) / thrust
 
 @struct.dataclass
 class DecoupledHit:
-    """The solution of [Yu2023bat, eqs 13-14] for given racket velocity y, z and thrust x, z."""
+    """A hit with given racket velocity y, z and thrust x, z, by [Yu2023bat, eqs 13-14]."""
 
     ball_vel_after: Array  # (3,) [m/s], velocity of the ball after the impact
     flight_time: Array  # () [s], of the ball from the impact to the target

@@ -66,7 +66,7 @@ class JuggleHit(Planner):
     - The published trials: at every recorded hit the quadrotor's horizontal velocity is zero, and
       its height is 1.43 to 1.50 m. The ball's apex after the hit is 2.3 m in the median, computed
       from attitude and target without drag.
-    - Assumption: the ramp of `minimum_jerk_after_ramp`; without it the body rate jumps at time 0.
+    - Assumption: the jerk changes linearly for 0.02 s, or else the body rate would jump at time 0.
 
     With the coefficient of restitution 0.7 of [Yu2023bat] this planner succeeds on two of three
     serves, and the published planner on one of ten. The recorded hits imply a coefficient near

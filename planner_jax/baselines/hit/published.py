@@ -26,7 +26,8 @@ _SERVE_COLUMNS = ("serve position", "serve velocity", "landing position", "targe
 _HIT_COLUMNS = (("hitting position", 3), ("hitting velocity", 3), ("hitting attitude", 4))
 _LISTED = 5  # greatest number of problems that an error message lists
 
-# Line number -> `Trial.numbers` and whether the serve was solved; None if parsing failed.
+# Line number -> 12 numbers of a serve (`Trial.numbers`: positions, velocity, target), and whether
+# the planner solved it; None if parsing failed.
 _Table: TypeAlias = dict[int, tuple[list[float], bool] | None]
 
 
@@ -72,7 +73,6 @@ def read_serves(folder: str | os.PathLike) -> Serves:
 
 
 def _find_trial_files(folder) -> dict[int, dict[str, Path]]:
-    """Return paths of trial files by scenario index, then by the planner's letter in the name."""
     folder = Path(folder)
     require(folder.is_dir(), "serves", "an existing folder", str(folder))
     files: dict[int, dict[str, Path]] = {}
@@ -141,7 +141,6 @@ def _vector(name: str, cell: str, size: int) -> list[float]:
 def _merge(
     scenario: int, paths: dict[str, Path], tables: dict[str, _Table], problems: list[str]
 ) -> list[Trial]:
-    """Merge the files of all planners for one scenario; append a problem if serves differ."""
     trials = []
     for line in sorted(set().union(*tables.values())):
         present = [letter for letter, table in tables.items() if line in table]
@@ -185,7 +184,7 @@ def _list_out_of_play(trials: list[Trial]) -> list[str]:
 class PublishedRates:
     """Published success rates in percent, one row per court scenario, one column per planner.
 
-    The paper and its trial files differ by up to 20 points.
+    The paper and its trial files differ by up to 20 percentage points.
     """
 
     paper: np.ndarray  # (36, 3) [%], Table I of the paper

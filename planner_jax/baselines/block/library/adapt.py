@@ -40,8 +40,8 @@ _HIGHEST = lax.Precision.HIGHEST
 # Weights of the squared changes of six joint angles of a stored motion. The wrist joints have low
 # weights, since they carry little mass; the last joint keeps its stored angles.
 _WEIGHTS = np.array([1.0, 1.0, 1.0, 0.3, 0.3, 0.0])
-# [rad^2], penalty weight of the squared distance between the ball and the cells (rectangles on two
-# boxes around the arm) for which a motion was stored, in cell sizes.
+# [rad^2], weight of (distance / cell size)^2, from the point where the ball enters a box to the
+# centre of the cell (rectangle on the box) for which a motion was stored; summed over two boxes.
 _AWAY = 0.02
 _LATE = 10.0  # [rad^2], penalty of a relative excess of 1 over a joint limit
 _NEAR = 30.0  # [rad^2/m], penalty per metre that the distance from the pole is too small
@@ -65,11 +65,12 @@ class Effort(Attempt):
 
 @struct.dataclass
 class Warped:
-    """C stored motions, warped to meet the given ball; sorted by penalty, the smallest first."""
+    """C stored motions, warped to meet the given ball, in the order in which they are checked."""
 
     # (C, 6 K + 1): rates of 6 joints at K knots, times the duration [rad]; then contact time [s].
     points: Array
-    penalty: Array  # (C,) [rad^2], squared warp plus penalties; infinite without a stored motion
+    # (C,) [rad^2], squared change of the end pose, plus penalties; infinite if none is stored.
+    penalty: Array
     is_open: Array  # (C,) bool, whether joint limits and the least pole distance are kept
 
 
@@ -109,7 +110,7 @@ class AdaptBlock(Planner):
         self.stored.check(cases)
 
     def solve(self, case: BlockCase, attempt: Effort) -> BlockPlan:
-        """Return the plan of one case: the first motion that can be warped to meet the ball."""
+        """Return one case's plan: the first warped, else refined motion that keeps all limits."""
         flight = flight_of(case)
         home, fits = self.stored.home_of(case)
         poses = end_poses(case, flight, attempt.points, self.online.pieces)

@@ -46,12 +46,13 @@ from planner_jax.task.block.default_planner import OnlineBlock, read_learned_sta
 from planner_jax.task.block.motion import angles_at
 from planner_jax.task.block.scene import Scene
 
-# Indices of stored initial guesses (starts) of the least squares. A build tries `STARTS` for pairs
-# of cells (one on each of two boxes) that have a motion already, and all stored guesses for pairs
-# without a motion. Planning again after an obstacle has moved (`repair`) starts from the old motion
-# and from `REPAIR_STARTS`.
+# Indices of initial guesses of the least squares (file `learned_starts.json`), in the order of use.
+# For pairs of cells with a motion, a build tries `STARTS`, which may find one that blocks earlier
+# balls; for pairs without a motion it tries all guesses. A repair after an obstacle has moved
+# starts from the old motion and from `REPAIR_STARTS`.
 STARTS, REPAIR_STARTS = (2, 0, 1, 3, 4, 5), (2,)
-_WORTH = 0.03  # [s], a motion is improved only if the ball might come at least this much earlier
+# [s] A motion is improved if, without obstacles, the arm could block a ball this much earlier.
+_WORTH = 0.03
 _CHECKED_AT_ONCE = 1024  # number of stored motions whose distances are computed in one batch
 
 
@@ -73,11 +74,11 @@ _FEW = 6  # number of planner calls of the small size that take as long as one o
 
 @dataclasses.dataclass(frozen=True)
 class _Motions:
-    """For P pairs of cells, the motions found so far that can block the earliest ball."""
+    """The best motions found so far for P pairs of cells: they block balls that come earliest."""
 
     # (P, 6 K + 1): rates of 6 joints at K knots, times the duration [rad]; then the duration [s].
     point: np.ndarray
-    # (P,) [s], earliest time at which a ball may enter the outer box; infinite without a motion.
+    # (P,) [s], earliest entry into the outer box of a ball that the motion blocks; or infinite.
     entry: np.ndarray
     quickest: np.ndarray  # (P,) [s], earliest entry if there were no obstacles
 
@@ -195,10 +196,9 @@ def plan_pairs(
     """Plan motions from one start pose for N pairs of cells; return rows of the library's table.
 
     A pair is one cell on each of the two boxes around the arm. `StraightPair` tries motions in
-    which all joints move in proportion. For pairs without a motion, and pairs in which an earlier
-    ball might be blocked, `BentPair` then bends motions around obstacles, from one initial guess
-    after another. For pairs that still have no motion, both steps are repeated with the wider
-    tolerance `COARSE`.
+    which all joints move in proportion. `BentPair` then bends motions around obstacles, for pairs
+    without a motion, or whose motion blocks only balls that come 0.03 s later than without
+    obstacles. Pairs that still have no motion get both steps again, with less accurate contacts.
 
     Args:
         setting: arm, limits and scene, with NumPy leaves.

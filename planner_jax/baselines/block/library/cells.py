@@ -79,9 +79,9 @@ def _faces(names: str, cells: tuple[int, int]) -> tuple[Face, ...]:
     )
 
 
-# Divisions of both boxes around the arm into cells. A, B and C have 5,760 pairs of cells, as the
-# code of [Natarajan2024]. D has cells on all sides that balls from ahead can reach. The default
-# "full" also has cells on the top of the outer box, for lobbed balls.
+# Faces of the outer, then the inner box (+x is its front), with numbers of cells along the other
+# two axes, in the order x, y, z. A, B and C have 5,760 pairs of cells, as the code of
+# [Natarajan2024]. The default "full" has cells on the outer top, too, for lobbed balls.
 LAYOUTS = {
     "full": Layout(_faces("+x +y -y +z", (8, 8)), _faces("+x +y -y", (4, 7))),
     "A": Layout(_faces("+x +y -y", (8, 8)), _faces("+x +z", (3, 5))),
@@ -94,8 +94,8 @@ LAYOUTS = {
 def cell_of(faces: tuple[Face, ...], box: Box, point: Sequence[Array]) -> tuple[Array, Array]:
     """Return the cell that contains a point of a box's surface.
 
-    A point on an edge of the box belongs to the face whose normal is the first axis. A point on the
-    border of two cells belongs to the cell with the greater coordinate.
+    A point on an edge of the box belongs to the face whose normal is first in the order x, y, z. A
+    point on the border of two cells belongs to the cell with the greater coordinate.
 
     Args:
         faces: the faces of the box that are divided into cells.

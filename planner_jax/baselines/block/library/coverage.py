@@ -33,7 +33,8 @@ class Coverage:
     """Which motions a library has, from H start poses, for P pairs of cells on two boxes."""
 
     is_feasible: np.ndarray  # (P,) bool, whether a ball can pass through both cells
-    is_centred: np.ndarray  # (P,) bool, whether a ball can pass from the outer cell's centre
+    # (P,) bool, whether a ball through the outer cell's centre can pass the inner cell, too.
+    is_centred: np.ndarray
     found: np.ndarray  # (H, P) bool, whether a motion is stored
     # (H, P) bool, whether the shield at the end of the motion blocks all balls through both cells.
     is_sure: np.ndarray
@@ -61,8 +62,6 @@ def coverage(library: Library) -> Coverage:
 
 @jax.jit
 def _farthest(outer: Array, inner: Array, row: Row) -> Array:
-    """Return how far [m] from a shield's centre balls of each pair can cross its plane, (H, P)."""
-
     def one(outer: Array, inner: Array, row: Row) -> Array:
         sides = [row.normal, row.edge, jnp.cross(row.normal, row.edge)]
         return farthest_crossing(outer, inner, jnp.asarray(row.middle), jnp.stack(sides, axis=1))
@@ -73,7 +72,7 @@ def _farthest(outer: Array, inner: Array, row: Row) -> Array:
 
 @dataclasses.dataclass(frozen=True)
 class Check:
-    """B random balls through pairs of cells with a stored motion, and an independent verdict."""
+    """B random balls through pairs of cells with a stored motion, and the referee's verdicts."""
 
     cases: BlockCase
     pairs: np.ndarray  # (B,) int, index of the pair of cells that each ball passes

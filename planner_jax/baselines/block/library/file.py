@@ -112,7 +112,6 @@ def load_library(path: str | os.PathLike) -> Library:
 
 
 def _map_library(path: str | os.PathLike, header: dict[str, PyTree]) -> Library:
-    """Return the library that the header of a file describes, with memory-mapped motions."""
     arrays: dict[str, PyTree] = {}
     for name, (kind, shape, place) in header["arrays"].items():
         mapped = np.memmap(path, kind, "r", place, tuple(shape) or (1,))

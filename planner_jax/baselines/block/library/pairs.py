@@ -41,7 +41,8 @@ from planner_jax.task.block.motion import angles_at, bump_steps, step_weights
 # direction and shield normal, at the end of a stored motion. COARSE applies if no motion keeps FINE
 # (2 mm, 0.5 degrees), since a shield that blocks some balls is better than no shield.
 FINE, COARSE = STRICT, (0.08, np.deg2rad(20.0))
-# [s], longest time by which obstacles may delay a ball's entry into the outer box around the arm.
+# [s], how much later than without obstacles a ball may come; if not even this ball can be blocked,
+# no motion is stored for the two cells through which it flies.
 _PATIENCE = 0.8
 # [rad], greatest angle of the shield's edge from horizontal, if it must block all possible balls.
 _ROLL = np.deg2rad(1.0)
@@ -59,7 +60,7 @@ class PairCase:
 
     outer: Array  # (2, 3) [m], corners of the outer cell's part in front of the inner cell
     inner: Array  # (2, 3) [m], corners of the inner cell
-    is_coarse: Array  # () bool, whether blocking some balls of the pair suffices
+    is_coarse: Array  # () bool, whether blocking some balls through both cells suffices
     best: Array  # () [s], earliest entry into the outer box so far; infinite if none
     start: Array  # () int32, index of a stored initial guess; -1 selects the guess `given`
     # (6 K + 1,): rates of 6 joints at K knots, times the duration [rad]; then the duration [s].
@@ -100,7 +101,7 @@ class PairPlanner(Planner):
     is_sequential: ClassVar[bool] = True
 
     def case_of(self, pair: PairCase, entry: Array) -> tuple[BlockCase, Flight]:
-        """Return the case of a ball that enters the outer box at `entry`, and when to block it."""
+        """Return the case of a ball that enters the outer box at `entry` [s], and contact times."""
         ball, span = nominal_ball(pair.outer, pair.inner)
         gravity = jnp.asarray(GRAVITY, span.dtype)
         case = BlockCase(
@@ -126,10 +127,10 @@ class PairPlanner(Planner):
 
         Returns:
             End poses. Their `time` [s] is the duration of the quickest motion with all joints in
-            proportion. Their `effort` [s] is the time at which the ball may enter the outer box so
-            that this motion blocks it. The effort is `_TOUCHING` greater if the arm touches
-            something in this pose, and infinite if the pose does not exist or does not block as
-            required.
+            proportion. Their `effort`, by which poses are sorted, is the time [s] at which the ball
+            may enter the outer box so that this motion blocks it. It is `_TOUCHING` greater if the
+            arm touches something in this pose, and infinite if the pose does not exist or balls
+            through both cells can miss the shield.
         """
         online, arm, limits = self.online, self.setting.arm, self.setting.limits
         ball, span = nominal_ball(pair.outer, pair.inner)
@@ -168,11 +169,10 @@ class PairPlanner(Planner):
         )
 
     def model(self, pair: PairCase, point: Array, case: BlockCase, flight: Flight) -> Model:
-        """Return the quadratic model of a motion's cost and violation, for the least squares.
+        """Return a quadratic model of the cost at `point`, encoded as `PairPlan.point`.
 
-        The model is `OnlineBlock.model` plus a cost of the shield's roll, the angle modulo quarter
-        turns between its edge and the horizontal. The roll has no cost if blocking some balls
-        that pass the two cells suffices (`is_coarse`).
+        The cost is the planner `online`'s, plus the square of the roll: the angle [rad] of the
+        square shield's nearest edge from horizontal. With `is_coarse` the roll has no cost.
         """
         online = self.online
         model = online.model(point, case, flight)
@@ -200,8 +200,9 @@ class PairPlanner(Planner):
     def plan_at(self, pair: PairCase, point: Array, entry: Array, steps: Array) -> PairPlan:
         """Return the plan of the motion `point` (6 K + 1,), encoded as `PairPlan.point`.
 
-        The ball enters the outer box at time `entry` () [s]. The plan's violation includes balls
-        that pass the pair's two cells but would miss the shield. `steps` are its `iterations`.
+        The ball enters the outer box at time `entry` () [s]. Balls through both cells cross the
+        shield's plane at most a distance d from its centre; d / (half its edge) - 1 counts as a
+        violation. `steps` is the plan's number of solver iterations.
         """
         case, flight = self.case_of(pair, entry)
         plan = self.online.finish(case, flight, point, steps)
@@ -233,7 +234,7 @@ class StraightPair(PairPlanner):
         return (Attempt(),)
 
     def solve(self, pair: PairCase, attempt: Attempt) -> PairPlan:
-        """Return the plan of one pair of cells: the first straight motion that keeps all limits."""
+        """Return the plan of a pair of cells: the best straight motion that keeps all limits."""
         poses = self.poses(pair)
         order = jnp.argsort(poses.effort)
         possible = jnp.sum(poses.effort < 0.5 * _TOUCHING)
@@ -276,7 +277,7 @@ def _entry(effort: Array) -> Array:
 
 @dataclasses.dataclass(frozen=True)
 class Bends(Attempt):
-    """An attempt: least-squares searches (rounds), each for a ball that comes at another time."""
+    """An attempt: a bisection of the ball's entry time, with least squares for each time."""
 
     rounds: int = 4
     solver: LevenbergConfig = LevenbergConfig(
@@ -298,11 +299,11 @@ class BentPair(PairPlanner):
 
     @property
     def attempts(self) -> tuple[Bends, ...]:
-        """The only attempt: a bisection of the ball's entry time, with the settings of `search`."""
+        """The only attempt: the bisection that the field `search` describes."""
         return (self.search,)
 
     def solve(self, pair: PairCase, attempt: Bends) -> PairPlan:
-        """Return the plan of one pair of cells: the motion of the last successful search."""
+        """Return the plan of a pair of cells: the motion found for the ball that comes earliest."""
         online, dtype = self.online, pair.best.dtype
         poses = self.poses(pair)
         order = jnp.argsort(poses.effort)

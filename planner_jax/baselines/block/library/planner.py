@@ -110,7 +110,6 @@ def library_planner(file: str | os.PathLike) -> LibraryBlock:
 
 
 def _plan_from_answer(table: Table, case: BlockCase, home: Array) -> BlockPlan:
-    """Return the plan of a case whose arm stands at start pose `home`, by a lookup in the table."""
     answer = lookup(table, case.ball, case.gravity, home)
     row, stored = answer.row, answer.stored
     dtype = case.angles.dtype

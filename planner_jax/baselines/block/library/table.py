@@ -104,7 +104,7 @@ def unpack_rows(values: Array | np.ndarray) -> Row:
 
 
 class Answer(NamedTuple):
-    """The table's entry for a ball, and where the ball crosses the plane of the shield."""
+    """The motion stored for a ball, and where the ball crosses the plane of the shield."""
 
     row: Row
     pair: Array | int  # () int32, number of the pair of cells; 0 without a pair
