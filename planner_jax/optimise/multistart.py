@@ -160,7 +160,7 @@ def _optimum_at(point: Array, evaluation: Evaluation, config: Solver) -> Optimum
 
 
 def solve_round(planner: "OptimisedPlanner", attempt: Round, case: PyTree) -> PyTree:
-    """Plan one case by a round's searches, each from the end of the search before it; pure."""
+    """Plan one case by one attempt (round): searches, each from the end of the one before it."""
     last = planner.with_settings(attempt.settings)
     context = last.prepare(case)
 
@@ -181,7 +181,7 @@ def solve_round(planner: "OptimisedPlanner", attempt: Round, case: PyTree) -> Py
 
 
 def solve_batch(planner: "OptimisedPlanner", attempt: Round, cases: PyTree) -> PyTree:
-    """Plan a batch by a round's searches, each from the end of the search before it; pure."""
+    """Plan a batch by one attempt (round): searches, each from the end of the one before it."""
     last = planner.with_settings(attempt.settings)
     contexts = over_lanes(last.prepare)(_lanes_last(cases))
     first = planner.with_settings(attempt.all_stages[0].settings)
@@ -258,12 +258,12 @@ def divide_round(
     attempt: Round,
     cases: PyTree,
 ) -> PyTree:
-    """Return each case's best plan over all searches of one round (attempt), for a batch.
+    """Return each case's best plan over all starting points of an attempt (round), for a batch.
 
-    The arrays may be NumPy's or JAX's. `search` runs one stage of L searches and returns the end
-    points (L, n) and the plans at these points. It takes the stage and the three fields of
-    `Searches`: cases with leaves (L, ...), indices (L,) and points (L, n) of the starts. In the
-    first stage the points are None.
+    An attempt has one or more stages, which search in turn from every starting point. `search` runs
+    one stage of L searches and returns the end points (L, n) and the plans at these points. It
+    takes the stage, cases with leaves (L, ...), indices (L,) of the starts among the guesses, and
+    starting points (L, n), None in the first stage. The arrays may be NumPy's or JAX's.
     """
     xp = numpy_of(*jax.tree.leaves(cases))
     size, num = len(jax.tree.leaves(cases)[0]), attempt.starts

@@ -99,7 +99,7 @@ class OptimisedPlanner(Planner[CaseT, PlanT], abc.ABC):
     def decode(self, point: Array, context: PyTree) -> PyTree:
         """Return the plan at a point (n,), with a more exact violation than in `objective`.
 
-        The solver sets the plan's `cost`, `iterations` and `status` afterwards; see `pending`.
+        The solver sets the plan's `cost`, `iterations` and `status` afterwards.
         """
 
     def rules_out(self, context: PyTree) -> Array:
@@ -116,7 +116,7 @@ class OptimisedPlanner(Planner[CaseT, PlanT], abc.ABC):
 
     @property
     def attempts(self) -> tuple[Round, ...]:
-        """The rounds (attempts) of the planner, in order."""
+        """The planner's rounds: attempts at a case, in order, until one attempt solves it."""
         return self.rounds
 
     def load_attempt(self, attempt: Round, cases: PyTree) -> PyTree:
@@ -127,14 +127,14 @@ class OptimisedPlanner(Planner[CaseT, PlanT], abc.ABC):
         return load_round(attempt, jax.default_backend() != "cpu")
 
     def solve(self, case: PyTree, attempt: Round) -> PyTree:
-        """Return the plan that one round (attempt) finds for one case."""
+        """Return the plan that one attempt (round of searches) finds for one case."""
         if attempt.is_divided:
             plans = self.solve_lanes(jax.tree.map(lambda leaf: leaf[None], case), attempt)
             return jax.tree.map(lambda leaf: leaf[0], plans)
         return solve_round(self, attempt, case)
 
     def solve_lanes(self, cases: PyTree, attempt: Round) -> PyTree:
-        """Return the plans that one round (attempt) finds for a batch."""
+        """Return the plans that one attempt (round of searches) finds for a batch of cases."""
         return (solve_divided if attempt.is_divided else solve_batch)(self, attempt, cases)
 
     def divides(self, attempt: Round) -> bool:

@@ -94,7 +94,7 @@ class Differentiated(OptimisedPlanner):
 
     @property
     def attempts(self) -> tuple[Round, ...]:
-        """The rounds (attempts) of the inner planner."""
+        """The inner planner's rounds: attempts at a case, in order, until one solves it."""
         return self.planner.rounds
 
     def with_settings(self, settings: Settings) -> "Differentiated":

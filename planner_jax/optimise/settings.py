@@ -1,4 +1,4 @@
-"""Types of objectives, and settings of rounds (attempts), which are searches in several stages."""
+"""Types of objectives, and settings of a planner's attempts (rounds), each of several searches."""
 
 import dataclasses
 import functools

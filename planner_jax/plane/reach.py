@@ -214,7 +214,7 @@ def reach_set(
     pace = speed * grid.step / grid.cell * jnp.arange(levels, dtype=dtype) / (levels - 1)
     # A move is the difference of two rounded positions, so that the moves of n layers add up to the
     # rounded position. If each move were rounded, a car with a heading of 11 degrees would never
-    # change its row.
+    # change its row of cells.
     half_steps = jnp.arange(2 * lattice.layers + 2, dtype=dtype)[:, None, None, None]
     cells = jnp.round(0.5 * half_steps * pace[None, :, None, None] * direction[None, None])
     halves = jnp.diff(cells.astype(jnp.int32), axis=0)  # (2 layers + 1, levels, headings, 2)

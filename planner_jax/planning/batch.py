@@ -136,7 +136,7 @@ def plan_batch(
         planner: planner that makes the attempts.
         attempts: one or more attempts, in order.
         cases: batch of B cases, with a leading axis of length B on every leaf.
-        chunk: cases that a device solves in one call; None for a number that suits the device.
+        chunk: number of cases that a device solves in one call; None: a number that suits it.
         devices: devices that share the batch; None for all local devices.
         watch: ends the attempts at the time limit; the first attempt always starts.
 

@@ -45,7 +45,7 @@ def plan(
     """Plan one case, or a batch of cases with a leading axis on every leaf.
 
     Inside a compiled function of the caller this is `solve`. A repeated call returns bitwise equal
-    plans. With other cases in the batch, other chunks or other devices, a case's arithmetic is
+    plans. With other cases in the batch, another `chunk` or other devices, a case's arithmetic is
     rounded differently. A search that ends before the optimum may then end at
     another point, rarely with another status.
 
@@ -53,7 +53,7 @@ def plan(
         planner: a planner such as `pj.hit.planner("exact")`; its attempts (searches) are made in
             order, each at the cases that are still unsolved.
         cases: one case of the planner's task, or a batch, which has one more leading axis.
-        chunk: cases that a device solves in one compiled call. The default suits the device.
+        chunk: number of cases that a device solves in one compiled call. The default suits it.
         devices: devices that share a batch. By default all local ones, `jax.local_devices()`.
         time_limit: [s] time, compilation included, after which no attempt but the first starts;
             running computations are finished. Unsolved cases that have not been through all

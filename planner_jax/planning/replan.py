@@ -17,7 +17,7 @@ from planner_jax.planning.plan import plan
 
 @struct.dataclass
 class Replanning(Generic[CaseT, PlanT]):
-    """The input of a re-planner, for one case or a batch: the present case and the earlier plan."""
+    """The input of a re-planner: the present planning problems and the plans being executed."""
 
     case: CaseT  # the case as known at present; its times count from the present
     previous: PlanT  # the plan being executed, which started `elapsed` seconds ago

@@ -15,7 +15,7 @@ from planner_jax.referee.quadrotor import Pieces
 
 @runtime_checkable
 class ExtraLimit(Protocol):
-    """A limit that a user adds to a case; other objects in `extras` are terms of the cost."""
+    """A limit that a user adds to a planning problem, in its field `extras`."""
 
     def excess(self, pos: np.ndarray, vel: np.ndarray, acc: np.ndarray) -> np.ndarray:
         """Return the relative excess over the limit, positive where the limit is exceeded.
@@ -35,7 +35,7 @@ _STEEP = 1e9
 
 
 def worst_extras(pieces: Pieces, lanes: np.ndarray, extras: tuple, u: np.ndarray) -> tuple:
-    """Find each plan's greatest relative excess over limits in `extras`, its time and its limit.
+    """Find each plan's greatest relative excess over the user's limits, its time and its limit.
 
     The excess is sampled at fractions u of every piece. The intervals between samples that most
     likely contain a greater excess are sampled more finely. All results are (B,); the limit is an
@@ -44,7 +44,7 @@ def worst_extras(pieces: Pieces, lanes: np.ndarray, extras: tuple, u: np.ndarray
     Args:
         pieces: trajectories of B plans.
         lanes: (B,), indices of the plans' cases in the arrays of `extras`.
-        extras: extras of all cases of the batch, limits and terms of the cost.
+        extras: the user's limits and terms of the cost (ignored here), for all cases of the batch.
         u: (S,), sampled fractions of a piece's duration, from 0 to 1.
     """
     limits = [k for k, extra in enumerate(extras) if isinstance(extra, ExtraLimit)]

@@ -2,8 +2,8 @@
 
 A hit is a quadrotor's return of a ball to a target with a racket. `referee.quadrotor` checks the
 flight. This module integrates the ball up to the impact, which is at the end of the trajectory, and
-on to its landing. Only extra limits (`referee.extras`) are code that planners use too. World frame,
-z up, ground at z = 0, SI units.
+on to its landing. Of the planners' code it runs only limits that a user adds (`referee.extras`).
+World frame, z up, ground at z = 0, SI units.
 
 Equations of [Yu2023bat]: eq. 2 is the drag, eq. 18 the limits, and eq. 3 the impact with the
 coefficient of restitution beta. Eq. 3 prints 1 - beta; this module has 1 + beta, which follows from

@@ -1,8 +1,8 @@
 """Tests of a quadrotor's trajectory in float64 NumPy, for the referees of hits and catches.
 
 Polynomial pieces are sampled. Attitude and body rate follow from differential flatness (Hopf
-fibration at zero heading [Watterson2020]). World frame, z up, SI units. Only the case's extra
-limits (`referee.extras`) are code that the planners run too.
+fibration at zero heading [Watterson2020]). World frame, z up, SI units. Of the planners' code it
+runs only limits that a user adds (`referee.extras`).
 """
 
 import dataclasses

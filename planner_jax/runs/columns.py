@@ -30,7 +30,7 @@ Values: TypeAlias = ArrayLike | pa.Array | None
 
 
 class Column(NamedTuple):
-    """One column of the rows of a run: its description, and a function that computes its values."""
+    """A column of the stored table of planned problems, and the function that fills the column."""
 
     name: str
     unit: str  # SI unit; "" for names and counts, "1" for ratios

@@ -69,7 +69,7 @@ def check_part(path: Path) -> Entries:
 
 
 class Dataset:
-    """All rows of a run: the Parquet files (parts) of a folder, in the order of their numbers."""
+    """All rows of a run, one for each planned problem, in the Parquet files (parts) of a folder."""
 
     def __init__(self, folder: Path):
         self.folder = folder

@@ -12,7 +12,7 @@ from planner_jax.core.errors import ArgumentError
 from planner_jax.host.machine import processor, threads_of_a_computation, usable_cores
 from planner_jax.runs.manifest import Entries
 
-# Packages whose versions affect the numbers in the rows of a run.
+# Packages whose versions affect the stored plans and verdicts of a run.
 _PACKAGES = ("planner-jax", "jax", "jaxlib", "numpy", "scipy")
 _PACKAGE = Path(__file__).resolve().parents[1]
 
@@ -64,7 +64,7 @@ def environment() -> Entries:
 
 
 def makers_of(found: Entries) -> Entries:
-    """Return the entries of `environment()` that affect the numbers in the rows of a run."""
+    """Return the entries of `environment()` that affect the plans and verdicts of a run."""
     device = found["device"]
     return {
         **{name: found["versions"][name] for name in _PACKAGES},
