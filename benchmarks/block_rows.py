@@ -128,10 +128,11 @@ def find_blocked(cases: pj.block.BlockCase, planner: Any) -> np.ndarray:
 
 
 def measure(bench: Bench, name: str, options: Any) -> dict[str, np.ndarray]:
-    """Draw the throws of the row `name`, and print the share of them that each method blocks.
+    """Draw throws, and print the share of them that each method of planning a block blocks.
 
-    `options` are the command-line options. Returns for each method, by name, which of the N throws
-    it blocks, (N,) bool.
+    `name` is a row of the table, such as "R2 late": the joint limits R2 of the arm, which may start
+    late. `options` are the command-line options. Returns for each method, by name, which of the N
+    throws it blocks, (N,) bool.
     """
     suite, settings = ROWS[name]
     cases = pj.block.draw(options.num, suite, options.seed, **settings)

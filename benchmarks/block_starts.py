@@ -79,7 +79,7 @@ def follow(
     rank: Array,
     steps: int | Array,
 ) -> Followed:
-    """Run least squares for one case, starting from a straight motion with an added bump.
+    """Search a block motion by least squares for one case, from a straight motion plus a bump.
 
     In a straight motion all joints move in proportion. The search runs to its end, even where the
     planner would stop it because success is unlikely.
@@ -141,10 +141,21 @@ def try_starts(
 def try_in_parts(
     cases: Any, index: np.ndarray, bumps: np.ndarray, ranks: np.ndarray, steps: int, lanes: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Run `try_starts` from N starting points, `lanes` of them in one call.
+    """Search block motions by least squares from N initial motions, `lanes` of them in one call.
 
-    Point n is for the case with index `index[n]`. Returns whether each point led to a plan (N,),
-    and the greatest deviations of the joints from a straight motion in the results (N, 6) [rad].
+    An initial motion is a straight motion, in which all joints move in proportion, plus a bump.
+
+    Args:
+        cases: a batch of cases.
+        index: (N,) int, index of the case of each initial motion.
+        bumps: (N, 6) [rad], greatest deviation of each joint from the straight motion.
+        ranks: (N,) int, indices of end poses in the planner's order.
+        steps: maximum number of least-squares steps.
+        lanes: number of searches in one call of the compiled program.
+
+    Returns:
+        Whether each search led to a plan (N,), and the greatest deviations of the joints from a
+            straight motion in the results (N, 6) [rad].
     """
 
     def parts() -> Iterator[tuple[np.ndarray, np.ndarray]]:
@@ -161,10 +172,11 @@ def try_in_parts(
 
 
 def select_starts(solves: np.ndarray) -> list[int]:
-    """Select starting points greedily from a table `solves` (throws, points) bool.
+    """Select greedily from which initial motions the planner of blocks starts its search.
 
-    An entry is true if a plan from the point blocks the throw. Each selected point solves most of
-    the throws that the points before it do not solve. Returns at most 16 column indices.
+    Entry (throw, motion) of the table `solves` (throws, motions) bool is true if a search from the
+    initial motion blocks the throw. Each selected motion solves most of the throws that the
+    selected motions before it do not solve. Returns at most 16 column indices.
     """
     left, chosen = np.ones(len(solves), bool), []
     while left.any() and len(chosen) < MOST:

@@ -42,8 +42,9 @@ from planner_jax.optimise.settings import Round, Stage
 
 SETS = ("paper", "hard")
 BATCH_COPIES = 64
-# Maximum numbers of iterations of `quick_paper_catch` in its second stage, which checks limits at
-# all samples of a trajectory, and in its first stage, which uses a quarter of the samples.
+# Maximum numbers of iterations of the planner whose speed is measured: in its second stage, which
+# checks limits at all samples of a trajectory, and in its first stage, which uses a quarter of
+# them.
 _QUICK, _QUICK_COARSE = 45, 60
 
 

@@ -63,13 +63,16 @@ def cost_gaps(
 
 
 def _reference_planner(planner: Any, cases: Any, card: Task | None) -> Any:
-    """Return the planner whose costs are the reference for `cost_gaps`, or None if none exists."""
+    """Return the planner with whose costs the costs of plans are compared, or None.
+
+    There is none for a planner that does not minimise a cost, if the task specification `card`
+    names no planner of comparison (`yardstick`) for cases of this class.
+    """
     if isinstance(planner, OptimisedPlanner):
         return with_long_search(planner)
     if card is None or card.yardstick is None:
         return None
     yardstick = card.planner(card.yardstick)
-    # The yardstick, whose costs are the reference, cannot plan cases of another class.
     return yardstick if isinstance(cases, yardstick.case_type) else None
 
 
@@ -79,9 +82,10 @@ def with_long_search(planner: OptimisedPlanner) -> OptimisedPlanner:
 
 
 def gap_figures(*gaps: np.ndarray | None) -> dict[str, float | None]:
-    """Return the median, 90 % and 99 % quantile of the results of `cost_gaps`, by name.
+    """Return the median, 90 % and 99 % quantile of relative excess costs of plans, by name.
 
-    The results are concatenated; None stands for no result. Without results the quantiles are None.
+    `gaps` are arrays of cost / best cost - 1, which are concatenated; None stands for no array.
+    Without any number the quantiles are None.
     """
     together = np.concatenate([np.zeros(0), *(each for each in gaps if each is not None)])
     names = ("cost_gap_median", "cost_gap_p90", "cost_gap_p99")

@@ -86,12 +86,12 @@ print(json.dumps(dict(cpu=cpu, wall=wall, programs=programs, again=again, succes
 
 
 def plan_in_new_process(row: Row, caches: str) -> dict[str, Any]:
-    """Plan a row's cases in a new process, with compiled programs in the folder `caches`.
+    """Plan the cases of `row` in a new process, with compiled programs in the folder `caches`.
 
     Returns:
         "cpu" and "wall", the times [s] until the first plans; "programs", the number of programs
-        that took more than 0.1 s to compile or load; "again", the CPU time [s] of a second
-        call; and "success" of each case.
+            that took more than 0.1 s to compile or load; "again", the CPU time [s] of a second
+            call; and "success" of each case.
     """
     usual = {name: text for name, text in os.environ.items() if not name.startswith("JAX_PERS")}
     command = [sys.executable, "-c", _PROCESS, json.dumps(dataclasses.asdict(row))]

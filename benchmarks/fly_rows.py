@@ -97,7 +97,10 @@ def run_twice(fly: Callable[[], Any]) -> tuple[Any, str]:
 
 
 def check_rate(good: np.ndarray, bar: float | None) -> str:
-    """Return text that states whether the share of `good` reaches `bar`; empty if `bar` is None."""
+    """Return text that states whether the share of successful flights reaches the rate `bar`.
+
+    The text is empty if `bar` is None.
+    """
     if bar is None:
         return ""
     return f", must reach {100 * bar:g} %: {'yes' if good.mean() >= bar else 'NO'}"

@@ -62,11 +62,12 @@ class Scene:
 class Rules:
     """Settings of a lattice: how turns are rounded, and which discs replace the car's body."""
 
-    # 1: one disc inside of the body, whose radius is half the body's width. 2: two discs that cover
-    # the body.
+    # Number of discs that replace the car's body. 1: one disc inside of the body, whose radius is
+    # half the body's width. 2: two discs that cover the body.
     discs: int
-    # The limit on the heading change in a layer (time step) is a fractional number of
-    # headings. True: it is rounded up. False: fractions add up until they permit a whole heading.
+    # A car's heading is one of 64. Its greatest change in a time step is a fractional number of
+    # headings. True: this number is rounded up. False: fractions add up over time steps until they
+    # permit a whole heading.
     turns_up: bool
 
 
@@ -80,7 +81,8 @@ class Reach:
 
     at_end: bool  # whether the target can be met at the time that the case prescribes
     earliest: float  # [s], time of the first layer at which the target can be met, or infinity
-    # (2 n + 1, 5): time, x, y, heading and speed after each half of n time steps, or None.
+    # Path to the earliest meeting, (2 n + 1, 5), if it was requested and exists, else None: time,
+    # x, y, heading and speed after each half of n time steps, in SI units.
     path: np.ndarray | None
 
 

@@ -116,7 +116,7 @@ def row_of(cases: list, paths: list[HybridPath], ms: np.ndarray) -> Row:
 
 
 def search_row(cases: list, meetings: np.ndarray, headings: list[float | None]) -> Row:
-    """Search paths with this library to each case's meeting point, and return their table row.
+    """Search a path to each case's meeting point with this library, and return the results.
 
     A heading [rad] at the meeting point is prescribed, or arbitrary if it is None.
     """
@@ -129,7 +129,10 @@ def search_row(cases: list, meetings: np.ndarray, headings: list[float | None]) 
 
 
 def peer_row(cases: list, meetings: np.ndarray, headings: list[float]) -> Row:
-    """Search paths with fastsim-navigation to given headings [rad], and return their table row."""
+    """Search a path to each meeting point with fastsim-navigation, and return the results.
+
+    `headings` are the prescribed headings [rad] at the meeting points, one for each case.
+    """
     searches = []
     for case, meeting, heading in zip(cases, meetings, headings, strict=True):
         behind, ahead, half = body_of(case)

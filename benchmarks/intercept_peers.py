@@ -122,7 +122,8 @@ def split_planner(planner: Any) -> dict[str, Callable]:
 def time_parts(planner: Any, lanes: list) -> dict[str, np.ndarray]:
     """Plan N cases one by one; return durations (N,) [s] of each part and of all parts together.
 
-    Everything is compiled before, and the fastest of three calls counts.
+    The parts of a planner are, for example, path search and speed planning. All programs are
+    compiled before, and the fastest of three calls counts.
     """
     parts = split_planner(planner)
     best = {name: np.full(len(lanes), np.inf) for name in (*parts, "total")}
@@ -175,7 +176,7 @@ def table_of_outcomes(bench: Bench, outcomes: dict[str, Outcome]) -> None:
 
 
 def table_of_accelerations(bench: Bench, outcomes: dict[str, Outcome]) -> None:
-    """Print accelerations for pairs of planners (`PAIRS`), on cases where both of a pair succeed.
+    """Print mean accelerations of two planners at a time, on cases where both succeed.
 
     The first row has the values of Table II of [Qu2022].
     """

@@ -156,7 +156,7 @@ def loosen(cases: InterceptCase, distance: float) -> InterceptCase:
 
 
 def plan_beside(cases: InterceptCase) -> InterceptPlan:
-    """Plan each case to eight points around its target; return each case's first solved plan."""
+    """Plan each case to eight points 0.5 m around its target; return its first solved plan."""
     num, path = len(PLACES), cast("Any", cases.target)
     many = take_lanes(cases, np.repeat(np.arange(len(cases.time)), num))
     moved = np.asarray(path.pos)[:, None] + PLACES

@@ -74,14 +74,15 @@ def measure_scale(
     """Measure the scale of every decision variable of a planner on a batch of cases.
 
     The solutions at which curvature is measured depend on the scales with which they are computed.
-    The measurement is therefore repeated with the measured scales; it converges in two or three
-    rounds.
+    The measurement is therefore made three times, each time with the scales measured before. It
+    converges in two or three measurements.
 
     Args:
         planner: a frozen dataclass with a `scale` field, whose initial value is only a rough guess.
         cases: a batch of a few hundred cases, some of them hard, so that limits are active.
-        residuals: function of the planner, a point (n,) of the n decision variables, and prepared
-            data. Returns residuals whose squares sum to about twice the objective near its minimum.
+        residuals: function of the planner, a point (n,) of the n decision variables, and the result
+            of the planner's `prepare` for a case. Returns residuals whose squares sum to about
+            twice the objective near its minimum.
         floor: added to the curvature, so that a variable with almost no effect gets a finite scale.
 
     Returns:

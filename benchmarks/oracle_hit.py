@@ -68,7 +68,10 @@ def summarise(findings: list[Finding]) -> dict:
 
 
 def format_table(summary: dict) -> str:
-    """Format the result of `summarise` as a Markdown table and one or two sentences."""
+    """Format numbers of feasible, infeasible and undecided cases as a Markdown table and sentences.
+
+    `summary` also has the excesses over limits of the infeasible cases, and CPU times.
+    """
     lines = ["| verdict | cases | share | 95 % interval |", "|---|---|---|---|"]
     for name in VERDICTS:
         row = summary[name]

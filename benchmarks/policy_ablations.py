@@ -40,7 +40,7 @@ from planner_jax.task.catch.default_planner import ExactCatch
 from planner_jax.task.catch.spec import SUITES
 
 ITERATIONS = 25  # Number of the planner's iterations for each decision in training.
-# Name of a variant -> arguments of `training_settings`.
+# Name of a variant of the training -> arguments of `training_settings` that differ from defaults.
 VARIANTS: dict[str, dict[str, Any]] = {
     "whole": {},
     "mlp": {"network": "mlp"},

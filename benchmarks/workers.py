@@ -54,12 +54,15 @@ class _Share(NamedTuple):
 
     @property
     def first(self) -> int:
-        """Number of first chunks that are not timed, because workers start during that time."""
+        """Number of first files of plans that are not timed, because workers start at that time."""
         return max(_FIRST, WORKERS_OF_GPU * len(self.gpus) if self.gpus else len(self.cores))
 
 
 class _Sweep:
-    """Sweep of hits in a separate process; records when each of its chunks was written."""
+    """Sweep of hits in a separate process: it plans drawn cases in chunks, and writes a file each.
+
+    The times at which the files appear are recorded.
+    """
 
     def __init__(self, out: Path, num: int, batch: int, share: _Share, ray: bool):
         self._out, self._batch, self._first, self._times = out, batch, share.first, list[float]()
@@ -80,13 +83,13 @@ class _Sweep:
         os.sched_setaffinity(self._process.pid, share.cores)
 
     def poll(self) -> bool:
-        """Record the time of newly written chunks; return whether the process still runs."""
+        """Record when the sweep has written more files of plans; return whether it still runs."""
         there = len(list(self._out.glob("plans/part-*.parquet")))
         self._times += [time.perf_counter()] * (there - len(self._times))
         return self._process.poll() is None
 
     def rate(self) -> float:
-        """Return plans per second, without the first chunks, during which workers start.
+        """Return plans per second, without the first files of plans, during which workers start.
 
         Raises:
             RuntimeError: the sweep has failed.

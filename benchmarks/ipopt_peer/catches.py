@@ -11,7 +11,8 @@ from planner_jax.core.protocol import FEASIBILITY_TOLERANCE
 
 RIM = 0.9  # Greatest distance of a planned catch from the net's centre, over the net's radius.
 
-# Name of each parameter of a catch, in SI units -> number of its values.
+# Name of each number of a case that IPOPT's problem of a catch contains, in SI units -> its number
+# of values (3 for a vector).
 SIZES = {
     "gravity": 1,
     "speed": 1,

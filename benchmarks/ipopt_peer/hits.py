@@ -9,7 +9,8 @@ import numpy as np
 
 from planner_jax.benchmarks.ipopt_peer.program import Problem, body_axes, ca, rate_squared
 
-# Name of each parameter of a hit, in SI units -> number of its values.
+# Name of each number of a case that IPOPT's problem of a hit contains, in SI units -> its number of
+# values (3 for a vector).
 SIZES = {
     "gravity": 1,
     "speed": 1,
