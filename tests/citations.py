@@ -30,10 +30,10 @@ NUMBER = r"\d+[a-z]?"
 EQUATIONS = re.compile(rf"\b[Ee]qs?\.?\s+({NUMBER}(?:\s*(?:,|-|and|to)\s*{NUMBER})*)")
 HEAD = """# Where each equation is
 
-The equations of the four papers of [references](references.md) that the code cites. The column
-"computes" says in a few words what an equation computes. The column "implemented in" has the file
-that computes it, and the functions or classes there whose docstrings cite it. The files in the last
-column use, check or discuss the equation.
+This page lists the equations of four papers of [references](references.md) that the code cites. The
+column "computes" says in a few words what an equation computes. The column "implemented in" has the
+file that computes it, and the functions or classes there whose docstrings cite it. The files in the
+last column use, check or discuss the equation.
 
 `python -m tests.citations --write` generates this page from the citations in the code and the words
 in `tests/data/equations.toml`.
