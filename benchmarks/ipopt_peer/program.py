@@ -246,7 +246,7 @@ class Program:
         return self._own * ca.sumsqr(offsets) / h**self._power
 
     def _worst(self) -> Any:
-        """Build a function of the decision variables that returns the largest excess over limits."""
+        """Build a function of the decision variables: the largest excess over a limit."""
         x, params, natural, offsets = self._point()
         outward, _, at_ends = self._ends(natural, params)
         columns, h = self._basis.join(outward, offsets)
