@@ -147,7 +147,7 @@ class Progress:
             yield tell
 
     def add_evaluation(self, number: int, decisions: int, suites: Mapping[str, Any]) -> None:
-        """Add the results of `training.evaluate_policy` after part `number`, by suite, as a row."""
+        """Add a row with the results, by suite, of an evaluation after part (PPO run) `number`."""
         self.add(number, decisions, {"suites": suites})
 
     def add(self, number: int, decisions: int, row: Mapping[str, Any]) -> None:

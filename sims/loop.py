@@ -314,7 +314,8 @@ def begin_compiling(
     """
     if loop.replan == 0.0 or not in_parts(flights):
         return lambda: None
-    # Zeros come from NumPy arrays, as plans do. For other arrays JAX compiles another program.
+    # JAX compiles different programs for arrays that come from NumPy and for its own arrays. Plans
+    # come from NumPy, so that the zeros must come from NumPy, too.
     zeros = functools.partial(
         jax.tree.map, lambda leaf: jnp.asarray(np.zeros(leaf.shape, leaf.dtype))
     )

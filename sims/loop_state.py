@@ -1,4 +1,4 @@
-"""The state of a flight, the settings of its closed loop, and its records."""
+"""The state of a simulated flight, the settings of its closed loop, and its records."""
 
 import dataclasses
 import functools
@@ -46,7 +46,7 @@ class Pilot(Protocol):
     def choose(self, asked: Any, outlook: Outlook, found: tuple[Any, ...]) -> tuple[Any, Array]:
         """Select one of the new plans; return the plan, and whether it replaces the current plan.
 
-        Each task has its own rule, which compares violations of limits and, for catches, costs.
+        Each task compares the plans' violations of limits, and the task `catch` also their costs.
 
         Args:
             asked: the planning problem that `pose_problem` returned.

@@ -154,7 +154,6 @@ def make_recording(
     time = np.broadcast_to(grid, (number, grid.size))
 
     def extend(leaf: np.ndarray) -> np.ndarray:
-        """Extend an array to all samples: its first value before the simulation, NaN after."""
         whole = np.full((number, grid.size, *leaf.shape[2:]), np.nan)
         whole[:, before : before + samples], whole[:, :before] = leaf, leaf[:, :1]
         return whole

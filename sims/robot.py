@@ -81,8 +81,8 @@ class Robot(Protocol):
     def drive(self, physics: Physics, command: Array, timestep: float) -> tuple[Array, Array]:
         """Convert a command to MuJoCo's controls (A,) and to extra generalised forces (R',).
 
-        R' is the number of the robot's joint velocities. The extra forces are those for which the
-        model has no actuators, such as tyre forces. `timestep` [s] is MuJoCo's.
+        R' is the number of the robot's joint velocities. The extra forces, such as tyre forces,
+        have no actuators in the model. `timestep` is MuJoCo's time step [s].
         """
         ...
 

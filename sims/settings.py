@@ -23,7 +23,7 @@ from planner_jax.task.hit.spec import TASK as HIT
 from planner_jax.task.intercept.spec import TASK as INTERCEPT
 
 _REPLAN = "replanning rate, 0 for never (default: {} with {}, 0 with other planners)"
-# The decision "given" takes order and times of catches from the case; cases of flights have none.
+# Cases of flights contain no order and times of catches, which the decision "given" would use.
 _FLOWN_DECISIONS = {name: where for name, where in DECISIONS.items() if name != "given"}
 _AT_ONCE = 4096  # greatest default number of flights per batch
 # Estimated memory [bytes] of a flight during its simulation, and of its results afterwards.
@@ -173,7 +173,7 @@ class CatchFly(BallFly):
 
     @property
     def redecide_rate(self) -> float:
-        """The rate [Hz] of new decisions on the catches' order and times; by default `rate`."""
+        """The rate [Hz] of new decisions on order and times of catches; by default of new plans."""
         return self.rate if self.redecide is None else self.redecide
 
     def flight(self) -> Any:

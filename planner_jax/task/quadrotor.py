@@ -32,7 +32,7 @@ FLIGHT_RULES: Table = (
     Field("limits.rotors.max_thrust", ()),
 )
 
-# Field of a case -> argument of the function `case` that sets it. Error messages name the argument.
+# Maps a field of a case to the argument of `case` that sets it; error messages name the argument.
 ARGUMENTS = {
     "head_state": "start",
     **{

@@ -204,7 +204,7 @@ def _median(rates: Array, step: Array, chance: Array, of_zero: Array) -> Array:
 
 
 def mean_position(prediction: Prediction, time: ArrayLike) -> Array:
-    """Return the expected position (2,) [m] of a target at a time, by all alternative paths."""
+    """Return the mean position (2,) [m] of the alternative paths, weighted by their probability."""
     offset, _ = _errors(prediction, time)
     mean = jnp.sum(prediction.alternatives.chance[:, None] * offset, axis=0)
     return prediction.path.at(jnp.asarray(time)).pos + mean

@@ -45,7 +45,7 @@ _PROPORTIONS = (0.2, 0.5) + (1.0,) * 10
 _FEATURE_TIMES = (0.5, 0.75, 0.95)  # times of the ball that the network sees / landing time
 # Settings of searches for any plan that keeps the limits, whatever its cost. If the velocities at
 # waypoints are variables, the starting point must nearly keep the limits. `margin` is the relative
-# distance from a limit at which penalties start; it must cover peaks between the `nodes`.
+# distance from a limit at which penalties start; it must cover peaks between the samples (`nodes`).
 _ANY_FEASIBLE = (("energy_weight", 1e-11), ("margin", 0.01), ("nodes", 8))
 WITH_VELOCITIES = (*_ANY_FEASIBLE, ("velocities", True))
 _SMALL_MARGIN = (

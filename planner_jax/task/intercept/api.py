@@ -105,8 +105,8 @@ def planner(name: str = "spacetime", **options: object) -> Planner[InterceptCase
     * `em`: the best path of `lattice`, with the speed optimisation of the EM planner [Fan2018].
     * `constant`: the best path of `lattice` at constant speed; ignores moving obstacles.
 
-    Arguments and errors are as for `pj.hit.planner`. The options are the fields of the planner's
-    class: `SpacetimeIntercept`, `PathThenSpeed` or `PaperIntercept`.
+    An unknown name raises `ValueError`. The options are the fields of the planner's class:
+    `SpacetimeIntercept`, `PathThenSpeed` or `PaperIntercept`.
     """
     return TASK.make_planner(name, options)
 
@@ -117,9 +117,9 @@ def judge(cases: InterceptCase, plans: InterceptPlan, **settings: object) -> Int
     The referee computes the positions of targets of the classes `TurningPath`, `PolynomialPath` and
     `LaterPath` itself. For other classes it calls the target's method `at` in float64.
 
-    Arguments, result and errors are as for `pj.hit.judge`. The settings are keyword arguments of
-    `referee_intercepts`, such as `truth`: the true path of the target, or a batch of true paths, if
-    the paths in the cases are predictions.
+    The verdict has for each plan whether it is a `success`, the reason as text by `sentence(k)`,
+    and the measured quantities. The settings are keyword arguments of `referee_intercepts`, such as
+    `truth`: the true paths of the targets, if the paths in the cases are predictions.
     """
     require_kind("cases", cases, InterceptCase)
     target = cases.target

@@ -49,7 +49,7 @@ RULES: Table = (
     Field("body.rear_overhang", ()),
     *(Field(f"limits.{name}", (), rules.POSITIVE_OR_NONE) for name in _LIMITS),
 )
-# Field of a case -> argument of `case` that sets it. Error messages name the argument.
+# Maps a field of a case to the argument of `case` that sets it; error messages name the argument.
 _ARGUMENTS = {
     "speed": "initial_speed",
     "curvature": "initial_curvature",

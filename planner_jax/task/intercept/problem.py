@@ -49,7 +49,7 @@ _EARLY = 30.0
 
 @struct.dataclass
 class Stage:
-    """A stage of the search: Levenberg-Marquardt steps with fixed weights of the cost."""
+    """A stage of least squares: Levenberg-Marquardt steps with fixed weights of the cost."""
 
     weights: terms.Weights
     steps: Array | int  # greatest number of steps

@@ -121,7 +121,7 @@ class ReplanIntercept(Planner[Replanning, InterceptPlan]):
         return super().load_attempt(attempt, tasks)
 
     def solve(self, task: Replanning, attempt: Search | Warm) -> InterceptPlan:
-        """Return the plan of one case, from the previous plan or from scratch by a `Search`."""
+        """Return a new plan of one case: by `Warm` from the previous one, or by a `Search` anew."""
         if isinstance(attempt, Search):
             return self.planner.solve(task.case, attempt)
         case, problem = task.case, self.problem

@@ -240,14 +240,14 @@ def _boxes(left, low, right, high) -> np.ndarray:
 
 
 def path_of(draws: Draws, dtype: DTypeLike) -> TurningPath:
-    """Return the paths of the targets in draws, which are dictionaries of arrays."""
+    """Return the paths of targets from their position, angle, speed and turn rate in `draws`."""
     velocity = draws["speed"][..., None] * _unit(draws["angle"])
     parts = (np.asarray(part, dtype) for part in (draws["pos"], velocity, draws["rate"]))
     return TurningPath(*map(jnp.asarray, parts))
 
 
 def cases_of(draws: Draws, dtype: DTypeLike) -> InterceptCase:
-    """Make cases from draws, which are dictionaries of arrays, with leaves of type `dtype`."""
+    """Make cases from the arrays `draws` of random starts, targets, times and obstacles."""
 
     def group(kind: str, velocity: np.ndarray) -> Obstacles:
         present = draws[f"{kind} present"]
@@ -344,8 +344,8 @@ def _is_separated(_: Suite, draws: Draws) -> np.ndarray:
     return separated
 
 
-# Cause for which a candidate is rejected -> function that returns whether the cause applies to each
-# of B candidates, (B,) bool. The causes are tested in this order.
+# Maps each cause for which a candidate is rejected to a function, which returns whether the cause
+# applies to each of B candidates, (B,) bool. The causes are tested in this order.
 _APPLIES: dict[str, Callable[[Suite, Draws], np.ndarray]] = {
     "target off the map": _is_off_map,
     "start near a wall": lambda _, draws: _gap(draws, "walls", _middle(draws)) < START_ROOM,

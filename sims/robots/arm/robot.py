@@ -45,7 +45,7 @@ def _arm(xml: str) -> Any:
 def lanes_of(arm: Arm) -> dict[str, np.ndarray]:
     """Return an arm's geometry as float64 arrays with a batch axis of length one.
 
-    The names, such as "arm.origin", are those that `referee.arm_clearance.links_of` reads.
+    The names, such as "arm.origin", are the names that the referee's function `links_of` reads.
     """
     names = ("origin", "turn", "axis", "shield_centre")
     return {f"arm.{name}": np.asarray(getattr(arm, name), float)[None] for name in names}
