@@ -85,7 +85,10 @@ def _read_number(flag: str, kind: Callable[[str], float], word: str) -> float:
 
 
 def add_settings(parser: Parser, kind: Any, task: Task | None = None) -> None:
-    """Add an option for each field of `kind`, with the planners and suites of `task`, if any."""
+    """Add an option for every field of `kind`, the dataclass with the settings of a command.
+
+    Help texts list the planners and suites of `task`; None for a command without a task.
+    """
     hints = typing.get_type_hints(kind)
     names = {"planner": task.all_planners(), "suite": task.all_suites()} if task else {}
     defaults: dict[str, object] = {name: next(iter(known)) for name, known in names.items()}

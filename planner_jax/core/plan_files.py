@@ -94,7 +94,7 @@ def _read(path: str | os.PathLike) -> tuple[object, object, dict[str, np.ndarray
 
 
 def leaves_by_name(tree: PyTree, prefix: str = "") -> dict[str, PyTree]:
-    """Return the arrays of a nested dataclass by `prefix` and name, such as "limits.speed"."""
+    """Return the arrays of a nested dataclass by `prefix` + dotted name, such as "limits.speed"."""
     leaves = {}
     defaults = {field.name: field.default for field in dataclasses.fields(tree)}
     for name, value in nodes_of(tree).items():

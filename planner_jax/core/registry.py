@@ -67,7 +67,7 @@ class Task:
 
     @property
     def draw(self) -> "Callable[..., PyTree]":
-        """Function `draw(num, suite, seed, first)`: cases of a random suite from number `first`."""
+        """Function `draw(num, suite, seed, first)`: a suite's random cases from number `first`."""
         return self._function("draw")
 
     @property

@@ -41,7 +41,7 @@ Vectors = list[list[Array]]  # columns, or derivatives of a motion, each with it
 
 @dataclasses.dataclass(frozen=True)
 class Grid:
-    """The division of a kernel's work into blocks, by segments and lanes (problems of a batch)."""
+    """Division of a kernel's work into GPU blocks by segments and lanes (problems of a batch)."""
 
     trajectories: int  # number of segments of each lane
     num_columns: int  # number of columns (boundary rows and waypoint offsets) of a segment

@@ -30,7 +30,7 @@ from planner_jax.lanes.pallas import grid_index
 def peaks_kernel(
     along: Along, *, interpret: bool = False
 ) -> Callable[[Treedef, Sequence[Array]], Sequence[Array] | None]:
-    """Make the kernel of `greatest_along`; with `interpret` it runs without a GPU, for tests."""
+    """Make the kernel for the greatest excess over each limit; `interpret` needs no GPU."""
 
     def kernel(treedef: Treedef, leaves: Sequence[Array]) -> Sequence[Array] | None:
         columns, durations, *parameters = leaves

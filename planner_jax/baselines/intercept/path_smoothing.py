@@ -92,7 +92,7 @@ def smooth_path(
             half of its width.
         lower: (2,) [m], least coordinates of the map, in which the body's centre must stay.
         upper: (2,) [m], greatest coordinates of the map.
-        settings: weights and numbers of the descent.
+        settings: weights, step size and number of iterations.
 
     Raises:
         ArgumentError: N - 1 is not a multiple of the stride, or there are fewer than five control
@@ -144,7 +144,7 @@ def smooth_points(
         points: (n + 1, 2) [m], n + 1 nearly equally spaced points, such as `control_points`.
         walls: standing obstacles.
         curvature: () [1/m], greatest curvature.
-        settings: weights and numbers of the descent.
+        settings: weights, step size and number of iterations.
     """
     unit = _mean_distance(points)
     moves = (np.arange(len(points)) >= 2) & (np.arange(len(points)) < len(points) - 2)
