@@ -116,8 +116,8 @@ class Planner(Generic[CaseT, PlanT]):
     def compiles_quickly(self, attempt: PyTree, /) -> bool:
         """Return whether a CPU compiles the search of an attempt for one case by `QUICK_OPTIONS`.
 
-        These options save compile time, but the program may run slower. By default all planners use
-        them except those with `is_sequential`.
+        These options of XLA save compile time, but the program may run slower. By default planners
+        use them unless a CPU solves the cases of their batches one by one (`is_sequential`).
         """
         return not self.is_sequential
 

@@ -167,7 +167,7 @@ def task_named(name: object) -> Task:
 
 @functools.cache
 def all_tasks() -> dict[str, Task]:
-    """Return tasks by name; tasks of other packages that fail are left out with a warning."""
+    """Return tasks by name; other packages' tasks that fail to load are left out with a warning."""
     tasks = {name: pkgutil.resolve_name(path) for name, path in _OWN.items()}
     for entry in metadata.entry_points(group=f"{_GROUP}.tasks"):
         problem = f"the name is taken by {tasks[entry.name].home}" if entry.name in tasks else ""

@@ -66,7 +66,7 @@ class Grid:
 def grid_of(
     along: Along, leaves: Sequence[Array], points: Sequence[tuple[Array, Array, PyTree]]
 ) -> tuple[Grid, tuple[int, ...]] | None:
-    """Return the grid for a kernel's arguments, and the leading axes that `vmap` has added to them.
+    """Return the GPU grid for a kernel's arguments, and the leading axes that `vmap` added to them.
 
     `points` has (columns, durations, parameters); the mode "curvature" adds a second tuple, their
     tangents. `leaves` are all arrays in `points`. None: the kernel does not support the arguments.
@@ -233,7 +233,10 @@ def _store(refs: Sequence[Ref], values: Iterable[Array]) -> None:
 
 
 def unit_motion(row: Vectors, columns: Vectors) -> Vectors:
-    """Multiply a sample's matrix (4, C) and C columns: height, velocity, ... for pieces of 1 s."""
+    """Return a sample's height, velocity, acceleration and jerk for a mean piece duration of 1 s.
+
+    The matrix `row` (4, C) multiplies C `columns`, which are end states and waypoint offsets.
+    """
     return [
         [_total(row[d][c] * columns[c][axis] for c in range(len(columns))) for axis in axes]
         for d, axes in enumerate(_AXES)

@@ -27,7 +27,7 @@ from planner_jax.cost.penalty import greatest_by_tangents
 from planner_jax.trajectory.polynomial import Motion
 from planner_jax.trajectory.proportional_minco import ProportionalMinco, by_pieces
 
-# Number of intervals of a piece in the check of finished plans: many, as obstacles may be small.
+# Number of samples per polynomial piece when a finished plan is checked: obstacles may be small.
 _CLOSE_NODES = 64
 
 

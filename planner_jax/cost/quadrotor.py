@@ -179,7 +179,7 @@ def _kinds(limits: QuadrotorLimits) -> list[_Kind]:
 
 
 def flight_excess(motion: Motion, gravity: Array, limits: QuadrotorLimits) -> tuple[Array, ...]:
-    """Return the excess (N,) at N samples over each limit that is set, in a fixed order."""
+    """Return the excess (N,) at N samples over each limit that is not None, in a fixed order."""
     return tuple(
         excess for kind in _kinds(limits) for excess in kind.excess(motion, gravity, limits)
     )
@@ -207,7 +207,7 @@ def flight_along(
     """Return the penalties for exceeding the limits of a case along the segments of a flight.
 
     They start at a relative distance `margin` before each limit, are smoothed over `hinge_width`,
-    and are sampled at `nodes` intervals of each polynomial piece.
+    and are sampled at `nodes` intervals of each polynomial piece by the matrices `maps`.
     """
     factors = [measure.factor for measure in flight_measures(case.limits)]
     factors += [1.0] * num_limits(case.extras)

@@ -251,13 +251,6 @@ def _is_free_along(pose, parts, senses, curvature, scene, field):
 
 @njit(cache=True)
 def _shoot(pose, goal, bound, rules, scene, field, lengths):
-    """Find the cheapest collision-free Dubins path to the goal that costs less than `bound` [m].
-
-    The lengths of the paths' parts are written into `lengths` (6, 3) [m].
-
-    Returns:
-        The path's row in `lengths`, or -1 if there is no path; and the path's cost [m].
-    """
     x, y = in_frame(pose, goal, rules.curvature)
     if goal.has_heading:
         words_to_pose(x, y, goal.pose[2] - pose[2], lengths)
