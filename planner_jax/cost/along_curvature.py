@@ -225,8 +225,7 @@ def _square(entries: dict[tuple[int, int], Array], num: int) -> Array:
 
 @dataclasses.dataclass(frozen=True)
 class _Constants:
-    # (3 * orders * K, G + C), maps end states and offsets to samples and two derivatives by log h.
-    samples: np.ndarray
+    samples: np.ndarray  # (3 * orders * K, G + C)
     moving_samples: np.ndarray  # (orders, K, C)
     groups: tuple[tuple[Slot, ...], ...]
     # (pairs of axes, pairs of orders): for each pair of axes such as (x, y), the pairs of orders

@@ -141,7 +141,7 @@ def smooth_points(
     """Return the points (n + 1, 2) [m] after gradient descent on the cost [Qu2022, eq. 16].
 
     Args:
-        points: (n + 1, 2) [m], n + 1 nearly equally spaced points, such as `control_points`.
+        points: (n + 1, 2) [m], nearly equally spaced control points of the path.
         walls: standing obstacles.
         curvature: () [1/m], greatest curvature.
         settings: weights, step size and number of iterations.

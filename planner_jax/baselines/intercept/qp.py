@@ -159,7 +159,7 @@ def solve_qp(
     dtype = lower.dtype
     t: QpTemplate = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), template)
     unbounded = _product(t.reach, right_side)
-    # Bounds on the point along unit normals, and `slack`, their tolerance for rounding errors.
+    # `low` and `high` bound the products of unit normals and point; `slack` is for rounding errors.
     low, high = (lower - unbounded) / t.scales, (upper - unbounded) / t.scales
     eps = jnp.finfo(dtype).eps
     slack = 16.0 * eps * (1.0 + jnp.where(jnp.isfinite(low), jnp.abs(low), 0.0))

@@ -174,7 +174,6 @@ def _find_forbidden_edges(problem: StationTimeProblem, grid: StationTimeGrid) ->
 
 
 def _parts_of_cells(num: int, parts: int) -> np.ndarray:
-    """Return for `num` equal cells of a path which of `parts` equal parts each cell overlaps."""
     cell = np.arange(num)
     first, last = cell * parts // num, -(-(cell + 1) * parts // num) - 1
     width = (last - first).max() + 1
