@@ -113,7 +113,7 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
         return 0.0
 
     def active(self, context: PyTree) -> Bool[Array, " N"]:
-        """Return which of the N segments the planning problem uses, (N,) bool; here N = 1."""
+        """Return which of the N segments a planning problem uses, (N,) bool; by default N = 1."""
         return jnp.ones(1, bool)
 
     def relative_excess(self, excess: Array) -> Array:
@@ -187,7 +187,7 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
     def evaluate_ends(
         self, natural: Float[Array, "N K"], context: PyTree
     ) -> tuple[Array, Array, Array, Array]:
-        """Compute what depends only on the K end variables (log duration first) of N segments.
+        """Compute those parts of the objective that depend only on N segments' K end variables.
 
         Returns:
             Boundary rows (N, 8, 3), scaled states at both ends of the segments; mean durations of a

@@ -20,9 +20,9 @@ from planner_jax.optimise.preconditioner import block_preconditioner
 from planner_jax.optimise.settings import Curvature, Evaluation
 from planner_jax.trajectory.proportional_minco import ProportionalMinco, offset_energy
 
-# A function of the k end variables of N segments (N, k). It returns boundary rows (N, 2s, 3), which
-# are s scaled derivatives at each end; mean durations of a piece (N,) [s]; the part of the cost ()
-# that depends on the ends alone; and the greatest excess over a limit at the ends ().
+# A function of the k end variables of N segments (N, k). It returns the positions and derivatives
+# at both ends, scaled, (N, 8, 3) for minimum snap; mean durations of a piece (N,) [s]; the part of
+# the cost () that depends on the ends alone; and the greatest excess over a limit at the ends ().
 Ends = Callable[[Array], tuple[Array, Array, Array, Array]]
 
 

@@ -112,7 +112,7 @@ def is_stationary(numbers: NewtonNumbers, config: NewtonConfig) -> Array:
 
 
 def most_to_gain(numbers: NewtonNumbers, config: NewtonConfig, num: int) -> Array:
-    """Return indices (num,) of problems, unfinished ones first, by falling predicted decrease."""
+    """Return indices (num,) of unfinished problems whose cost is predicted to decrease most."""
     expected = jnp.where(jnp.isnan(numbers.expected), jnp.inf, numbers.expected)
     return jnp.argsort(jnp.where(is_unfinished(numbers, config), -expected, 1.0))[:num]
 
@@ -122,8 +122,8 @@ def step(
 ) -> NewtonState:
     """Return the state after one iteration of Newton's method.
 
-    An iteration computes derivatives, a subspace and one step for each trial damping, and takes
-    the step to the least cost. A finished problem of a batch keeps its point.
+    An iteration computes derivatives, a Krylov subspace and one step for each trial damping, and
+    takes the step to the least cost. A finished problem of a batch keeps its point.
     """
     here = curved(state.point)
     steps, decrease = solve_damped(here, state.numbers.damping, config)
@@ -274,7 +274,7 @@ def _choose(
     costs = jnp.where(jnp.isfinite(trials.cost), trials.cost, jnp.inf)
     slack = config.slack * jnp.finfo(costs.dtype).eps * jnp.abs(here.cost)
     places = jnp.arange(costs.size)
-    # Among the trials whose costs are equal up to rounding, the least damped one is chosen.
+    # Among the trial steps whose costs are equal up to rounding, the least damped step is chosen.
     is_chosen = places == jnp.argmin(jnp.where(costs <= jnp.min(costs) + slack, places, costs.size))
 
     def of_chosen(values: Array) -> Array:  # a masked sum; a gather would need its own loop

@@ -99,9 +99,9 @@ class NewtonConfig:
     # Rounding error of a cost, in units of machine epsilon times the cost. A step may raise the
     # cost by this error; such a step counts as progress if the predicted decrease halves.
     slack: float = 0.0
-    # After `max_steps`, unfinished problems continue in groups, those with the greatest predicted
-    # decrease first. The three numbers: size of a group as a fraction of the batch, iterations of a
-    # group, greatest number of groups.
+    # After `max_steps`, unfinished problems continue in groups, by falling predicted decrease. The
+    # three numbers are the size of a group as a fraction of the batch, the number of iterations of
+    # a group, and the greatest number of groups. With None, no problem continues.
     stragglers: tuple[float, int, int] | None = None
 
     def __post_init__(self) -> None:

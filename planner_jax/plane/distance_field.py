@@ -6,8 +6,8 @@ from jax import Array, lax
 
 from planner_jax.plane.obstacles import Obstacles, distances
 
-# An array of a wall's corners is padded by repeats of the last corner. To save time, distances are
-# computed from its first half if its second half is only padding and has at least this length.
+# A wall's array of corners is padded by repeats of its last corner. To save time, distances are
+# computed from half the array, if the other half is only padding and has at least this length.
 _HALF = 4
 
 

@@ -39,7 +39,7 @@ LANES = PartitionSpec("lanes")
 
 @dataclasses.dataclass(frozen=True)
 class Sizes:
-    """Numbers of lanes (cases) that the calls of one attempt (search) may have on each device."""
+    """Numbers of lanes (cases) that one compiled call of an attempt may solve on each device."""
 
     most: int  # greatest number of lanes of a call
     busy: int  # least number of lanes that keeps a GPU busy
@@ -191,7 +191,7 @@ class PerDevice:
         )
 
     def __call__(self, mesh: Mesh, static: Hashable, *trees: PyTree) -> PyTree:
-        """Return the function's results, with the lanes (cases) of all devices."""
+        """Return the function's results, joined over the lanes (cases) of all devices."""
         if mesh.size == 1:
             return self._alone(mesh.devices[0].platform, static, *trees)
         return self._together(*trees, mesh=mesh, static=static)
@@ -236,7 +236,7 @@ compiled: set[Hashable] = set()
 def program_key(
     planner: Planner, attempt: Attempt, num: int, cases: PyTree, compiles_quickly: bool
 ) -> Hashable:
-    """Return the key, in the set `compiled`, of the program that solves `num` cases per device."""
+    """Return the key of the program that solves `num` cases per device, for the set `compiled`."""
     own = tuple((leaf.shape, leaf.dtype) for leaf in jax.tree.leaves(planner))
     lanes = tuple((leaf.shape[1:], leaf.dtype) for leaf in jax.tree.leaves(cases))
     loaded = planner.load_attempt(attempt, cases)
@@ -267,8 +267,8 @@ def call_packed(
 
     The pure function is compiled once for each hashable `static` and each layout of the other
     arguments. `own` is a pytree that stays on the device, such as a planner. `case` has NumPy
-    leaves, at least one of them of a floating-point type. `compiles_quickly` selects a generator of
-    code that takes less time.
+    leaves, at least one of them of a floating-point type. With `compiles_quickly`, options of XLA
+    shorten the compilation.
     """
     leaves, tree = jax.tree.flatten(case)
     arrays = [np.asarray(leaf) for leaf in leaves]

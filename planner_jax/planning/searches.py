@@ -1,4 +1,4 @@
-"""One round (attempt) of a planner that minimises, with each search as a problem of its own.
+"""One attempt (round) of a planner that minimises, with each search as a problem of a batch.
 
 A case may be searched from several starting points, in stages from an easy to a hard problem. Every
 search of every case is one lane of a batch. The host cuts the lanes of a stage into calls of one
@@ -26,8 +26,8 @@ from planner_jax.planning.programs import (
     on_devices,
 )
 
-# Number of searches in one call on each device, for a batch. Few searches keep a CPU from waiting
-# for its slowest search; a GPU takes as long for fewer searches.
+# Number of searches in one compiled call on each device. A call lasts until its slowest search
+# ends, so a CPU makes few searches in a call. A GPU takes as long for fewer searches.
 _CPU_LANES, _GPU_LANES = 16, 8192
 
 

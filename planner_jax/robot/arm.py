@@ -56,7 +56,6 @@ class Regime:
 
 
 def _regime(factor: float, acceleration: float, ends_at_rest: bool) -> Regime:
-    """Return the IRB 1600's limits: data-sheet speeds times `factor`, `acceleration` [rad/s^2]."""
     speeds = np.deg2rad(np.array([150, 160, 170, 320, 400, 450], np.float32))
     limits = ArmLimits(host_leaf(factor * speeds), host_leaf(np.full(6, acceleration, np.float32)))
     return Regime(limits=limits, ends_at_rest=ends_at_rest)

@@ -1,4 +1,4 @@
-"""The environment of a run, stored in its manifest: versions, code digest, commit and device."""
+"""Versions, code digest, commit and device of a run, which are stored in its manifest."""
 
 import functools
 import hashlib
