@@ -1,4 +1,4 @@
-"""Write the plans and verdicts of every suite to a folder, or compare two such folders.
+"""Write plans and verdicts for random cases of every suite, or compare two such folders.
 
     python -m tests.golden write DIR [NAME ...]
     python -m tests.golden compare DIR OTHER

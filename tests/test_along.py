@@ -80,7 +80,6 @@ def test_slopes_and_curvature_are_those_of_finite_differences(float64):
 
 
 def test_the_greatest_of_every_limit_is_the_peak_between_the_samples(float64):
-    """Compare no body rates: their peaks are too narrow even for 100 times as many samples."""
     columns, durations, given = jax.tree.map(lambda x: x[0], cases(dtype=np.float64))
     along, finer = dataclasses.replace(ALONG, nodes=20), 100
 
@@ -236,7 +235,7 @@ def test_the_kernel_declines_types_and_sizes_that_it_does_not_support():
 
 
 def test_the_name_of_a_kernel_does_not_depend_on_earlier_kernels(monkeypatch):
-    """Processes share compiled programs by the names of their kernels."""
+    """Processes share a compiled program only if its GPU kernels have equal names in them."""
     lane = jax.tree.map(lambda leaf: leaf[0], cases())
     others = [dataclasses.replace(ALONG, margins=(0.1, 0.1, 0.1, margin)) for margin in (0.2, 0.3)]
 

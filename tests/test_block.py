@@ -174,7 +174,7 @@ def test_end_poses_meet_the_ball(float64):
 @pytest.mark.slow
 @pytest.mark.parametrize("regime", ["R1", "R2"])
 def test_slopes_of_least_squares_are_those_of_the_cost(regime, float64):
-    """Let joints move at first and the contact be too late, so that all residuals count."""
+    """Let joints move at the start and the contact be too late, so that no residual is zero."""
     case = throw(regime=regime, rates=(0.3, -0.2, 0.1, 0.2, -0.4, 0.5), dtype=jnp.float64)
     flight = flight_of(case)
     poses = end_poses(case, flight, SMALL.points, SMALL.pieces)

@@ -246,7 +246,7 @@ def test_boxes_and_planes_are_planned_around_and_judged(hits, free, middle):
     first, last = (np.array([way(free, k)[place] for k in range(NUM)]) for place in (0, -1))
     across = np.cross(last - first, [0.0, 0.0, 1.0])
     across /= np.linalg.norm(across, axis=1, keepdims=True)
-    # Planes are parallel to the line from start to end, and forbid the side of the trajectory.
+    # Each plane is parallel to the line from start to end, and forbids the trajectory's side of it.
     side = np.sign(((middle - first) * across).sum(1, keepdims=True))
     depth = np.abs(((middle - first) * across).sum(1, keepdims=True))
     point = np.where(np.arange(NUM)[:, None] < 2, -FAR, first + 0.5 * depth * side * across)

@@ -1,4 +1,4 @@
-"""Programs that are lowered for CUDA contain the expected kernels; these tests need no GPU."""
+"""Programs that are lowered for CUDA contain the expected GPU kernels; no GPU is needed."""
 
 import re
 import sys
@@ -23,8 +23,8 @@ LANES = 128
 # Number of GPU kernels in one search: one predicts the ball's path, three integrate penalties,
 # one computes L-BFGS directions, one finds the plan's greatest violations of limits.
 ROUND = {"flight_table": 1, "integrate_along": 3, "lbfgs_turn": 1, "greatest_along": 1}
-# Number of kernels in a gradient: the ball's path and its derivative, first and second derivatives
-# of the penalties, and one inverse of the preconditioner.
+# Number of GPU kernels in a plan's gradient: the ball's path and its derivative, first and second
+# derivatives of the penalties, and the inverse of the preconditioner.
 GRADIENT = {"flight_table": 2, "integrate_along": 2, "positive_inverse": 1}
 
 

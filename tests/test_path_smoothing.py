@@ -92,7 +92,7 @@ def test_terms_have_their_closed_forms(float64):
     nothing, settings = walls_of([]), path_smoothing.Smoothing()
     line = np.stack([np.arange(9.0), np.zeros(9)], axis=1)
     assert cost(line, 1.0, nothing) == 0.0
-    # A right angle between steps of 0.5 m. The two unit vectors along the path differ by sqrt(2).
+    # The path turns by 90 degrees, so that the unit vectors along it differ by sqrt(2) there.
     steps = 0.5 * np.arange(-4.0, 5.0)
     corner = np.stack([np.minimum(steps, 0.0), np.maximum(steps, 0.0)], axis=1)
     excess = np.pi / 2 - CURVATURE * 0.5

@@ -227,7 +227,7 @@ def test_paths_differ_by_a_turn_just_if_a_wall_is_between_them():
 SMALL = {"searches": (Search(4, lattice=Lattice(layers=22)),)}
 PLANNER = path_then_speed.lattice(source=path_then_speed.PathSource(drawn=6), **SMALL)
 CROSSING = [SQUARE + [3.5, 1.5]]
-# A barrier across the whole map.
+# This obstacle crosses the whole map, so that no path leads past it.
 BARRIER = [[3.9, -0.5], [4.1, -0.5], [4.1, 8.5], [3.9, 8.5]]
 SCENES = {
     "free": (scene(), pj.Status.CONVERGED),

@@ -1,4 +1,4 @@
-"""Seeing a ball: camera, stereo noise, colour masks, fits of flights, hand-eye calibration."""
+"""Observation of balls: camera, stereo noise, colour masks, fitted paths, hand-eye calibration."""
 
 import colorsys
 

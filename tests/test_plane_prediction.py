@@ -124,7 +124,7 @@ def test_absent_observations_have_no_effect():
     cubic = fits(times, seen, weights)[2]
     expected = np.polyfit(TIMES[present], seen[present], 3)
     np.testing.assert_allclose(at(cubic, AHEAD), expected.T @ AHEAD ** np.arange(3, -1, -1.0))
-    # Another order of observations, and other values of the absent ones, give the same prediction.
+    # The prediction depends neither on the order of observations nor on values marked as absent.
     other = np.isin(TIMES, TIMES[present]).astype(float)
     wild, order = noisy(TURN), np.random.default_rng(3).permutation(15)
     wild[other == 0.0] = 9.0

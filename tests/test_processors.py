@@ -1,4 +1,4 @@
-"""Number of cores and threads that commands use, on which the rows of a run must not depend."""
+"""Number of cores and threads that commands use, on which a run's results must not depend."""
 
 import os
 import sys

@@ -90,7 +90,7 @@ def test_the_gradient_of_the_body_rate_matches_finite_differences(acc):
     assert_gradient_matches_differences(squared, point, rtol=1e-6)
 
 
-# Thrusts [m/s^2] in hover, nearly zero, zero (free fall), nearly downward and downward.
+# The thrusts [m/s^2] are: hover, nearly zero, zero (free fall), nearly downward, and downward.
 @pytest.mark.parametrize(
     "thrust", [(0, 0, GRAVITY), (1e-4, 0, 1e-5), (0, 0, 0), (1e-3, 0, -5.0), (0, 0, -5.0)]
 )

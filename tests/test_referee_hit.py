@@ -329,7 +329,7 @@ def test_an_infinite_limit_is_no_limit():
     [(None, 0.03, True), (0.11, 0.03, True), (0.11, 0.095, True), (0.11, 0.105, False)],
 )
 def test_a_racket_is_met_within_its_radius_less_a_margin(radius, off, passes):
-    """Check that a tenth of the radius at the rim is excluded at any tolerance."""
+    """Check that contacts within a tenth of the radius from the rim fail at any tolerance."""
     leaves = volley()
     after = leaves["target"][0] - CONTACT
     aside = np.array([-after[1], after[0], 0.0]) / np.hypot(*after[:2])

@@ -185,8 +185,8 @@ def test_a_mover_is_hit_at_its_position_and_time():
     assert assert_good(passing).mover_clearance[0] == pytest.approx(0.05)
     hit = good(**still, movers=([square(7.0, 1.0, 0.2), square(x, y - 0.05, 0.2)], way * 2))
     verdict = assert_fails(hit, "mover", excess=0.05, says="inside movers[1]")
-    # The depth is the shortest way out of the overlap. It is 0.05 m, to the side, once the overlap
-    # along the car is longer.
+    # The depth is the shortest motion out of the overlap. It is 0.05 m to the side, as soon as the
+    # overlap along the car is longer.
     assert verdict.failed_time[0] == pytest.approx(2.0 - 0.35 / 0.5, abs=0.02)
     convoy = good(movers=([square(START[0] + FRONT + 0.3, 4.0, 0.2)], [(SPEED, 0.0)]))
     assert assert_good(convoy).mover_clearance[0] == pytest.approx(0.1)

@@ -1,4 +1,4 @@
-"""Properties of every referee (check of plans): it judges each plan alone, and invalid input."""
+"""Properties of all referees, which check plans: each plan is judged alone, also invalid ones."""
 
 import dataclasses
 

@@ -1,4 +1,4 @@
-"""`pj.replan` for hits and catches, and planners without a re-planner."""
+"""`pj.replan` for hits and catches, and its errors for planners that only plan from scratch."""
 
 import dataclasses
 

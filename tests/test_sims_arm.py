@@ -68,7 +68,8 @@ def plans(*motions, contact, status=None):
 
 
 STILL = motion(0.0 * TURN)
-# Standstill, a motion to rest, a motion to rest in the other direction, and a motion without rest.
+# The motions are standstill, two motions in opposite directions that end at rest, and one that
+# ends with moving joints.
 MOTIONS = (STILL, motion(TURN), motion(-0.3 * TURN), motion(0.6 * TURN, ends_at_rest=False))
 
 

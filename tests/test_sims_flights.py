@@ -114,7 +114,7 @@ WIDER = [bounds(Loop(CATCH_WORLD), distance) for distance in LIMITS]
 def test_a_ball_is_planned_alone_where_no_plan_can_include_the_next_ball():
     suite = jax.tree.map(np.asarray, pj.catch.draw(2, "throws", seed=4, num_targets=2))
     both = dataclasses.replace(suite, present=np.ones((2, 2), bool))
-    # The next ball of the second case must be caught immediately.
+    # In the second case the next ball must be caught at once, so that no plan catches both balls.
     both = dataclasses.replace(both, horizon=both.horizon * np.array([[1.0, 2.0], [1.0, 0.02]]))
     known, plans = plan_ahead(pj.catch.planner(decide="greedy"), both, 0, WIDER)
     assert not known.present[1, 1] and known.present[1, 0]

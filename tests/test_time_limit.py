@@ -1,4 +1,4 @@
-"""Time limits and reports of progress, by a clock that moves with every report."""
+"""Time limits and progress reports of `pj.plan`, with a clock that only reports advance."""
 
 import dataclasses
 import types

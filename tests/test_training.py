@@ -1,4 +1,4 @@
-"""A training learns, can be watched, and continues bit for bit after an interruption."""
+"""Training of policies: they improve, and training continues bit for bit after interruptions."""
 
 import dataclasses
 import json

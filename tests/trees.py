@@ -9,7 +9,7 @@ def as_numpy(tree):
 
 
 def assert_same(ours, theirs, lanes=...):
-    """Assert equal types of the arrays of two pytrees, and equal values at the indices `lanes`."""
+    """Assert that arrays of two pytrees have equal types, and equal values at indices `lanes`."""
     for a, b in zip(jax.tree.leaves(ours), jax.tree.leaves(theirs), strict=True):
         assert a.dtype == b.dtype
         np.testing.assert_array_equal(np.asarray(a)[lanes], np.asarray(b)[lanes])

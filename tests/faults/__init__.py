@@ -4,7 +4,7 @@
 import os
 from pathlib import Path
 
-# The variables apply to `python -m tests.faults` and its commands, and equal tests/conftest.py.
+# These variables, as in tests/conftest.py, are for `python -m tests.faults` and its commands.
 CACHE = Path(__file__).resolve().parents[2] / ".cache" / "jax"
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(CACHE))

@@ -1,4 +1,4 @@
-"""Small runs whose files tests damage, and checks of what readers of the files do then."""
+"""Small run folders whose files tests damage, and checks of what readers of these files do."""
 
 import contextlib
 import dataclasses

@@ -23,7 +23,7 @@ COMMAND = ("sweep", "hit", "--num", "40", "--batch", "13", "--seed", "3", "--out
 
 
 class Killed(BaseException):
-    """Exception in place of SIGKILL."""
+    """An exception that tests raise in place of a SIGKILL, which would end the tests, too."""
 
 
 def failing(monkeypatch, number, error):

@@ -35,7 +35,7 @@ sweep = partial(start, "sweep", module=QUICK)
 class Trial(NamedTuple):
     name: str
     words: str  # of the table
-    # It takes a random generator, a number of faults, an empty folder, undisturbed runs' folder.
+    # `run` takes a random generator, a number of faults, an empty folder, and undisturbed runs.
     run: Callable[[random.Random, int, Path, Path], Survived]
     num: int
     most: int  # faults that one process tries

@@ -19,7 +19,7 @@ import planner_jax as pj
 
 @struct.dataclass
 class MeetCase:
-    """The states of robot and target at time 0, and the robot's limit; world frame in the plane."""
+    """The states of robot and target in the plane at time 0, and the acceleration limit."""
 
     pos: Array  # (2,) [m], of the robot
     vel: Array  # (2,) [m/s]
