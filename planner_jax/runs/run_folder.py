@@ -142,11 +142,11 @@ class RunFolder:
                     path.unlink(missing_ok=True)
 
     def read_manifest(self) -> Entries:
-        """Read the manifest; raise `ArgumentError` if it is missing, edited or damaged."""
+        """Read the run's `manifest.json`; raise `ArgumentError` if missing, edited or damaged."""
         return read_written(self.path / MANIFEST, self.name, "a run")
 
     def write_manifest(self, manifest: Entries) -> Entries:
-        """Replace the manifest, and return the JSON object that the file now holds."""
+        """Replace the run's `manifest.json`, and return the JSON object that it then holds."""
         text = json.dumps(to_write(manifest), indent=2, allow_nan=False)
         self.write_text(MANIFEST, text + "\n")
         return json.loads(text)

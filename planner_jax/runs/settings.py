@@ -41,7 +41,7 @@ def recovery_option(usual: str = NONE) -> str:
 
 
 def recovery_options(value: str) -> dict[str, str]:
-    """Return the planner's arguments for `recovery`, {} for "none"; raise if it is unknown."""
+    """Return the planner's keyword arguments for the option `recovery`, which are {} for "none"."""
     require_one_of(CHOICES, "recovery", value)
     return {} if value == NONE else {"recovery": value}
 
@@ -54,7 +54,7 @@ def require_count(name: str, value: int | None, least: int, *, none: bool = Fals
 
 @dataclasses.dataclass(frozen=True)
 class SweepSettings:
-    """Settings that the sweeps of all tasks have; a task's subclass adds further settings."""
+    """Settings of a sweep (run over many cases) of any task; subclasses add a task's settings."""
 
     planner: str | None = option(None, "NAME", "")  # None selects the task's first planner
     suite: str | None = option(None, "NAME", "")  # None selects the task's first suite

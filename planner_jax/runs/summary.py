@@ -1,4 +1,4 @@
-"""Success rates and other counts of a sweep, computed from its stored rows."""
+"""Success rates and other counts of a run over many cases, computed from its stored rows."""
 
 from collections import Counter
 from typing import Any, ClassVar
@@ -31,7 +31,7 @@ COUNTED = ("index", "success", "status", "failed_limit")
 
 
 class Tally:
-    """Counts over the rows of a sweep, to which the rows are added one table after another."""
+    """Counts over the planned and judged cases of a run, whose rows are added table by table."""
 
     READS: ClassVar[tuple[str, ...]] = ()  # columns that are read; () stands for all columns
     MEANS: ClassVar[tuple[str, ...]] = ()  # columns whose mean over the successes is reported

@@ -13,8 +13,7 @@ from planner_jax.core.protocol import take
 from planner_jax.planning.plan import CaseT, PlanT, plan
 
 # Prefix of the names of JAX's events of tracing, lowering, compiling and reading the compile cache.
-# Events overlap in time, since functions are traced within functions. The compile time is the
-# length of the union of their time spans.
+# Events overlap in time, since functions are traced within functions.
 _COMPILING = "/jax/core/compile/"
 _WARM_CALLS = 3  # greatest number of calls until one in which JAX compiles nothing
 

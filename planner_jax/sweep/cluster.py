@@ -1,4 +1,4 @@
-"""Workers of a Ray cluster that plan the chunks of a sweep, for the option `--workers ray`.
+"""Workers of a Ray cluster that plan a run over many cases, for the option `--workers ray`.
 
 A chunk is a block of consecutive cases. One Ray task plans and judges a chunk, and returns the
 bytes of the Parquet file with its rows. If a worker dies, Ray repeats its task on another worker.

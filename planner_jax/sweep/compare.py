@@ -25,7 +25,7 @@ _READ = ("index", "success", "failed_limit", "cost", "iterations")
 
 @dataclasses.dataclass(frozen=True)
 class ComparedRun:
-    """A finished sweep of B cases, with the columns that are compared with other sweeps."""
+    """A finished run over B cases, with the columns that are compared with other runs."""
 
     name: str  # path of the run's folder, as the user wrote it
     manifest: Entries

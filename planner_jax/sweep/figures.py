@@ -90,7 +90,7 @@ def quadrotor_figure(
 
 
 def look_of(index: int, name: str, row: Row) -> Entries:
-    """Return the line style of a plan: dashed if it failed, thick if the run's planner made it."""
+    """Return the line style of plan `index`: dashed if it failed, thick if it is the first."""
     return {
         "color": style.PLANNER_COLOURS.get(name, style.INK),
         "linestyle": "-" if row["success"] else (0, (4, 1.5)),

@@ -1,4 +1,4 @@
-"""Columns and sampled trajectories that the sweeps of hits and catches by quadrotors share."""
+"""Columns of stored cases, and sampled trajectories, for runs of quadrotors that hit or catch."""
 
 import dataclasses
 from collections.abc import Sequence

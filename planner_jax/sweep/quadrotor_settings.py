@@ -1,4 +1,4 @@
-"""Settings that the sweeps of hits and catches share, because both robots are quadrotors."""
+"""Settings of runs over many cases in which quadrotors hit or catch."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -53,7 +53,7 @@ def robot_remark(parameters: Row) -> list[str]:
 
 @dataclasses.dataclass(frozen=True)
 class QuadrotorSettings(SweepSettings):
-    """Settings that the sweeps of all tasks with a quadrotor have."""
+    """Settings of a run over many cases in which quadrotors hit or catch."""
 
     limit_scale: float = option(1.0, "F", "factor on the limits of speed, body rate and thrust")
     robot: object = robot_option("the task's")

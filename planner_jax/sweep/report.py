@@ -1,4 +1,4 @@
-"""Report of a finished sweep: table, figures and HTML page, made from the files of its folder."""
+"""Report of a finished run over many cases: table, figures and HTML page, from its folder."""
 
 import html
 import math

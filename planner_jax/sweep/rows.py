@@ -1,4 +1,4 @@
-"""Cases and plans of finished sweeps, restored from the rows of a run for the command line."""
+"""Cases and plans of a finished run, restored from its table of cases for the command line."""
 
 import numpy as np
 from jax import Array

@@ -98,8 +98,8 @@ def resume_sweep(
     Rows are stored in one file per chunk of cases. The cases of a file that is missing, damaged or
     of another run are planned again. The rows equal the rows of an uninterrupted run.
 
-    The settings `given` by name must equal the run's settings. The other arguments and errors are
-    as for `start_sweep`; `workers` may differ from those of the interrupted sweep.
+    The settings `given` by name must equal the run's settings. `progress` shows a progress bar.
+    `workers` "ray" plans in a Ray cluster, None in this process, whichever the run used.
 
     Raises:
         ArgumentError: the folder does not hold a sweep of this task, a given setting differs, or

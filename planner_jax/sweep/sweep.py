@@ -1,4 +1,4 @@
-"""The class `Sweep`: what a sweep needs from its task, such as columns, table and figures."""
+"""The class `Sweep`: what a run over many cases needs from its task, such as columns, figures."""
 
 import contextlib
 import dataclasses
@@ -37,7 +37,7 @@ class RunFigure:
 
 
 class Sweep(Generic[AnySettings]):
-    """Base class of the sweeps of a task: it provides cases, plans and judges them, and reports."""
+    """Base class for a task's runs over many cases: it makes, plans, judges and reports them."""
 
     frame: ClassVar[str] = ""  # text on the coordinate frame and time origin of the columns
     # Columns of the rows; () stands for a column for each array of cases, plans and verdicts.

@@ -1,4 +1,4 @@
-"""The sweep of blocks: robot arms block thrown balls, known exactly or observed by a camera."""
+"""Runs over many cases of an arm that blocks a ball, known exactly or observed by a camera."""
 
 from collections.abc import Sequence
 

@@ -1,4 +1,4 @@
-"""Figures in the report of a sweep of catches: one plan in space, and plans over time."""
+"""Figures in the report of many planned catches: one plan in space, and plans over time."""
 
 from typing import NamedTuple
 

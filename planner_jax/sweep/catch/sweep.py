@@ -1,4 +1,4 @@
-"""The sweep of catches by quadrotors with a net, compared with the rates of [Yu2023catch]."""
+"""Runs over many cases of catching with a net, compared with the rates of [Yu2023catch]."""
 
 import numpy as np
 import pyarrow as pa

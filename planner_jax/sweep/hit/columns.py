@@ -1,4 +1,4 @@
-"""Columns of the rows that a sweep of hits stores: serve, plan and the referee's verdict."""
+"""Columns of stored cases of hitting a ball: serve, plan and the referee's verdict."""
 
 import numpy as np
 import pyarrow as pa

@@ -1,4 +1,4 @@
-"""Figures in the report of a sweep of hits: the court, one case in space, plans over time."""
+"""Figures in the report of many planned hits: the court, one case in space, plans over time."""
 
 import numpy as np
 from matplotlib.axes import Axes

@@ -1,4 +1,4 @@
-"""The sweep of hits: quadrotors return serves in the 36 court scenarios of [Yu2023bat]."""
+"""Runs over many hits: quadrotors return serves in the 36 court scenarios of [Yu2023bat]."""
 
 import dataclasses
 

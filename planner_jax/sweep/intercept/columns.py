@@ -1,4 +1,4 @@
-"""Columns of the rows that a sweep of interceptions stores: case, plan and verdict."""
+"""Columns of stored cases of a car that meets a target: case, plan and referee's verdict."""
 
 from collections.abc import Callable
 

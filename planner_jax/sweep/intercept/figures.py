@@ -1,4 +1,4 @@
-"""Figures in the report of a sweep of interceptions: cases from above, and plans over time."""
+"""Figures in the report of many planned interceptions: cases from above, plans over time."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
@@ -192,7 +192,7 @@ def entries(colours: ScalarMappable) -> list[Artist]:
 
 
 def instants(end: float, most: int) -> np.ndarray:
-    """Return at most `most` round, equally spaced times [s] from 0 to `end`."""
+    """Return at most `most` times [s] from 0 to `end`: multiples of 1, 2, 2.5 or 5 times 10^k."""
     steps = [mantissa * 10.0**power for power in range(-3, 9) for mantissa in (1.0, 2.0, 2.5, 5.0)]
     num, step = next((n, step) for step in steps if (n := int(end / step + 1e-6)) < most)
     return step * np.arange(num + 1)

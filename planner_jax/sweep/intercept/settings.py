@@ -1,4 +1,4 @@
-"""Settings of the sweeps of cars that meet one moving target, or a group of targets."""
+"""Settings of runs over many cases of a car that meets one moving target, or a group."""
 
 import dataclasses
 from typing import ClassVar
@@ -10,7 +10,7 @@ from planner_jax.task.group.spec import DECISIONS
 
 @dataclasses.dataclass(frozen=True)
 class InterceptSettings(SweepSettings):
-    """Settings of a sweep of cars that each meet one moving target."""
+    """Settings of a run over many cases of a car that meets one moving target."""
 
     RUN: ClassVar[str] = "planner_jax.sweep.intercept.sweep:InterceptSweep"
     CASE_BYTES: ClassVar[int] = 100_000
@@ -20,7 +20,7 @@ class InterceptSettings(SweepSettings):
 
 @dataclasses.dataclass(frozen=True)
 class GroupSettings(SweepSettings):
-    """Settings of a sweep of cars that each meet a group of targets one after another."""
+    """Settings of a run over many cases of a car that meets several targets in turn."""
 
     decide: str = option("best", "NAME", f"decision about the order: {', '.join(DECISIONS)}")
 

@@ -1,4 +1,4 @@
-"""The sweep of interceptions: cars that meet moving targets among walls and moving obstacles."""
+"""Runs over many cases of a car that meets a moving target among walls and moving obstacles."""
 
 import numpy as np
 import pyarrow as pa
@@ -51,7 +51,7 @@ class InterceptSweep(Sweep[InterceptSettings]):
     )
 
     def other_planners(self, settings: InterceptSettings) -> Entries:
-        """Return only the planners named in `COMPARED`, because each compiles for a minute."""
+        """Return only the planners named in `COMPARED`, because the others take long to compile."""
         others = super().other_planners(settings)
         return {name: others[name] for name in COMPARED if name in others}
 

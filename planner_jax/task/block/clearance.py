@@ -64,7 +64,7 @@ def least_clearances(arm: Arm, scene: Scene, angles: Array) -> Array:
 def clearances_and_slopes(
     arm: Arm, scene: Scene, angles: Array
 ) -> tuple[Array, Callable[[Array], Array]]:
-    """Return distances (R, N) [m], as `clearances` does, and a function for their derivatives.
+    """Return distances (R, N) [m] of R pairs of bodies in N poses, and their derivative function.
 
     The function takes the indices (W,) of W of the N poses, and returns the derivatives of the R
     distances at these poses by the joint angles, (R, 6, W) [m/rad]. The derivative by a joint that

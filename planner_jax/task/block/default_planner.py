@@ -163,7 +163,7 @@ class OnlineBlock(Planner):
         return place_numbers(StraightSearch(**vars(attempt)) if is_small else attempt)
 
     def compiles_quickly(self, attempt: Search) -> bool:
-        """Return whether the attempt's program is compiled in less time, though it runs slower.
+        """Return whether a search's program is compiled in less time, though it then runs slower.
 
         This is true for least squares: few cases need them, so that their run time matters less.
         """
@@ -218,7 +218,7 @@ class OnlineBlock(Planner):
         return dataclasses.replace(plan, status=explain_status(poses, plan.status))
 
     def solve_at_once(self, cases: BlockCase, attempt: Search) -> BlockPlan:
-        """Return the plans of a batch, by equal sequences of computations, as `jax.vmap` needs."""
+        """Return the plans of a batch; every case runs the same computations, as for `jax.vmap`."""
         return jax.vmap(lambda case: self._solve_in_step(case, attempt))(cases)
 
     def _solve_in_step(self, case: BlockCase, attempt: Search) -> BlockPlan:

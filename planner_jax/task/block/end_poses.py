@@ -133,7 +133,7 @@ def face_ball(velocity: Array) -> Array:
 
 
 def frame_of(normal: Array) -> Array:
-    """Return a rotation (3, 3) with the first column `normal` (3,) and a horizontal second one."""
+    """Return a rotation (3, 3) whose first column is `normal` (3,), the second one horizontal."""
     flat = jnp.sqrt(jnp.maximum(normal[0] ** 2 + normal[1] ** 2, 1e-12))
     side = jnp.stack([-normal[1], normal[0], jnp.zeros_like(flat)]) / flat
     return jnp.stack([normal, side, jnp.cross(normal, side)], axis=1)

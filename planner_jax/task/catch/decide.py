@@ -118,7 +118,6 @@ def beam(case: CatchCase, table: Timetable, width: int) -> CatchChoice:
         taken = jnp.sum(jnp.where(left, 0, bits[:, None]), axis=2, keepdims=True)
         *others, last = (taken | bits[:, None]).reshape(len(words), -1)
         state = (*others, last * num + jnp.tile(np.arange(num), width))
-        # Among sequences with equal sets of targets and equal last targets only the best continues.
         sorted_ = jnp.lexsort((rank, *state))
         alike = [jnp.diff(word[sorted_], prepend=-1) == 0 for word in state]
         again = functools.reduce(jnp.logical_and, alike)

@@ -42,7 +42,7 @@ class GroupIntercept(Planner):
     patient: SpacetimeIntercept = SpacetimeIntercept("least")  # for legs that `planner` fails
 
     def plan_by(self, drive: Drive, cases: InterceptGroup) -> GroupPlan:
-        """Plan the ways to one target after another; other planners are called through `drive`."""
+        """Plan one leg (path to one target) after another; `drive` calls the legs' planner."""
         if cases.batch_shape == ():
             plans = self.plan_by(drive, jax.tree.map(lambda leaf: leaf[None], cases))
             return jax.tree.map(lambda leaf: leaf[0], plans)

@@ -41,7 +41,7 @@ SCENARIOS = tuple(
 
 
 def region_bounds(depth: float = HALF_LENGTH) -> np.ndarray:
-    """Return bounds (4, 2, 2) [m]: four regions, |x| and y, lower and upper; |x| <= `depth`."""
+    """Return bounds (4, 2, 2) [m] of four regions: |x| up to `depth`, and y, each from and to."""
     near, far = (DEAD_ZONE, NEAR_LINE), (NEAR_LINE, depth)
     whole, middle = (DEAD_ZONE, depth), (-LANE_LINE, LANE_LINE)
     left, right = (LANE_LINE, HALF_WIDTH), (-HALF_WIDTH, -LANE_LINE)
@@ -55,7 +55,7 @@ def scenario_regions(scenario) -> np.ndarray:
 
 
 def target_of(scenario) -> np.ndarray:
-    """Return the targets (..., 3) [m] of scenarios (...), which are indices in SCENARIOS."""
+    """Return the landing points (..., 3) [m] to aim at in scenarios (...), indices in SCENARIOS."""
     return np.array(TARGETS)[scenario_regions(scenario)[..., 2] - 1]
 
 
