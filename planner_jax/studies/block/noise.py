@@ -63,7 +63,7 @@ def stereo_noise(
             camera of [Natarajan2024]. Most other defaults are assumptions.
         pixel_std: [px], standard deviation of the ball's centre along each image axis.
         disparity_std: [px], standard deviation of the disparity, averaged over the ball.
-        speckle_std: [px], further standard deviation for one pixel, with a usual value as default.
+        speckle_std: [px], further standard deviation of one pixel's disparity; usually 0.2 px.
         dropout: probability that a pixel, or a ball in a frame, has no depth.
         mismatch: probability that a pixel has the depth of another object.
 

@@ -96,6 +96,6 @@ class SeeingArms(Planner[BlockCase, SeenPlan]):
         return moments
 
     def _seeds(self, cases: BlockCase) -> np.ndarray:
-        """Return the seed of each case's noise, computed from its ball and not from its batch."""
+        """Return a seed of the noise for each ball, which does not depend on the other balls."""
         balls = np.concatenate([cases.ball.pos, cases.ball.vel], axis=1).astype(np.float32)
         return np.array([zlib.crc32(ball.tobytes(), self.seed) for ball in balls], np.uint32)

@@ -51,7 +51,7 @@ class ServeSource(Source):
         return Chunk(serves.index, jax.tree.map(np.asarray, cases), serves)
 
     def check(self) -> PyTree:
-        """Check the first chunk of cases; all chunks if the serves are read from files."""
+        """Return the first `batch` cases; raise if one, or any serve of a file, is invalid."""
         cases = super().check()
         for chunk in range(1, 1 if self.folder is None else self.num_chunks):
             self.chunk(chunk)

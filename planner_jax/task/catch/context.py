@@ -73,7 +73,7 @@ def is_too_far(context: CatchContext) -> Array:
     """Return true only if the quadrotor provably cannot catch some target at any time, () bool.
 
     At a catch the quadrotor's distance from the target is at most height plus radius of the net,
-    and the quadrotor is above its least height. These conditions are tested at `_TIMES` times. A
+    and the quadrotor is above its least height. These conditions are tested at 32 times. A
     catch is within half a step of such a time, so the distances that target and quadrotor can move
     in half a step are added.
 

@@ -36,13 +36,13 @@ if TYPE_CHECKING:
     from planner_jax.task.catch.replan import ReplanCatch
 
 _PROPORTIONS = (0.3,) + (1.0,) * 5
-_FEATURE_TIMES = (-0.1, 0.1)  # [s] times of the ball that the network sees, after the decided time
+_FEATURE_TIMES = (-0.1, 0.1)  # [s] times of the network's inputs, after the estimated catch
 _RIM = 0.9  # greatest distance of a catch from the net's centre, relative to the net's radius
 # Greatest norm of the two unbounded variables that determine a catch point, if a network predicts
 # them. The point is then at most 0.89 * `_RIM` * (radius of the net) from the net's centre.
 _LEARNED_SIZE = 2.0
 _ENCODED_RIM = 0.99  # greatest distance of a catch point made by `encode`, relative to `_RIM`
-# Starting points, the most successful first. Column 1 is a factor on the decided times of the
+# Starting points, the most successful first. Column 1 is a factor on the estimated times of the
 # catches. Columns 2 and 3 are the velocity at catches before the last one and at the last one,
 # relative to the mean velocity since the previous catch. Columns 4 and 5 are the thrust at these
 # catches: -1 is the least, 0 hover, 1 the greatest thrust.
@@ -64,8 +64,8 @@ _ROUNDS = (
     Round(starts=6, solver=LbfgsConfig(max_steps=200)),
 )
 _FROM_LEARNED = Round(starts=1, solver=LbfgsConfig(max_steps=2))  # from a network's starting point
-# With several targets these iterations of L-BFGS run before Newton's method, because the eight
-# iterations of `_FIRST` would end too far from the optimum.
+# Settings of L-BFGS, which runs before Newton's method if there are several targets, because the
+# eight iterations for a single target would end too far from the optimum.
 _LONG_CHAIN = Stage(LbfgsConfig(max_steps=200, tolerance=1e-6, patience=5))
 _CHAIN_TOLERANCE = 1e-4
 # If more than `_FEW` targets must all be caught, the first attempt has `_STEPS_A_TARGET` iterations

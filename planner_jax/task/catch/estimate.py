@@ -132,8 +132,8 @@ def follow(case: CatchCase, table: Timetable, order: Array) -> tuple[CatchChoice
 def earliest_next(case: CatchCase, table: Timetable, handicap: Array) -> CatchChoice:
     """Return the order in which the next target is always the target with the earliest catch.
 
-    Before the times are compared, the target's `handicap` [s] is added to its time. Optional
-    targets that are out of reach are not caught; they and absent targets come last.
+    Before the times are compared, `handicap` (N,) [s] is added to the times of N targets, which
+    makes other orders possible. Optional targets out of reach, and absent targets, come last.
     """
     speed = top_speed(case)
 
@@ -161,7 +161,7 @@ def can_be_next(case: CatchCase, shortfalls: Array) -> Array:
     """Return which of N targets may be caught next, (N,) bool.
 
     These are all targets that are present. Optional targets must also be within reach: estimates
-    of the distances `shortfalls` (N,) [m] by which they are missed must be at most `_MARGIN`.
+    of the distances `shortfalls` (N,) [m] by which they are missed must be at most 0.8 m.
     """
     return case.present & (shortfalls <= _MARGIN) if case.optional else case.present
 

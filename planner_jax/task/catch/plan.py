@@ -33,7 +33,7 @@ class CatchPlan(QuadrotorPlan):
 
     @property
     def choice(self) -> CatchChoice:
-        """Order, decided times, and which targets are caught, for `CatchCase.with_choice`."""
+        """Order of the targets, guessed times of their catches, and which targets are caught."""
         order = jnp.asarray(self.order)
         taken = jnp.take_along_axis(self._is_catch, jnp.argsort(order, axis=-1), axis=-1)
         return CatchChoice(order=self.order, times=self.decided_times, taken=taken)

@@ -180,7 +180,7 @@ class ReplanCatch(OptimisedPlanner):
         return self.planner.objective(jnp.where(context.keep, context.start, point), context.catch)
 
     def decode(self, point: Array, context: ReplanContext) -> CatchPlan:
-        """Return the plan at `point`; shortly before a catch, the previous plan's remainder."""
+        """Return the plan at `point`, or if `context.keep` the remainder of the previous plan."""
         plan = self.planner.decode(point, context.catch)
         return jax.lax.cond(
             context.keep, lambda: _remainder(context.task, context.catch), lambda: plan
@@ -207,11 +207,7 @@ def _segments(task: Replanning) -> tuple[Array, Array]:
 
 
 def _remainder(task: Replanning, context: CatchContext) -> CatchPlan:
-    """Return the remainder of the previous plan in the same number of pieces.
-
-    The remainder of the current piece is split into equal parts, which replace the piece itself and
-    the earlier pieces of its segment.
-    """
+    """Return the remainder of the previous plan, in the same number of polynomial pieces."""
     previous, num = task.previous, context.times.size
     segments, times = _segments(task)
     path = previous.trajectory

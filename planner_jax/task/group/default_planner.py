@@ -1,8 +1,8 @@
 """The default planner of groups of targets: it plans leg after leg, each as early as possible.
 
-A leg is the drive to one target. It starts at the end of the previous leg, with targets and moving
-obstacles moved to that time. `SpacetimeIntercept` plans each leg such that the meeting is as early
-as possible. If this fails, it plans the leg with the least squared acceleration instead. The first
+A leg is the drive to one target. It starts when the previous leg ends, with targets and obstacles
+where they then are. `SpacetimeIntercept` plans each leg such that the meeting is as early as
+possible. If this fails, it plans the leg with the least squared acceleration instead. The first
 legs of all groups of a batch, in all proposed orders, are planned together, then all second legs.
 """
 

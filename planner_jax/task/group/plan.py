@@ -23,5 +23,5 @@ class GroupPlan(Plan):
 
     @property
     def choice(self) -> GroupChoice:
-        """The order of the plan, in the form that `InterceptGroup.with_choice` accepts."""
+        """The order in which the plan meets its targets, for `InterceptGroup.with_choice`."""
         return GroupChoice(order=self.order)

@@ -1,6 +1,6 @@
 """Seeded random cases of groups: several targets for one car among walls and moving obstacles.
 
-`docs/suites.md` states how they are drawn. World frame in the plane, SI units.
+`docs/suites.md` states how cases are drawn. World frame in the plane, SI units.
 """
 
 import dataclasses
