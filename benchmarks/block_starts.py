@@ -190,14 +190,16 @@ def select_starts(solves: np.ndarray) -> list[int]:
 
 
 def learn(bench: Bench, num: int, tries: int, lanes: int) -> list[dict[str, Any]]:
-    """Draw throws, and learn starting points of the least-squares search from them.
+    """Draw throws, and learn initial motions for the planner's search of blocks by least squares.
 
-    Returns the starting points in the order in which the planner tries them.
+    An initial motion is a straight motion, in which all joints move in proportion, plus a bump.
+    Returns the rank of the straight motion's end pose and the bump of each initial motion, in the
+    order in which the planner tries them.
 
     Args:
         bench: prints the share of solved throws.
         num: number of throws.
-        tries: number of random starting points for each throw.
+        tries: number of random initial motions for each throw.
         lanes: number of searches that run in one call.
     """
     rng = np.random.default_rng(0)

@@ -146,8 +146,8 @@ _propose = jax.jit(pj.catch.Greedy().propose)
 def warm_up(case: CatchCase) -> None:
     """Compile all searches of the planner and the re-planner.
 
-    The planner starts a later search only for cases that are not solved. In the case used here the
-    quadrotor's speed limit is near zero, so no search solves it and all are compiled.
+    The planner starts a later search only for cases that are not solved. The quadrotor's speed
+    limit is therefore set near zero, so that no search solves the case and all are compiled.
     """
     stuck = dataclasses.replace(
         case, limits=dataclasses.replace(case.limits, speed=np.float32(1e-3))

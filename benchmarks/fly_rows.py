@@ -56,7 +56,6 @@ def format_rate(good: np.ndarray) -> str:
 
 
 def format_quantiles(values: np.ndarray, scale: float, unit: str) -> str:
-    """Format median, 90 % quantile and maximum of the finite values, multiplied by `scale`."""
     kept = values[np.isfinite(values)]
     if not kept.size:
         return "none"

@@ -63,11 +63,11 @@ def earliest_bound(scene: Scene) -> tuple[bool, float]:
 def _limit_steps(scene: Scene) -> np.ndarray:
     """Return upper bounds (2 L,) [m] on the distance covered in each half of L time steps.
 
-    This is the distance of the body's middle, which is b ahead of the rear axle. On a path of
-    curvature kappa, its speed is sqrt(v^2 + (b v kappa)^2), where v is the speed of the rear axle.
-    The term (v kappa)^2 is the curvature kappa times the lateral acceleration v^2 kappa, and both
-    are limited. The speed is convex in v, so for linearly increasing v the trapezoid rule is an
-    upper bound.
+    The bounds are for the body's middle, which is b ahead of the rear axle. On a path of curvature
+    kappa, its speed is sqrt(v^2 + (b v kappa)^2), where v is the speed of the rear axle. The term
+    (v kappa)^2 is the curvature kappa times the lateral acceleration v^2 kappa, and both are
+    limited. The speed is convex in v, so for linearly increasing v the trapezoid rule is an upper
+    bound.
     """
     step = 0.5 * scene.dt
     times = step * np.arange(2 * len(scene.target) - 1)

@@ -43,7 +43,7 @@ REPEATS = 3  # The fastest of this number of calls is reported.
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """Results of one planner on B path problems, for one row of the table."""
+    """Results of one planner on B path problems."""
 
     found: np.ndarray  # (B,) bool, whether the planner has found a path
     clear: np.ndarray  # (B,) bool, whether the body touches no wall at any pose of the path

@@ -306,9 +306,10 @@ def report(
 def report_bound(
     bench: Bench, observed: Observations, truth: InterceptCase, turning: np.ndarray
 ) -> None:
-    """Print the share of first predictions within 0.3 m of the target at the meeting's time.
+    """Print the share of predictions within 0.3 m of the target, made at the start of the drive.
 
-    Also print this share for the best unbiased predictor, by the Cramer-Rao bound.
+    The target is predicted at the time of the meeting. Also print this share for the best unbiased
+    predictor, by the Cramer-Rao bound.
     """
     times = np.asarray(truth.time)
     there = positions(truth.target, times)

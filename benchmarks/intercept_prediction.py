@@ -95,8 +95,9 @@ def predict(truth: jax.Array, seen: jax.Array) -> tuple[jax.Array, ...]:
 
     Returns:
         off: (methods, 4) [m], distances of the predictions from the true positions.
-        nearer: () probability, according to the error distribution that `select` estimates, of an
-            error 10 s ahead below the actual error. It is uniform if the estimate is right.
+        nearer: () probability of an error below the actual error 10 s ahead, by the error
+            distribution that the method `select` estimates. Over many targets it is uniform if the
+            estimate is right.
         residual: () [m], deviation of the observations from the path that `select` chose.
         is_turning: () bool, whether `select` chose a turn.
     """

@@ -31,9 +31,9 @@ PLANNER = ExactHit()
 
 
 def make_own_solver(iterations: int) -> Callable:
-    """Return a function that minimises the objective of one case with this library's L-BFGS.
+    """Return a function that minimises the planner's objective for one hit with own L-BFGS.
 
-    The function returns the decision variables and the number of iterations.
+    The function maps a case to n decision variables (n,) and the number of iterations.
     """
 
     def solve(case):
@@ -48,10 +48,10 @@ def make_own_solver(iterations: int) -> Callable:
 
 
 def make_optax_solver(iterations: int) -> Callable:
-    """Return a function that minimises the objective of one case with optax.lbfgs.
+    """Return a function that minimises the planner's objective for one hit with optax.lbfgs.
 
-    It uses optax's zoom line search, and returns the decision variables and the number of
-    iterations.
+    It uses optax's zoom line search. The function maps a case to n decision variables (n,) and the
+    number of iterations.
     """
 
     def solve(case):

@@ -91,9 +91,10 @@ def compare(task: Any, num: int, every: int, seed: int) -> dict[str, int]:
 
 
 def measure(bench: Bench, options: argparse.Namespace) -> None:
-    """Plan a batch with and without invalid cases, and print the counts of `compare`.
+    """Plan a batch with and without invalid cases, and print two counts.
 
-    The counts are how many invalid cases are marked, and how many plans of other cases are equal.
+    The counts are how many invalid cases are marked as invalid, and how many plans of other cases
+    are equal in both batches.
     """
     task = pj.task_named(options.task)
     found = compare(task, options.num, options.every, options.seed)

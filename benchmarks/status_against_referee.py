@@ -36,7 +36,7 @@ TOLERANCE = 1e-3  # The referee accepts limits that are exceeded by up to this r
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """Definition of a row of the table: how its cases are drawn, planned and judged."""
+    """One kind of cases of a task: how they are drawn, planned and judged."""
 
     task: str
     suite: str

@@ -49,7 +49,7 @@ def report(*, out: str | os.PathLike | None = None, **settings: Any) -> None:
 
     Args:
         out: run folder, new or empty; None for a new folder in runs/.
-        **settings: fields of `ThroughputSettings`.
+        **settings: fields of `ThroughputSettings`, such as the task and the batch sizes.
 
     Raises:
         ArgumentError: the folder cannot be written, or a setting is invalid.

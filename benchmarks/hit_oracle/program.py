@@ -61,9 +61,10 @@ OPTIONS = {
 
 
 def case_parameters(case: HitCase) -> dict[str, np.ndarray]:
-    """Return the program's parameters, as named in `PARAMETERS`, for one case without batch axis.
+    """Return the numbers of one case on which the program depends, by name, in SI units.
 
-    The ball's path with drag is integrated numerically and approximated by a polynomial.
+    The case has no batch axis. The ball's path with drag is integrated numerically and approximated
+    by a polynomial.
     """
     drag, floor = float(case.drag), float(case.target[2])
     fall = np.array([0.0, 0.0, -float(case.gravity)])

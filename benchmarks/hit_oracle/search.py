@@ -64,8 +64,8 @@ def worst_ratios(motion: list[np.ndarray], durations: np.ndarray, values: dict) 
     """Return for each of M pieces (M,) the largest ratio of a quantity to its limit.
 
     The quantities are speed, acceleration and body rate. They are evaluated at 41 times of each
-    piece, more densely than in the program. `motion` has position to snap at the pieces' starts,
-    `values` the limits by name.
+    piece; IPOPT's program checks limits at 3 or 4 samples only. `motion` has position to snap at
+    the pieces' starts, `values` the limits by name.
     """
     times = durations[:, None, None] * np.linspace(0.0, 1.0, 41)[:, None]
     _, vel, acc, jerk, _ = advance([part[:, None] for part in motion], times)
