@@ -30,9 +30,9 @@ _EARLIER = 0.95
 class Policy(CatchDecision):
     """A decision that takes the order and times of catches from a neural network.
 
-    The first proposal for a case is the mean of the network's distribution of actions. Further
-    proposals are drawn from the distribution, with the same random numbers for every case. The
-    planner plans all proposals and selects the plan with the earliest last catch.
+    A proposal is an order and times of catches. The first proposal for a case is the mean of the
+    network's distribution of actions. Further proposals are drawn from it, with equal random
+    numbers for every case. The planner plans all and selects the plan with the earliest last catch.
     """
 
     params: Any  # weights of the network, the leaves of this pytree

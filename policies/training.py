@@ -220,10 +220,6 @@ def _record_settings(folder: Path, training: Training) -> None:
 
 
 def _first_params(training: Training, network: Any) -> Any:
-    """Return the initial parameters in the form of Brax: normaliser, policy and value network.
-
-    The normaliser of observations is a part that Brax expects and the networks do not use.
-    """
     env = _environment(training, training.parts[0])
     one, other = jax.random.split(jax.random.key(training.seed))
     seen = jnp.zeros((1, env.size, FEATURES))

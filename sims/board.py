@@ -77,7 +77,7 @@ def show_board(
 def calibrate_camera(
     arm: Arm, camera: Camera, noise: StereoNoise, num: int = 20, *, seed: int = 0
 ) -> tuple[Camera, Calibration]:
-    """Calibrate a camera by `num` simulated views of a board on the arm; see `show_board`.
+    """Calibrate a camera by `num` simulated views of a board that the arm holds in random poses.
 
     Returns:
         The camera at its calibrated pose, and the poses and residuals of the calibration.

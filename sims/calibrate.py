@@ -110,8 +110,8 @@ def calibrate(
             camera's axes.
 
     Raises:
-        ValueError: the points or the views do not determine the poses; see `rigid_motion` and
-            `hand_eye`.
+        ValueError: there are fewer than three points or views, all points lie on one line, or all
+            views rotate about one axis.
     """
     flange, points, seen = (np.asarray(each, float) for each in (flange, points, seen))
     views = np.stack([rigid_motion(points, each) for each in seen])

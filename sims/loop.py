@@ -173,7 +173,6 @@ def _with_plans(
 
 
 def _record(loop: Loop, pilot: Pilot, flight: FlightState, drag: Array) -> Record:
-    """Record a flight's state, and errors of ball positions predicted for the planned contacts."""
     world = loop.world
     horizon = flight.began + pilot.times(flight.plan) - flight.time
     now = moment(world, flight.physics)
@@ -298,9 +297,8 @@ def begin_compiling(
 ) -> Callable[[], Any]:
     """Start to compile the programs of `fly_leg` in another thread.
 
-    Only separate programs for planning and flying are compiled ahead; see `in_parts`. Otherwise
-    nothing is started. The thread flies one period with plans of zeros, which compiles the programs
-    that `fly_leg` needs.
+    For up to 1024 flights on a GPU, planning and flying are separate programs, and only these are
+    compiled ahead. The thread flies one period with plans of zeros, which compiles the programs.
 
     Args:
         loop: settings that determine the programs.

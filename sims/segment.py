@@ -45,8 +45,8 @@ def ball_thresholds(
     """Return thresholds for a ball as float32 NumPy arrays; the default colour is orange.
 
     `lower` and `upper` bound hue, saturation and value; `radius` [m] is the ball's radius. A pixel
-    needs a depth up to `reach` [m], of which the stereo camera reports at least the `confidence`,
-    from 0 to 1. A ball needs `pixels` such pixels.
+    needs a depth up to `reach` [m]. The camera's confidence in this depth, from 0 to 1, must be at
+    least `confidence`. A ball needs `pixels` such pixels.
 
     Raises:
         ValueError: a colour is not between 0 and 1, or the radius is not positive.

@@ -183,7 +183,7 @@ def sample_motion(
     """Sample position to jerk at the ends of `nodes` equal intervals of each piece of a spline.
 
     Args:
-        maps: constant maps of M pieces.
+        maps: constant matrices of splines of M pieces; s is their field `order`.
         nodes: intervals of each piece. Neighbouring pieces share one of N = M nodes + 1 samples.
         columns: (C, 3), derivatives d < s of the position at both ends times h^d, then the offsets
             of the waypoints from the smoothest spline, in the coordinates of `maps.offsets`.

@@ -155,7 +155,8 @@ def select(
         excess = (squares - best.squares) / variance
         return excess if noise is not None else (freedom + 1.0) * jnp.log1p(excess / freedom)
 
-    # Evaluate turn rates around the best rate, or around zero if observations determine it poorly.
+    # Turn rates are evaluated around the best rate, which is shifted towards zero if the
+    # observations determine it poorly.
     information = tangent(seen, best)[1] / variance
     precision = information + 1.0 / jnp.asarray(prior.variance, dtype)
     reach = _REACH / jnp.sqrt(precision)

@@ -120,11 +120,6 @@ def best_turn(seen: Centred, fastest: ArrayLike) -> TurnFit:
 
 
 def _search_rate(seen: Centred, spacing: Array) -> Array:
-    """Search the best turn rate by Gauss-Newton (Kaufman's variable projection).
-
-    The search starts from the best of the rates around zero that are `spacing` [rad/s] apart, and
-    stays between the neighbours of that rate.
-    """
     rates = spacing * (jnp.arange(_RATES) - _RATES // 2)
     squares = jax.vmap(lambda rate: fit_rate(seen, rate).squares)(rates)
 

@@ -148,7 +148,7 @@ def case(
         dtype: type of every floating leaf.
 
     Raises:
-        ValueError: a polygon is not convex. All other errors are as for `pj.hit.case`.
+        ValueError: a polygon is not convex, or an array has a wrong shape or an invalid value.
     """
     dtype, shapes = floating(dtype), [batch_of("start", start, 3)]
     scalars = {"time": time, "initial_speed": initial_speed, "tolerance": tolerance}

@@ -89,7 +89,7 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
         return MotionProblem(self.meet, self.pieces, self.samples, self.checked)
 
     def replanner(self) -> ReplanIntercept:
-        """Return the planner that updates a plan while it is being driven; see `pj.replan`."""
+        """Return the planner by which `pj.replan` updates a plan while it is being driven."""
         return ReplanIntercept(self, self.attempts[0], self.problem)
 
     def smooth_near(
@@ -97,8 +97,8 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
     ) -> tuple[SmoothIntercept, StartedCase]:
         """Return a planner and cases by which `pj.gradient` differentiates existing plans.
 
-        The planner minimises the cost from a start near its minimum: the plans, which are stored in
-        the cases.
+        The planner minimises the cost by least squares. They start at the plans, which are near the
+        minimum and are stored in the cases.
         """
         problem = self.problem
         start = problem.pack(plans.speed[..., 1:], plans.curvature[..., 1:], plans.time)
@@ -175,8 +175,8 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
     def load_attempt(self, attempt: Search, cases: InterceptCase) -> LoadedSearch:
         """Return the search `attempt` in the form of the second argument of the compiled `solve`.
 
-        Its settings become arrays, so that on a CPU all searches share one program; see
-        `load_search`. The cases are not used.
+        Its settings become arrays, so that on a CPU all searches of the planner share one program.
+        The cases are not used.
         """
         if isinstance(attempt, LoadedSearch):
             return attempt

@@ -78,9 +78,9 @@ class LoadedSearch(Search):
 def load_search(search: Search, searches: tuple[Search, ...], is_apart: bool) -> LoadedSearch:
     """Return one of a planner's searches, with its settings as arguments of a compiled program.
 
-    All searches share one program. Its arrays of random numbers, which select the paths, are as
-    large as in the search with most paths and most candidates for a path. If `is_apart` is true,
-    the search has its own program without such padding, because a GPU would try padded paths, too.
+    All `searches` of the planner share one program. Its arrays of random numbers, which select the
+    paths, are padded to the greatest numbers of paths and candidates of any search. If `is_apart`,
+    the search has its own program without padding, because a GPU would try padded paths, too.
     """
     sizes = (search,) if is_apart else searches
     paths, candidates = (max(vars(each)[name] for each in sizes) for name in _PADDED)

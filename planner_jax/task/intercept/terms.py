@@ -126,7 +126,7 @@ class SumOfSquares:
     """
 
     def __init__(self, size: int, sums: Mapping[tuple[int, int], Array] | None = None):
-        """Start from given entries (a, b), a <= b, of the matrix (size, size), by default zero."""
+        """Start from entries `sums[a, b]`, a <= b, of a matrix (size, size), by default zeros."""
         self._size = size
         self._sums: dict[tuple[int, int], Array | float] = dict(sums or {})
 

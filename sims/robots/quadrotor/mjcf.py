@@ -83,11 +83,7 @@ def _rotor(
     centre: np.ndarray,
     turn: np.ndarray,
 ) -> dict[str, Value]:
-    """Return position (2,) [m], thrust limits (2,) [N], torque ratio [m] and lag [s] of a rotor.
-
-    `k` is the rotor's actuator; `centre` (3,) [m] and `turn` (3, 3) are the body's pose in the
-    world.
-    """
+    """Return position (2,) [m], thrust limits (2,) [N], torque ratio [m] and lag [s] of a rotor."""
     name = model.actuator(k).name or k
     site = int(model.actuator_trnid[k, 0])
     frame = turn.T @ data.site_xmat[site].reshape(3, 3)
@@ -107,10 +103,6 @@ def _rotor(
 
 
 def _rotors(path: Path, rotors: list[dict[str, Value]]) -> dict[str, Value]:
-    """Return the field `rotors` of a robot file, with the rotors in counter-clockwise order.
-
-    The first rotor is one whose drag torque is positive.
-    """
     rotors = sorted(rotors, key=lambda rotor: np.arctan2(*rotor["place"][::-1]) % 6.28)
     if rotors[0]["ratio"] < 0.0:
         rotors = [*rotors[1:], rotors[0]]
