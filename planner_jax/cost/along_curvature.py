@@ -228,8 +228,8 @@ class _Constants:
     samples: np.ndarray  # (3 * orders * K, G + C)
     moving_samples: np.ndarray  # (orders, K, C)
     groups: tuple[tuple[Slot, ...], ...]
-    # (pairs of axes, pairs of orders): for each pair of axes such as (x, y), the pairs of orders
-    # such as (1, 2) (velocity, acceleration) by which the penalty has second derivatives.
+    # Entries (pairs of axes, pairs of orders): the penalty has second derivatives by derivatives of
+    # the motion of these orders (1: velocity) along these axes.
     pairs: tuple[tuple[tuple[tuple[int, int], ...], tuple[tuple[int, int], ...]], ...]
 
     @property

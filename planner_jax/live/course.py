@@ -96,7 +96,7 @@ def setpoints_of(num: int, _: None, query: Query) -> Float[Array, "K 20"]:
 
 
 def state_of(course: Course, elapsed: float) -> Float[np.ndarray, "4 3"]:
-    """Return position, velocity, acceleration, jerk after `elapsed` [s]; standstill at the end."""
+    """Return position, velocity, acceleration, jerk at `elapsed` [s]; after the end: standstill."""
     end = float(np.sum(course.path.durations))
     state = state_on(course.path, min(elapsed, end))
     if elapsed >= end:

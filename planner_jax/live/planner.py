@@ -158,7 +158,7 @@ class LivePlanner(Generic[CaseT, PlanT]):
             return self._pack(packet, fault, due)
 
     def record_sent(self, data: bytes, received: float) -> None:
-        """Record the time of a sent answer; then extend a new plan by a stop at its end."""
+        """Record the time of a sent answer; only then extend a new plan by a stop at its end."""
         taken = time.perf_counter() - received
         self.report.counts["answered"] += 1
         self.report.counts["missed"] += taken > self.deadline

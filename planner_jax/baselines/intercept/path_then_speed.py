@@ -182,7 +182,8 @@ def best_of(plans: InterceptPlan) -> Array:
 def lattice(**fields: object) -> PathThenSpeed:
     """Create the planner `lattice`: it searches eight paths, and plans a speed along each of them.
 
-    The cheapest solved plan is returned. `fields` are fields of the planner that replace defaults.
+    The paths lead through a lattice of cells in the plane. The cheapest solved plan is returned.
+    `fields` are fields of the planner that replace defaults.
     """
     return dataclasses.replace(PathThenSpeed(), **fields)
 
@@ -201,6 +202,7 @@ def em(**fields: object) -> PathThenSpeed:
 def constant(**fields: object) -> PathThenSpeed:
     """Create a planner that ignores moving obstacles and drives at constant speed after a ramp.
 
-    `fields` are fields of the planner that replace defaults.
+    The speed lets the car arrive in time on one of eight searched paths. `fields` are fields of the
+    planner that replace defaults.
     """
     return PathThenSpeed(**{"tries": 1, "step": SpeedStep(speed=None), **fields})
