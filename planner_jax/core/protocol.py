@@ -211,7 +211,7 @@ class Decision(Protocol):
         ...
 
     def rank(self, plans: PyTree, /) -> Array:
-        """Return one number for each plan, by default its cost; the least is selected; pure."""
+        """Return a number for each plan, by default its cost; the least one is selected; pure."""
         return plans.cost
 
     def explain(self, case: PyTree, status: Array, /) -> Array:
@@ -247,7 +247,7 @@ def take(tree: Tree, k: int | np.integer | slice | Numbers) -> Tree:
 
 
 def are_solved(plans: Plan) -> np.ndarray:
-    """Return whether each plan keeps every limit of its planner, bool; see `Status`.
+    """Return whether each plan keeps every limit that its planner checks, bool.
 
     Raises:
         ArgumentTypeError: the argument is not a plan or a batch of plans.

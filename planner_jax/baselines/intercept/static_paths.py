@@ -53,7 +53,7 @@ class PathSource:
     def paths(
         self, case: InterceptCase, attempt: Search, layers: Array | None = None
     ) -> StaticPaths:
-        """Find several paths past the standing obstacles of a case; `attempt.paths` is their number.
+        """Find `attempt.paths` different paths of one case past its standing obstacles.
 
         `layers` () is the number of equal time steps of the search, by default chosen for the case.
         """
