@@ -25,18 +25,18 @@ Tangent = Array | SymbolicZero
 
 
 def aim_drag_free(pos: Array, target: Array, flight_time: Array, gravity: Array) -> Array:
-    """Return the velocity (3,) of a drag-free ball from `pos` to `target` in `flight_time` [s]."""
+    """Return a drag-free ball's velocity (3,) [m/s] from `pos` to `target` in `flight_time` [s]."""
     return (target - pos) * reciprocal(flight_time) - 0.5 * gravity_vector(gravity) * flight_time
 
 
 def aim_with_drag(
     pos: Array, target: Array, flight_time: Array, drag: Array, gravity: Array
 ) -> Array:
-    """Return the initial velocity (3,) with which a ball with quadratic drag reaches a target.
+    """Return the initial velocity (3,) [m/s] with which a ball with quadratic drag meets a target.
 
-    The ball starts at `pos`, and is at `target` after `flight_time` > 0 [s]. Newton's method starts
-    from the drag-free velocity. Two steps integrate the flight coarsely; two more steps integrate
-    it finely and reuse the last Jacobian. The implicit function theorem gives the derivatives.
+    The ball starts at `pos` (3,) [m], and is at `target` after `flight_time` > 0 [s]; the drag is
+    K_D [1/m]. Two Newton steps from the drag-free velocity integrate the flight coarsely; two more
+    integrate it finely and reuse the last Jacobian. Derivatives are implicit.
     """
     return _aim(target - pos, jnp.asarray(flight_time), jnp.asarray(drag), jnp.asarray(gravity))
 

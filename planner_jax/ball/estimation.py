@@ -30,7 +30,7 @@ class EkfModel:
 
 @struct.dataclass
 class EkfState:
-    """A Gaussian belief about the ball's position (first three entries) and velocity."""
+    """A Gaussian belief about the ball's state: position [m] (entries 0 to 2), velocity [m/s]."""
 
     mean: Array  # (6,) [m, m/s]
     covariance: Array  # (6, 6)

@@ -116,7 +116,7 @@ def _node_function(num_nodes: int) -> Callable:
 
 
 def horizon_of(table: PathTable) -> Array:
-    """Return the last time [s] that the table covers; the first covered time is 0."""
+    """Return the last time [s] at which a table of a path can be interpolated; the first is 0."""
     return table.resolution * (table.pos.shape[0] - 3)
 
 

@@ -1,4 +1,4 @@
-"""Target paths from a user's table of positions, such as recorded or simulated motions."""
+"""Paths of targets through positions at given times, such as recorded or simulated motions."""
 
 import jax.numpy as jnp
 import numpy as np

@@ -1,4 +1,4 @@
-"""The baseline `mpp`: minimum-jerk trajectories to sampled states of catches at a given height."""
+"""The baseline `mpp`: catches at a given height by minimum-jerk trajectories to sampled states."""
 
 import dataclasses
 from typing import ClassVar

@@ -38,8 +38,8 @@ from planner_jax.trajectory.proportional_minco import (
 )
 
 _ORDER = 4  # derivative whose square is minimised: snap
-# Units of the optimiser's variables, tuned for low costs: of a waypoint's shift from the smoothest
-# trajectory, and of a catch's logarithm of duration, position, velocity, acceleration and jerk.
+# Units of the optimiser's variables, tuned for low costs: a waypoint's shift from the smoothest
+# trajectory [m]; then log(duration) and position to jerk of a catch (SI units, x, y, z).
 _OFFSET_SCALE = 0.05
 _CATCH_SCALE = (0.035, *(0.06,) * 3, *(0.6,) * 3, *(1.2,) * 3, *(2.4,) * 3)
 _PATIENT = {"memory": 16, "trial_steps": (1.0, 2.5, 0.3, 0.05), "tolerance": 1e-8, "patience": 10}
@@ -88,7 +88,7 @@ def thrust_band_excess(acc: Array, gravity: Array, least: Array, most: Array) ->
 
 @struct.dataclass
 class Catch:
-    """Catches of the N targets of one case, described by one vector of decision variables."""
+    """Times and states of the catches of the N targets of one case, and misses of the net."""
 
     times: Array  # (N,) [s], when the balls are caught
     durations: Array  # (N,) [s], durations of the segments that end with a catch

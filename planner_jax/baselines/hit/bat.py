@@ -225,7 +225,7 @@ class BatHit(OptimisedPlanner):
         return (natural / jnp.asarray(self.scale, dtype))[None]
 
     def primitive_waypoints(self, impact: Impact, case: HitCase) -> Array:
-        """Return W initial waypoints (W, 3) [m], on minimum-jerk trajectories to the impact."""
+        """Return initial waypoints (M - 1, 3) [m] of M pieces, on minimum-jerk trajectories."""
         head, tail, end = case.head_state[:3], impact.tail_state[:3], impact.stroke.time
         shares = np.arange(1, self.num_pieces) / self.num_pieces
         times = end * jnp.asarray(shares, end.dtype)

@@ -84,7 +84,7 @@ class ScenarioCounts:
 
 
 def make_table(manifest: Entries) -> RateTable:
-    """Return the success per scenario in percent, beside the rates of a published planner."""
+    """Return the run's success in each court scenario [%], beside a published planner's rates."""
     planner, summary = manifest["parameters"]["planner"], manifest["summary"]
     other = choose_reference(planner)
     published, column = read_published_rates(), court.PLANNERS.index(other)

@@ -100,7 +100,7 @@ class JuggleHit(Planner):
         )
         motion = sample_pieces(trajectory, self.nodes)
         along = jnp.stack(motion_excess(motion, case.gravity, case.limits))
-        # A height or apex that the ball cannot reach, or an upright racket face, is a violation.
+        # A height or apex that the ball cannot reach is a violation, as is a vertical racket face.
         meeting = jnp.abs(impact.stroke.ball_pos[2] - self.height)
         too_low = jnp.maximum(impact.stroke.ball_pos[2], case.target[2]) - self.apex
         lying = _LEAST_UPRIGHT - impact.stroke.normal[2]

@@ -37,14 +37,14 @@ from planner_jax.task.block.plan import BlockPlan, explain_status, make_empty_pl
 from planner_jax.task.block.scene import Box
 
 _HIGHEST = lax.Precision.HIGHEST
-# Weights of the squared changes of six joint angles of a stored motion. The wrist joints have low
-# weights, since they carry little mass; the last joint keeps its stored angles.
+# Weights of six joints in the squared change of a stored motion's end pose. The wrist joints have
+# low weights, since they carry little mass; the last joint keeps its stored angles.
 _WEIGHTS = np.array([1.0, 1.0, 1.0, 0.3, 0.3, 0.0])
 # [rad^2], weight of (distance / cell size)^2, from the point where the ball enters a box to the
 # centre of the cell (rectangle on the box) for which a motion was stored; summed over two boxes.
 _AWAY = 0.02
-_LATE = 10.0  # [rad^2], penalty of a relative excess of 1 over a joint limit
-_NEAR = 30.0  # [rad^2/m], penalty per metre that the distance from the pole is too small
+_LATE = 10.0  # [rad^2], penalty of a motion that exceeds a joint limit by the limit itself
+_NEAR = 30.0  # [rad^2/m], penalty per metre by which the arm is too close to the pole
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Build libraries of stored arm motions, and plan motions again after an obstacle has moved."""
+"""Build libraries of arm motions that block balls; repair them after an obstacle has moved."""
 
 import dataclasses
 import functools
@@ -306,7 +306,7 @@ def _ends(setting: Setting, home: Array, steps: Array) -> tuple[Array, Array]:
 
 
 def _is_free(setting: Setting, home: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """Return which of N motions (table rows) stay a margin away from obstacles, (N,) bool."""
+    """Return which of N stored motions keep the least distance from obstacles, (N,) bool."""
     online = OnlineBlock()
     if not len(rows):
         return np.zeros(0, bool)
@@ -315,7 +315,7 @@ def _is_free(setting: Setting, home: np.ndarray, rows: np.ndarray) -> np.ndarray
     near = [
         _nearest_on_motion(setting, home, some, shares) for some in _in_parts(np.asarray(steps))
     ]
-    # Distances may be 1e-5 m less than the margin, because of rounding errors.
+    # Rounding errors of distances are less than 1e-5 m.
     return np.concatenate(near)[: len(rows)] >= online.margin - 1e-5
 
 

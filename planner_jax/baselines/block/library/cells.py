@@ -1,4 +1,4 @@
-"""Cells on the faces of the two boxes around the arm, tunnels between cells, and their coverage.
+"""Division of two boxes around the arm into cells, by which libraries of motions are indexed.
 
 The inner box is protected from balls; in the outer box the arm may meet a ball. Cells are equal
 rectangles on the faces of both boxes. A ball passes one cell of the outer box and then one cell of
@@ -163,7 +163,7 @@ class Tunnels:
     outer: np.ndarray  # (P, 2, 3) [m], corners of the outer cell's part in front of the inner cell
     inner: np.ndarray  # (P, 2, 3) [m], corners of the inner cell, lowest and highest
     is_feasible: np.ndarray  # (P,) bool, whether a ball can pass from one cell to the other
-    is_centred: np.ndarray  # (P,) bool, whether a ball can pass from the outer cell's centre
+    is_centred: np.ndarray  # (P,) bool, whether a ball from the outer cell's centre can pass both
 
 
 def tunnels(layout: Layout, inner: Box, outer: Box) -> Tunnels:

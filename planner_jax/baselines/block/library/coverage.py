@@ -33,8 +33,7 @@ class Coverage:
     """Which motions a library has, from H start poses, for P pairs of cells on two boxes."""
 
     is_feasible: np.ndarray  # (P,) bool, whether a ball can pass through both cells
-    # (P,) bool, whether a ball through the outer cell's centre can pass the inner cell, too.
-    is_centred: np.ndarray
+    is_centred: np.ndarray  # (P,) bool, whether a ball from the outer cell's centre can pass both
     found: np.ndarray  # (H, P) bool, whether a motion is stored
     # (H, P) bool, whether the shield at the end of the motion blocks all balls through both cells.
     is_sure: np.ndarray

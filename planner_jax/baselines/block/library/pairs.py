@@ -49,8 +49,8 @@ _ROLL = np.deg2rad(1.0)
 # [s] Penalty of end poses that collide. It is added to a time in seconds by which end poses are
 # sorted, so that these poses are tried last.
 _TOUCHING = 10.0
-# Least distances of a shield from the two cells (on two boxes) that the ball passes, as fractions
-# of the distance between these cells, for the tolerances FINE and COARSE.
+# Least distance of a shield from each of the two cells that the ball passes, as a fraction of the
+# distance between the cells: for accurate contacts (FINE), and for other contacts (COARSE).
 _NEAREST = (0.1, 0.02)
 
 
@@ -61,7 +61,7 @@ class PairCase:
     outer: Array  # (2, 3) [m], corners of the outer cell's part in front of the inner cell
     inner: Array  # (2, 3) [m], corners of the inner cell
     is_coarse: Array  # () bool, whether blocking some balls through both cells suffices
-    best: Array  # () [s], earliest entry into the outer box so far; infinite if none
+    best: Array  # () [s], earliest entry of a ball that a known motion blocks; or infinite
     start: Array  # () int32, index of a stored initial guess; -1 selects the guess `given`
     # (6 K + 1,): rates of 6 joints at K knots, times the duration [rad]; then the duration [s].
     given: Array
