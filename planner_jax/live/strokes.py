@@ -143,7 +143,7 @@ class HitStroke(Stroke[HitCase, HitPlan]):
 
 
 def _time_left(case: CatchCase) -> Array:
-    """Return the last time (1,) [s] when the ball is above the net's least height, else 0."""
+    """Return the last time (1,) [s] with the ball above the net's lowest allowed height, or 0."""
     height = case.limits.min_height + case.net.height
     path = jax.tree.map(lambda leaf: leaf[0], case.targets)
     # The bisection starts at the ball's highest point, since a rising ball may be low at time 0.
@@ -178,7 +178,7 @@ def _catch_again(attempt: Round, planner: ReplanCatch, task: Replanning) -> Catc
 
 
 class CatchStroke(Stroke[CatchCase, CatchPlan]):
-    """The task to catch one ball before it is too low for the net.
+    """The task to catch one ball before it falls below the net's lowest allowed height.
 
     Args:
         robot: quadrotor with a net.

@@ -117,7 +117,7 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
         return jnp.ones(1, bool)
 
     def relative_excess(self, excess: Array) -> Array:
-        """Return excesses over limits at a plan's ends as fractions of the limits: unchanged."""
+        """Return relative excesses over limits at a plan's ends; `excess` is relative already."""
         return excess
 
     def start_network(self, case: PyTree) -> StartNetwork | None:

@@ -112,7 +112,7 @@ def is_stationary(numbers: NewtonNumbers, config: NewtonConfig) -> Array:
 
 
 def most_to_gain(numbers: NewtonNumbers, config: NewtonConfig, num: int) -> Array:
-    """Return indices (num,) of unfinished problems whose cost is predicted to decrease most."""
+    """Return indices (num,) of problems, unfinished first, by falling predicted decrease."""
     expected = jnp.where(jnp.isnan(numbers.expected), jnp.inf, numbers.expected)
     return jnp.argsort(jnp.where(is_unfinished(numbers, config), -expected, 1.0))[:num]
 

@@ -111,7 +111,7 @@ class OptimisedPlanner(Planner[CaseT, PlanT], abc.ABC):
 
     @property
     def held(self) -> np.ndarray | None:
-        """Mask (n,) of variables that searches with `Stage.frozen` keep constant; None: no such."""
+        """Mask (n,) of variables that searches with `Stage.frozen` keep constant; None if none."""
         return None
 
     @property

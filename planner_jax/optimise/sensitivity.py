@@ -111,7 +111,7 @@ class Differentiated(OptimisedPlanner):
 
     @property
     def held(self) -> np.ndarray | None:
-        """Mask (n,) of variables that searches with `Stage.frozen` keep constant; None: no such."""
+        """Mask (n,) of variables that searches with `Stage.frozen` keep constant; None if none."""
         return self.planner.held
 
     def divides(self, attempt: Round) -> bool:

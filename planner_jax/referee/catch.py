@@ -1,8 +1,8 @@
 """Float64 NumPy referee of catches: decides by physics whether a plan succeeds.
 
 A catch is a quadrotor's meeting with a moving target in the hoop of its net. `referee.quadrotor`
-checks the flight, this module the plan's order of targets, catch times and targets' positions. Only
-extra limits (`referee.extras`) are code that planners use too. World frame, z up, SI units.
+checks the flight, this module the plan's order of targets, catch times and targets' positions. Of
+the planners' code it runs only limits that a user adds. World frame, z up, SI units.
 
 Equations of [Yu2023catch]: a ball with linear drag (eq. 9); the net's centre p + l z_d at the
 height l above the quadrotor's position p (eq. 22); and the angle between z_d and minus the ball's

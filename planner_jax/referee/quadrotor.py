@@ -108,7 +108,7 @@ _PRODUCT, _SEARCHED = 250_000, 1024
 
 
 def intervals_of(num_pieces: int) -> int:
-    """Return a piece's number of sampling intervals, at least 16, and 400 for all `num_pieces`."""
+    """Return a piece's number of sampling intervals: >= 16, and >= 400 in `num_pieces` pieces."""
     return max(math.ceil(_INTERVALS / num_pieces), _FEWEST_INTERVALS)
 
 
