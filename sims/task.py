@@ -50,7 +50,7 @@ class Flights(abc.ABC):
 
 @dataclasses.dataclass(frozen=True)
 class FlightTask(abc.ABC):
-    """One task, such as hits, with its settings; `run.py` flies, scores and draws a run with it.
+    """The simulation of a task such as hits, with which `run.py` flies, scores and draws a run.
 
     The class of the settings names the subclass in its attribute `FLIGHT`. A task with balls
     inherits from `BallFlightTask`.

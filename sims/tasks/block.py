@@ -49,7 +49,7 @@ _KEPT = 5  # number of simulated frames from one recorded sample to the next
 
 
 class BlockFlight(FlightTask):
-    """The task `block` with settings: how `sims/run.py` simulates, scores and draws its flights."""
+    """The simulation of blocks with which `sims/run.py` flies, scores and draws a run."""
 
     settings: BlockFly
 
@@ -266,7 +266,7 @@ class BlockFlight(FlightTask):
         return lines
 
     def tables(self, rows: Any) -> Sequence[RateTable]:
-        """Return two tables: times from a ball's first sight to contact; joint tracking errors."""
+        """Return two tables: durations of sensing, planning and motion; joint tracking errors."""
         return [budget_table(rows), joint_table(rows)]
 
     def draw(self, folder: Path, rows: Any) -> Sequence[str]:

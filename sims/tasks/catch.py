@@ -227,7 +227,7 @@ def fly_catches(
 
 
 class CatchFlight(BallFlightTask):
-    """The task `catch` with settings: how `sims/run.py` simulates, scores and draws its flights."""
+    """The simulation of catches with which `sims/run.py` flies, scores and draws a run."""
 
     settings: CatchFly
 

@@ -99,7 +99,7 @@ class CatchPilot:
         plan, left = found[0], asked.case
         if self.redecide > 0.0:
             fresh = found[1]
-            # [s], time since the last new decision was due. `_INSTANT` absorbs rounding errors.
+            # [s], time since a new order was last due. `_INSTANT` absorbs rounding errors.
             since = jnp.mod(outlook.time + _INSTANT, 1.0 / self.redecide)
             take = (since < 2.0 * _INSTANT) & (fresh.times[0] >= self.planner.shortest)
             take &= is_worth_flying(fresh, plan)

@@ -278,7 +278,7 @@ def fly_hits(
 
 
 class HitFlight(BallFlightTask):
-    """The task `hit` with settings: how `sims/run.py` simulates, scores and draws its flights."""
+    """The simulation of hits with which `sims/run.py` flies, scores and draws a run."""
 
     settings: HitFly
 

@@ -121,8 +121,8 @@ def predict_scene(
         loop: settings of the loop, with the sensing.
         meetings: the B cases with their observations, leaves (B, ...).
         now: () [s], time since the start of the first plan.
-        known_target: whether the targets' paths are known (static).
-        predict_movers: whether moving obstacles are predicted from observations (static).
+        known_target: whether the targets' paths are known; static under jit.
+        predict_movers: whether moving obstacles are predicted from observations; static.
     """
     sensing = loop.sensing
     noise = max(sensing.target_std, _LEAST_STD)
@@ -375,8 +375,8 @@ def score(
 
     Args:
         cases: the true cases of B drives, leaves (B, ...).
-        first: the first plans.
-        flown: the drives.
+        first: the first plan of each drive.
+        flown: the simulated drives.
         planning_seconds: wall time of planning the first plans of all drives.
     """
     meeting = flown.meeting

@@ -40,7 +40,7 @@ _WALL_HEIGHT, _MOVER_HEIGHT, _TARGET_HEIGHT = 0.25, 0.2, 0.08  # [m], heights in
 
 
 class InterceptFlight(FlightTask):
-    """The task `intercept` with settings: how `sims/run.py` simulates, scores and draws drives."""
+    """The simulation of interceptions with which `sims/run.py` drives, scores and draws a run."""
 
     settings: InterceptFly
 
@@ -181,7 +181,7 @@ class InterceptFlight(FlightTask):
         return jax.tree.map(lambda leaf: np.asarray(leaf)[0], one)
 
     def counts(self, rows: Any) -> dict[str, Any]:
-        """Count meetings and obstacle contacts; add shares of time of saturated drive, steering."""
+        """Count met targets and obstacle contacts, and average times of saturated actuators."""
         miss = np.asarray(rows["miss"])
         wall, mover = (np.asarray(rows[f"{name}_clearance"]) < -TOUCH for name in ("wall", "mover"))
         return {
