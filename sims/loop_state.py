@@ -87,8 +87,8 @@ class Loop:
     """The settings that determine a flight's compiled program; static under `jax.jit`.
 
     Raises:
-        ValueError: the planning period or the latency is not a multiple of the observation period,
-            or the observation period is not a multiple of the time step.
+        ValueError: the time between plans or the latency is not a multiple of the observation
+            period, or the observation period is not a multiple of the time step.
     """
 
     world: World

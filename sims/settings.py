@@ -51,6 +51,8 @@ def fly_settings(task: str) -> type["FlySettings"]:
 def require_interval(sensing: Sensing, replan: float) -> None:
     """Raise `ValueError` unless the 0.8 s between two throws are a multiple of the planning period.
 
+    The planning period is the time from one plan to the next.
+
     Args:
         sensing: settings of the observations.
         replan: [Hz], rate of replanning; 0 for never.
@@ -133,7 +135,7 @@ class BallFly(FlySettings):
         require(0.0 <= self.drag_error < 1.0, "drag_error", ">= 0 and < 1", self.drag_error)
 
     def check_rate(self) -> None:
-        """Raise `ValueError` unless planning periods are multiples of the observation period."""
+        """Raise `ValueError` unless plans are made a whole number of observations apart."""
         NOISES[self.noise].observations_per_plan(self.rate)
 
 

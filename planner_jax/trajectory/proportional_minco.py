@@ -60,7 +60,7 @@ class ProportionalMinco:
 
     @property
     def num_pieces(self) -> int:
-        """M, the number of pieces."""
+        """The number M of polynomial pieces of a spline."""
         return len(self.proportions)
 
     def sample_matrix(self, nodes: int, derivative: int) -> np.ndarray:
@@ -168,7 +168,7 @@ def proportional_minco(
 
 
 def boundary_rows(head_state: Array, tail_state: Array, piece_duration: Array) -> Array:
-    """Return boundary rows (2s, 3) of states (s, 3) at a spline's start and end.
+    """Return the states (s, 3) at a spline's start and end as rows (2s, 3) in units of a piece.
 
     Row d of each state, the d-th derivative of the position, is multiplied by h^d, with the mean
     duration h [s] of a piece. The rows are derivatives by time in units of h.

@@ -92,7 +92,7 @@ def _smooth(steps: int, keep: int) -> Stage:
 # Rounds 3 and 4 start at a point that a network predicts. Rounds 5 and 6 start at all rows of
 # `_GUESSES` after the first one. They hold the velocities at waypoints constant at first, and then
 # continue only the searches of least cost. Rounds 4 and 6 take only cases whose greatest relative
-# excess over a limit is below `within`.
+# excess over a limit is below the round's field `within`.
 _ROUNDS = (
     Round(1, LbfgsConfig(max_steps=3)),
     Round(1, LbfgsConfig(max_steps=60)),
