@@ -18,7 +18,7 @@ from planner_jax.studies.block.seeing import SeeingArms, SeenPlan
 from planner_jax.studies.block.settings import StudySettings
 from planner_jax.task.block.default_planner import OnlineBlock
 
-_ROOM = 0.1  # [m] the summary counts the fitted flights whose position error is at most this
+_ROOM = 0.1  # [m] the summary counts flight fits with at most this position error
 
 
 # Names of the settings that are passed to `SeeingArms` as keyword arguments.

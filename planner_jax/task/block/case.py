@@ -120,7 +120,7 @@ def case(
             30 degrees, instead of 2 mm and half a degree.
         anywhere: whether the ball may meet the shield anywhere and at any angle. This suits motions
             that were planned for another ball.
-        scene: obstacles, without batch axes; by default the paper's scene.
+        scene: obstacles, without batch axes; by default the scene of [Natarajan2024].
         arm: without batch axes; by default an IRB 1600 with a shield.
         angles: (6,) [rad], joint angles at the start; by default those at which the arm waits.
         rates: (6,) [rad/s], joint rates at the start.
@@ -128,7 +128,8 @@ def case(
         dtype: type of every floating leaf.
 
     Raises:
-        ValueError: no regime has the requested name. All other errors are as for `pj.hit.case`.
+        ValueError: the regime is unknown, a shape is wrong, or a number breaks a rule.
+        TypeError: an argument has a wrong type.
     """
     require_name(REGIMES, "regime", regime)
     require_switch("wide", wide)

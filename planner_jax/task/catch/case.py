@@ -89,7 +89,7 @@ class CatchCase:
     gravity: Array  # () [m/s^2], magnitude
     net: Net
     limits: QuadrotorLimits  # with a least and a greatest thrust [Yu2023catch, eqs 3d, 3e]
-    extras: tuple[Extra, ...] = ()  # the user's constraints and costs, see `cost.extras`
+    extras: tuple[Extra, ...] = ()  # the user's further constraints and costs
     # Whether targets may be left out; the number of caught targets is then maximised.
     optional: bool = struct.field(pytree_node=False, default=False)
 

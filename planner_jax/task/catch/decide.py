@@ -1,4 +1,4 @@
-"""Decisions on the order and the times of catches, from estimates by the module `estimate`.
+"""Decisions on the order and times of catches, from estimates of when targets can be reached.
 
 A decision proposes orders, and the planner plans each of them. If targets are optional, a decision
 also selects which targets to catch: it proposes every order also with fewer catches, and the plan
@@ -163,9 +163,9 @@ def _choice(position: Array, times: Array) -> CatchChoice:
 
 
 def optimal_time_ratio(cases: CatchCase, plans: CatchPlan) -> np.ndarray:
-    """Return the mean of |T_o - T_p| / T_o over caught targets in B cases [Yu2023catch, eq. 29].
+    """Return the mean of |T_o - T_p| / T_o over the caught targets of each case, (B,).
 
-    T_p are the times of catches that were decided before planning, T_o the times in the plans.
+    T_p is a catch's time estimated before planning, T_o its planned time [Yu2023catch, eq. 29].
     """
     decided_times, optimised = np.asarray(plans.decided_times), np.asarray(plans.times)
     present = np.asarray(cases.present & plans.choice.taken)

@@ -172,10 +172,7 @@ class ExactCatch(ChainPlanner[CatchCase, CatchPlan]):
         return super().load_attempt(self._for_start(attempt, cases), cases)
 
     def starts_long(self, cases: CatchCase) -> bool:
-        """Return whether the first round (attempt) makes more iterations, for many targets.
-
-        It does so if more than `_FEW` targets must all be caught.
-        """
+        """Return whether more than three targets must be caught, which needs more iterations."""
         return self.rounds == _ROUNDS and cases.num_targets > _FEW and not cases.optional
 
     def _for_start(self, attempt: Round, case: CatchCase) -> Round:

@@ -169,7 +169,7 @@ class ReplanCatch(OptimisedPlanner):
         return planner.encode(context, durations, tails, offsets)
 
     def guesses(self, context: ReplanContext, num: int) -> Array:
-        """Return `num` starting points: the previous plan, then guesses as for a new case."""
+        """Return `num` starting points: the previous plan, then starting points of a new case."""
         first = context.start[None]
         if num == 1:
             return first

@@ -30,7 +30,7 @@ _EARLY = dataclasses.replace(SpacetimeIntercept("early").attempts[0], paths=12)
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class GroupIntercept(Planner):
-    """Planner of groups of targets with a decided order; other planners plan the drives (legs).
+    """Planner that meets targets in the order stored in a case; others plan the drives (legs).
 
     To save computing time, every leg ends as early as possible, even if that delays the next leg.
     """

@@ -73,7 +73,7 @@ class HitCase:
     racket_height: Array  # () [m], height of the racket's centre above the propeller plane
     limits: QuadrotorLimits
     hit_limits: HitLimits
-    extras: tuple[Extra, ...] = ()  # the user's constraints and costs, see `cost.extras`
+    extras: tuple[Extra, ...] = ()  # the user's further constraints and costs
     racket_radius: Array | None = None  # () [m]; None: the contact's offset is not limited
 
     @property

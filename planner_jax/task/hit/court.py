@@ -5,7 +5,7 @@ World frame: z up, x towards the opponent, y to the left, net at x = 0. The oppo
 images in x: near and far from the net in a middle strip, and a strip at the left and right.
 
 The paper states the size of the court but not the lines between regions. They are estimated from
-the published serves, landing points and targets: in y the middle strip extends to at least 0.8395
+its published serves, landing points and targets: in y the middle strip extends to at least 0.8395
 m, and the side strips start at 0.8418 m or less.
 
 Flights are computed by NumPy in float64.
