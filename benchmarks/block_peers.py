@@ -47,9 +47,10 @@ from planner_jax.task.block.spec import SUITES
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate, total_duration
 
 PEERS = "ompl and toppra not installed: pip install 'planner-jax[arm-peers]' for rrt-connect, epase"
-# Row of the table -> planner and its options. `direct` tries up to 384 motions, `direct-soonest`
-# only one. Rows with names in "-plain" use the first path that the planner finds, without trying to
-# improve it, as the planners of [Natarajan2024] presumably do.
+# Row of the printed table -> planner and its options. `direct` tries up to 384 straight motions, in
+# which all joints move in proportion, and `direct-soonest` only one. Rows with "-plain" use the
+# first path that the planner finds without improving it, as the planners of [Natarajan2024]
+# presumably do.
 PLANNERS: dict[str, tuple[str, dict[str, Any]]] = {
     "online": ("online", {}),
     "brisk": ("brisk", {}),

@@ -66,10 +66,6 @@ class Estimator:
         first, unravel = ravel_pytree(unknown)
 
         def advance(vector: jax.Array) -> jax.Array:
-            """Update the filter with an observation, and predict one period ahead.
-
-            `vector` contains the mean and covariance, and then the observation (3,) [m].
-            """
             state = ekf_update(unravel(vector[:-3]), vector[-3:], model)
             ahead = ekf_predict(state, jnp.asarray(period), model)
             return ravel_pytree(ahead)[0]
@@ -106,7 +102,6 @@ class Times:
     replans: list[tuple[Any, CatchPlan]] = dataclasses.field(default_factory=list)
 
     def keep(self, left: Any, found: CatchPlan) -> None:
-        """Store the re-planning problem `left` and its plan `found`, but at most 1,024 pairs."""
         if len(self.replans) < COMPARED:
             self.replans.append((left, found))
 

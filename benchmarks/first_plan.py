@@ -47,7 +47,8 @@ ROWS = {
     "intercept-64": Row("intercept", 64, "hard"),
     "block-64": Row("block", 64),
     "hit-late": Row("hit", 4096, options={"delay": 0.5}),
-    # With a fifth of the usual limits there is no solution, so all rounds (attempts) are run.
+    # With a fifth of the usual limits there is no solution, so the planner makes all of its
+    # attempts.
     "later-hit": Row("hit", options={"limit_scale": 0.2}, is_later=True),
     # No motion in which all joints move in proportion blocks this ball.
     "later-block": Row("block", options={"first": 2}, is_later=True),

@@ -204,13 +204,16 @@ class Lattice:
         return free
 
     def _list_moves(self) -> tuple[np.ndarray, list, list]:
-        """Compute the lattice's speed levels, and all moves between its states.
+        """Compute the speed levels of the grid of states, and all moves between its states.
+
+        A set of cells is an integer with one bit for each cell, so a move shifts the bits.
 
         Returns:
             levels: (S,) [m/s], the S speed levels.
-            shifts: bit shifts of a straight move, indexed by half of a time step, speed and
-                heading.
-            turns: greatest numbers of heading steps of a turn, indexed by time step and speed.
+            shifts: number of bits of the shift in a straight move, indexed by half of a time step,
+                speed and heading.
+            turns: greatest change of the heading in a time step, in multiples of 1/64 turn, indexed
+                by time step and speed.
         """
         scene = self.scene
         level = scene.acceleration * scene.dt

@@ -116,8 +116,8 @@ def predict(truth: jax.Array, seen: jax.Array) -> tuple[jax.Array, ...]:
 def bounds(path: TurningPath) -> tuple[jax.Array, jax.Array]:
     """Return mean errors (4,) [m] of a best unbiased prediction 0, 5, 10 and 15 s ahead.
 
-    Its covariance is the Cramer-Rao bound. The second result has the probabilities (2,) that its
-    error 10 s ahead is below 0.3 and below 0.5 m.
+    The covariance of this prediction is the Cramer-Rao bound. The second result has the
+    probabilities (2,) that its error 10 s ahead is below 0.3 and below 0.5 m.
     """
 
     def least(time: Any) -> jax.Array:

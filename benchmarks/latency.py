@@ -27,9 +27,10 @@ from planner_jax.runs.timing import measure_plans
 
 
 def begin_replans(planner: Any, cases: Any, elapsed: float) -> tuple[Any, Any]:
-    """Plan a batch of interceptions; return a re-planner, and the problems that it must solve.
+    """Plan a batch of interceptions; return a planner for re-planning, and problems for it.
 
-    In each problem the car has the state in which a solved plan is after `elapsed` [s].
+    In each problem the motion is planned again `elapsed` [s] after the start of a solved plan, from
+    the car's state at this time.
     """
     plans = pj.plan(planner, cases)
     lanes = np.flatnonzero(pj.are_solved(plans) & (np.asarray(plans.time) > elapsed))

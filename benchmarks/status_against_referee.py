@@ -194,7 +194,7 @@ ROWS = {
 
 
 def compare(row: Row, num: int, seed: int) -> dict[str, Any]:
-    """Plan and judge the cases of one row; return counts of plans, by name.
+    """Plan and judge `num` cases of one kind; return counts of plans, and further results by name.
 
     The counts are of plans that are solved by their status, that the referee (an independent check)
     accepts, and that only one of status and referee accepts.

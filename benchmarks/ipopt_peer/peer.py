@@ -58,7 +58,7 @@ AS_GOOD = 1e-3
 
 @dataclasses.dataclass
 class Batch:
-    """B cases for IPOPT: their parameters and initial guesses."""
+    """Parameters and initial guesses of B cases (planning problems) for IPOPT."""
 
     params: np.ndarray  # (B, P), the P parameters of each case
     starts: np.ndarray  # (B, n), initial guesses of the n decision variables
@@ -194,8 +194,8 @@ class _Recorder(ca.Callback):
 def best_setting(peer: Peer, batch: Batch, accepted: Any) -> tuple[tuple, list[dict[str, Any]]]:
     """Select the fastest setting of IPOPT among those with the highest success rate.
 
-    In nine of ten cases the setting's objective must also exceed the least objective of all
-    settings by at most 0.1 %. If no setting fulfils this, the setting with the least excess
+    Its objective must also be at most 0.1 % above the least objective of all settings in nine
+    of ten cases. If no setting fulfils this, the setting with the least excess
     is selected.
 
     Args:

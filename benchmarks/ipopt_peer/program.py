@@ -254,7 +254,11 @@ class Program:
         return ca.Function("worst", [x, params], [ca.fmax(ca.mmax(limits), ca.mmax(at_ends))])
 
     def _nlp(self) -> Any:
-        """Build objective and constraints: limits at samples, then limits at the path's end."""
+        """Build the objective and the constraints of IPOPT's program, from the variables x.
+
+        The constraints are the limits at the samples of the trajectory, and then the limits at its
+        end. There are none if the limits are penalties in the objective.
+        """
         x, params, natural, offsets = self._point()
         outward, core, at_ends = self._ends(natural, params)
         columns, h = self._basis.join(outward, offsets)
