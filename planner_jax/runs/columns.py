@@ -1,4 +1,4 @@
-"""Columns of the rows that a run stores: one row for each case, its plan and the verdict on it."""
+"""Columns of a run's stored table, which has a row for each case, its plan and its verdict."""
 
 import dataclasses
 from collections.abc import Callable, Iterator, Mapping, Sequence

@@ -114,7 +114,7 @@ class Dataset:
         return self._open().to_table(columns=None if columns is None else list(columns))
 
     def parts(self, columns: Sequence[str] | None = None) -> Iterator[pa.Table]:
-        """Yield one table for each file; named columns that the file does not have are left out."""
+        """Yield a table of the named columns (None: all) for each file, if the file has them."""
         for fragment in self._open().get_fragments():
             names = fragment.physical_schema.names
             known = None if columns is None else [name for name in columns if name in names]
