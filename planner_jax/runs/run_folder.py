@@ -43,7 +43,7 @@ class RunFolder:
         self._made: list[Path] = []
 
     def require(self, holds: bool, rule: str, shown: str) -> None:
-        """Raise `ArgumentError` "NAME must be RULE, got SHOWN" on the folder unless `holds`."""
+        """Raise an error with the text "NAME must be RULE, got SHOWN" unless `holds` is true."""
         require(holds, self.name, rule, shown=shown)
 
     def require_new(self) -> None:

@@ -104,6 +104,7 @@ def resume_sweep(
     Raises:
         ArgumentError: the folder does not hold a sweep of this task, a given setting differs, or
             rows planned here would differ because of other versions, code, devices or files.
+        SweepInterrupted, WorkersFailed, OSError: the run stopped; the folder can be resumed.
     """
     folder, sweep = RunFolder(out), sweep_of(task)
     _settings_of_run(folder, sweep, given)

@@ -52,8 +52,8 @@ def mast_camera(size: tuple[int, int] = (1280, 720)) -> Camera:
     Position and field of view (120 degrees) are assumptions, chosen so that the camera sees the
     throws of all suites almost until they enter the outer box, the region in which the arm may
     block them. It is 0.3 m to the left of the arm's axis, so that the pole in front of the arm does
-    not hide balls. In the model of [Natarajan2024] it is in front of the arm, where a field of
-    view of 110 degrees does not cover throws from up to 60 degrees to either side.
+    not hide balls. In the model of [Natarajan2024] the camera is in front of the arm, where a
+    field of view of 110 degrees does not cover throws from up to 60 degrees to either side.
     """
     place = np.array([-RIG_HALF, 0.3, 1.6])
     ahead = np.array([1.0, np.tan(np.deg2rad(-1.0)), np.tan(np.deg2rad(-8.0))])

@@ -58,8 +58,8 @@ class Aim:
     edge: float = 0.0  # [m] cut from both ends of the path on which the shield may meet a ball
 
 
-# Requirements on a contact, the strictest first: greatest offset [m] from the shield's centre, and
-# margins [m]. Each is tried for the balls for which no plan meets the previous requirements.
+# Requirements on a contact, the strictest first: offset from the shield's centre, and length cut
+# from the ball's path [m]. Each one is for balls for which no plan meets the stricter ones.
 AIMS = (Aim(0.005, at_rest=True, edge=0.05), Aim(0.005, edge=0.05), Aim(0.03, edge=0.03), Aim(0.09))
 
 
