@@ -142,12 +142,16 @@ def run_per_device(mesh: Mesh, function: Callable, *specs: PartitionSpec) -> Cal
 
 
 def place_lanes(tree: PyTree, mesh: Mesh) -> PyTree:
-    """Return the tree with its lanes (cases) divided equally among the devices of a mesh."""
+    """Return the tree with its lanes (cases) divided equally among the devices of a mesh.
+
+    The arrays are committed to these devices, as the plans of `Stored` programs are: JAX compiles
+    another program for uncommitted arrays.
+    """
     target = lane_sharding(mesh)
 
     def is_there(leaf: Array) -> bool:
         own = leaf.sharding  # == is the faster test, so it is tried first
-        return own == target or own.is_equivalent_to(target, leaf.ndim)
+        return leaf.committed and (own == target or own.is_equivalent_to(target, leaf.ndim))
 
     if all(map(is_there, jax.tree.leaves(tree))):
         return tree
