@@ -97,7 +97,7 @@ class Training:
 
 
 def train(training: Training, out: str | os.PathLike, *, progress: bool = True) -> Policy:
-    """Train a policy, or resume the interrupted run in a folder.
+    """Train a policy for the order and times of catches, or resume the run in a folder.
 
     Args:
         training: settings of the training.

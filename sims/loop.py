@@ -195,10 +195,10 @@ def _record(loop: Loop, pilot: Pilot, flight: FlightState, drag: Array) -> Recor
 
 
 def in_parts(flights: FlightState) -> bool:
-    """Return whether planning and flying are separate programs, which compile at the same time.
+    """Return whether planning and flying of a batch are separate compiled programs.
 
-    They are for up to 1024 flights on a GPU. The flights then run longer, but compiling, which
-    takes longer than these flights, takes half as long.
+    Up to 1024 flights on a GPU use separate programs, which are compiled concurrently. This halves
+    the compile time, which exceeds the run time, although the flights themselves run longer.
     """
     (device,) = flights.time.devices()
     return device.platform != "cpu" and len(flights.time) <= _FEW

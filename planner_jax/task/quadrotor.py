@@ -71,7 +71,7 @@ def require_start(cases: PyTree) -> None:
 
 
 def require_own_robot(robot: object, usual: QuadrotorModel, suite: str) -> None:
-    """Raise an error if `robot` is not the default `usual`; the `suite` defines its own robot."""
+    """Raise an error if `robot` differs from the default `usual`; `suite` has its own robot."""
     if robot != usual:
         raise ArgumentError("robot", f"left out with suite {suite!r}, which has its own", shown="")
 

@@ -20,7 +20,7 @@ class PiecewisePolynomial:
 
 @struct.dataclass
 class Motion:
-    """Height, velocity, acceleration and jerk of a trajectory at N times, to evaluate limits."""
+    """Position and derivatives of a trajectory at N times, at which its limits are checked."""
 
     height: Array  # (N,) [m]
     vel: Array  # (N, 3) [m/s]

@@ -33,8 +33,8 @@ _LATEST = 0.05  # [s], greatest shift of a catch's time in the starting point
 _SHORTEST = 0.01  # [s], least duration of a segment in the starting point
 _CLOSING = 0.1  # [m/s], least speed towards the net's plane at which a catch's time is shifted
 _BINOMIALS, _SHIFTS = polynomial.shift_basis(2 * _ORDERS)
-# Step lengths that a search tries. They include small ones, because the direction of the first
-# iteration ignores the cost's curvature and is too long.
+# Step lengths that L-BFGS tries, relative to its proposed step. Small lengths are needed, because
+# the first step ignores the cost's curvature and is too long.
 _TRIALS = (1.0, 0.2, 0.04)
 
 
@@ -90,13 +90,13 @@ class ReplanCatch(OptimisedPlanner):
         targets: TargetPath,
         head_state: ArrayLike | None = None,
     ) -> Replanning:
-        """Return the case, or the batch, as it remains `elapsed` seconds into its plan.
+        """Return the catches that remain `elapsed` [s] after the start of their plans `previous`.
 
-        Caught targets become absent; the remaining targets keep their order. `previous` is the plan
-        of `cases` that is flown, `elapsed` () or (B,) [s] >= 0 the time since its start. The
-        estimated `targets` have the shapes of the cases' targets, and their time 0 is the present.
-        The quadrotor's `head_state` (4, 3), or (B, 4, 3) for B cases, is by default its state in
-        the plan at this time.
+        `cases` are one case or a batch of B cases as they were planned, `elapsed` () or (B,) is
+        >= 0. Caught targets become absent; the remaining targets keep their order. `targets` are
+        the targets' paths as estimated at the present, which is time 0 of these paths. `head_state`
+        (..., 4, 3) has position, velocity, acceleration and jerk of the quadrotor, by default as
+        planned.
         """
         elapsed = check_elapsed(cases, elapsed)
         require_path("targets", targets, np.shape(cases.present), 3)
@@ -126,7 +126,7 @@ class ReplanCatch(OptimisedPlanner):
         return Replanning(case=left, previous=previous, elapsed=elapsed)
 
     def prepare(self, task: Replanning) -> ReplanContext:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Return the data of the remaining catches, and a starting point from the previous plan."""
+        """Return the remaining catches, and the previous plan as a starting point of the search."""
         context = self.planner.prepare(task.case)
         left = _segments(task)[1][0]
         return ReplanContext(
@@ -143,7 +143,6 @@ class ReplanCatch(OptimisedPlanner):
         last = (segments + 1) * planner.num_pieces - 1
         coeffs, ends = trajectory.coeffs[last], trajectory.durations[last]
         tails = _states(coeffs, ends)
-        # Times at which the targets pass the net's plane, linearised at the previous catches.
         axis = body_z(tails[:, 2], task.case.gravity)
         ball = targets_at(context.targets, times)
         above = jnp.sum((ball.pos - tails[:, 0]) * axis, axis=1) - net.height
@@ -155,7 +154,6 @@ class ReplanCatch(OptimisedPlanner):
         times = times + later
         begins = jnp.concatenate([jnp.zeros_like(times[:1]), times[:-1]])
         durations = jnp.maximum(times - begins, _SHORTEST)
-        # States of the previous trajectory at the new waypoints and at the starts of the segments.
         proportions = planner.maps.proportions
         shares = np.cumsum(proportions) / np.sum(proportions) - proportions / np.sum(proportions)
         knots = begins[:, None] + durations[:, None] * jnp.asarray(shares, times.dtype)[None]
@@ -169,18 +167,18 @@ class ReplanCatch(OptimisedPlanner):
         return planner.encode(context, durations, tails, offsets)
 
     def guesses(self, context: ReplanContext, num: int) -> Array:
-        """Return `num` starting points: the previous plan, then starting points of a new case."""
+        """Return `num` starting points: the previous plan, then guesses for new catches."""
         first = context.start[None]
         if num == 1:
             return first
         return jnp.concatenate([first, self.planner.guesses(context.catch, num - 1)])
 
     def objective(self, point: Array, context: ReplanContext) -> Evaluation:
-        """Return cost and violation at `point`; at the starting point if `context.keep` is true."""
+        """Return cost and violation at `point`, or if too little time is left, of the old plan."""
         return self.planner.objective(jnp.where(context.keep, context.start, point), context.catch)
 
     def decode(self, point: Array, context: ReplanContext) -> CatchPlan:
-        """Return the plan at `point`, or if `context.keep` the remainder of the previous plan."""
+        """Return the plan at `point`, or if too little time is left, the old plan's remainder."""
         plan = self.planner.decode(point, context.catch)
         return jax.lax.cond(
             context.keep, lambda: _remainder(context.task, context.catch), lambda: plan

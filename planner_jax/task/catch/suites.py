@@ -227,11 +227,6 @@ def _polygon(uniform: PyTree, *, num: int) -> tuple[BallPath, PyTree]:
 def _rush(
     uniform: PyTree, *, of: Callable, num: int, first: float, after: float, spread: float
 ) -> tuple[BallPath, PyTree]:
-    """Make `num` targets by the function `of`, each with a random deadline for its catch [s].
-
-    In a random order of the targets the deadlines are `first`, `first` + `after` and so on, each
-    changed by up to `spread` / 2.
-    """
     xp, own = _module(uniform), uniform[:, : -2 * num]
     order = xp.argsort(uniform[:, -2 * num : -num], axis=1)
     return of(own)[0], first + after * order + spread * (uniform[:, -num:] - 0.5)

@@ -1,9 +1,9 @@
-"""The default planner of groups of targets: it plans leg after leg, each as early as possible.
+"""The default planner of the task `group`, in which one car meets several targets in an order.
 
-A leg is the drive to one target. It starts when the previous leg ends, with targets and obstacles
-where they then are. `SpacetimeIntercept` plans each leg such that the meeting is as early as
-possible. If this fails, it plans the leg with the least squared acceleration instead. The first
-legs of all groups of a batch, in all proposed orders, are planned together, then all second legs.
+A leg is the drive to one target. It starts at the time and state at which the previous leg ends.
+`SpacetimeIntercept` plans each leg such that the meeting is as early as possible. If no such plan
+is found, it plans the leg with the least squared acceleration instead. The first legs of all cases
+of a batch, in all proposed orders, are planned together, then all second legs, and so on.
 """
 
 import dataclasses
@@ -30,9 +30,10 @@ _EARLY = dataclasses.replace(SpacetimeIntercept("early").attempts[0], paths=12)
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class GroupIntercept(Planner):
-    """Planner that meets targets in the order stored in a case; others plan the drives (legs).
+    """Planner by which a car meets targets in the order stored in a case, one leg after another.
 
-    To save computing time, every leg ends as early as possible, even if that delays the next leg.
+    A leg is the drive to one target, planned by `planner`. To save computing time, every leg ends
+    as early as possible, even if its end state delays the next leg.
     """
 
     case_type: ClassVar[type] = InterceptGroup
@@ -42,7 +43,7 @@ class GroupIntercept(Planner):
     patient: SpacetimeIntercept = SpacetimeIntercept("least")  # for legs that `planner` fails
 
     def plan_by(self, drive: Drive, cases: InterceptGroup) -> GroupPlan:
-        """Plan one leg (path to one target) after another; `drive` calls the legs' planner."""
+        """Plan the legs (drives to one target) in order; `drive(planner, legs)` plans a batch."""
         if cases.batch_shape == ():
             plans = self.plan_by(drive, jax.tree.map(lambda leaf: leaf[None], cases))
             return jax.tree.map(lambda leaf: leaf[0], plans)
@@ -94,7 +95,7 @@ def _is_open(status: Array) -> Array:
 def _make_legs(
     cases: InterceptGroup, k: Array | int, begin: Array, car: CarState, solved: Array
 ) -> tuple[InterceptCase, Array]:
-    """Return the drives (legs) of B groups to their k-th targets, and which are needed, (B,) bool.
+    """Return the drives (legs) to the k-th targets of B groups; and whether each is needed, (B,).
 
     The legs start at the times `begin` (B,) [s] in the states `car`. A leg is needed if its target
     exists and all previous legs are solved: `solved` (B,) bool.

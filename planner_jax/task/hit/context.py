@@ -17,7 +17,7 @@ _SLACK = 0.02  # [m], in `is_too_far`, far more than the errors of contacts that
 
 @struct.dataclass
 class HitContext:
-    """One case with path and landing time of the ball, for every evaluation of the cost."""
+    """One case with its ball's predicted path and landing time, computed before the search."""
 
     case: HitCase
     path: PathTable  # positions and velocities of the incoming ball at equally spaced times
@@ -73,8 +73,8 @@ def is_too_far(context: HitContext) -> Array:
     low = lowest - pos[:, 2] - _SLACK
     high = pos[:, 2] - ALLOWED * case.hit_limits.max_apex - _SLACK
     apart = jnp.maximum(far - arm, jnp.maximum(low, high))
-    # The tests above end at the table's last time. Later impacts are impossible if the ball is then
-    # below the height of every possible impact, and sinks.
+    # After the last time of the ball's tabulated path an impact is impossible if the ball is then
+    # sinking and below the least height of an impact.
     is_down = (pos[-1, 2] < lowest) & (vel[-1, 2] < 0.0)
     return jnp.all(apart > moved) & is_down
 

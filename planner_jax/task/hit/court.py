@@ -41,7 +41,7 @@ SCENARIOS = tuple(
 
 
 def region_bounds(depth: float = HALF_LENGTH) -> np.ndarray:
-    """Return bounds (4, 2, 2) [m] of four regions: |x| up to `depth`, and y, each from and to."""
+    """Return lower and upper bounds (4, 2, 2) [m] of |x| <= `depth` and y of the `REGIONS`."""
     near, far = (DEAD_ZONE, NEAR_LINE), (NEAR_LINE, depth)
     whole, middle = (DEAD_ZONE, depth), (-LANE_LINE, LANE_LINE)
     left, right = (LANE_LINE, HALF_WIDTH), (-HALF_WIDTH, -LANE_LINE)

@@ -43,9 +43,9 @@ if TYPE_CHECKING:
 
 _PROPORTIONS = (0.2, 0.5) + (1.0,) * 10
 _FEATURE_TIMES = (0.5, 0.75, 0.95)  # times of the ball that the network sees / landing time
-# Settings of searches for any plan that keeps the limits, whatever its cost. If the velocities at
-# waypoints are variables, the starting point must nearly keep the limits. `margin` is the relative
-# distance from a limit at which penalties start; it must cover peaks between the samples (`nodes`).
+# Settings of searches for any plan that keeps the limits, whatever its cost. `margin` is the
+# relative distance from a limit at which penalties start. Penalties are evaluated at samples only
+# (`nodes` a piece), so that the margin must cover higher values between samples.
 _ANY_FEASIBLE = (("energy_weight", 1e-11), ("margin", 0.01), ("nodes", 8))
 WITH_VELOCITIES = (*_ANY_FEASIBLE, ("velocities", True))
 _SMALL_MARGIN = (
@@ -59,7 +59,7 @@ _VELOCITY_SCALE = 2.0  # entry of `scale` for the variables that change velociti
 _PASSING = 0.9  # greatest speed of the racket in a starting point, divided by the speed limit
 # Starting points, the most successful first. Columns: time of the impact / time at which the ball
 # would land without a hit; flight time after the impact [s]; thrust per unit mass / gravity. A
-# network may replace the first row by a better one. The second row repeats the unimproved row.
+# network may replace the first row by a predicted point; therefore the second row repeats it.
 _GUESSES = np.array(
     [
         (0.92, 1.7, 1.2),
@@ -139,8 +139,8 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
     num_end_variables = 8
     guess_table = _GUESSES
     decode_nodes = (16, 16)
-    # Relative durations of the pieces. The first pieces are short, so that a hovering quadrotor can
-    # start to turn at once although its jerk is continuous.
+    # Durations of the trajectory's polynomial pieces, relative to each other. The first pieces are
+    # short, so that the jerk can change fast and a hovering quadrotor starts to turn early.
     proportions: tuple[float, ...] = _PROPORTIONS
     nodes: int = 4  # intervals of each piece at whose ends penalties are evaluated
     time_weight: float = 0.0

@@ -134,9 +134,10 @@ def judge(cases: InterceptCase, plans: InterceptPlan, **settings: object) -> Int
 
 
 def position_setting(target: PlanePath) -> dict[str, object]:
-    """Return the referee's setting `target_positions` for a target of a user's own class.
+    """Return the setting by which the referee evaluates targets of a user's own class.
 
-    The result is {} for the library's classes, whose positions the referee computes itself.
+    The result is {"target_positions": positions} with the function `positions` below. It is {} for
+    the library's classes, whose positions the referee computes itself.
     """
     while isinstance(target, LaterPath):
         target = target.path

@@ -97,8 +97,8 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
     ) -> tuple[SmoothIntercept, StartedCase]:
         """Return a planner and cases by which `pj.gradient` differentiates existing plans.
 
-        The planner minimises the cost by least squares. They start at the plans, which are near the
-        minimum and are stored in the cases.
+        The planner minimises the cost by least squares. The minimisation starts at the plans, which
+        are near the minimum and are stored in the returned cases.
         """
         problem = self.problem
         start = problem.pack(plans.speed[..., 1:], plans.curvature[..., 1:], plans.time)
@@ -121,7 +121,7 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
         return self.smooth_near(cases, plans)
 
     def solve(self, case: InterceptCase, attempt: Search) -> InterceptPlan:
-        """Return the plan of one case: try path after path until one leads to a solved plan.
+        """Plan one case by least squares from random paths of cells, up to the first solved plan.
 
         With `tries_all`, or if the meeting time is free, all paths are tried for the best plan.
         """
@@ -147,7 +147,7 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
         return self._explain(case, search, found, best)
 
     def solve_at_once(self, cases: InterceptCase, attempt: Search) -> InterceptPlan:
-        """Return the plans of a batch: try all paths together, select the best of each case."""
+        """Plan a batch: try all random paths of cells together, select each case's best plan."""
         search = self.load_attempt(attempt, cases)
         layers = jnp.max(jax.vmap(lambda case: make_grid(case, search.lattice).num)(cases))
         return jax.vmap(lambda case: self._solve_all_paths(case, search, layers))(cases)

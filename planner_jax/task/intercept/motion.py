@@ -140,8 +140,8 @@ def motion(start: Array, time: Array, speed: Array, curvature: Array, samples: i
     after = jnp.stack(  # twists of later pieces by the five variables of a piece, (5, K, 3)
         [last[:, 0] + last[:, 2] * end_y, last[:, 1] - last[:, 2] * end_x, last[:, 2]], axis=-1
     )
-    # The variables of a piece also deform earlier pieces, which displaces the piece rigidly: the
-    # end time deforms all earlier pieces, speed and curvature at its start the previous piece.
+    # A piece is displaced rigidly if its variables deform earlier pieces: the end time deforms all
+    # earlier pieces; the speed and curvature at the piece's start deform the previous piece.
     zero = jnp.zeros((1, 3), dtype)
     before = jnp.stack(
         [

@@ -70,7 +70,7 @@ class Guess:
 class MotionProblem:
     """The least-squares problem of an interception, which `SpacetimeIntercept` solves.
 
-    `meet` selects the time of the meeting: the case's time, the earliest, or that of least effort.
+    `meet` selects the time of the meeting: the case's, the earliest, or the one of least effort.
     """
 
     meet: Literal["given", "early", "least"] = "given"  # as in `SpacetimeIntercept`
@@ -260,8 +260,8 @@ class MotionProblem:
     ) -> InterceptPlan:
         """Run the stages from `guess`, and return the better of the last two stages' plans.
 
-        That is the plan that keeps all limits. If both do, it is the cheaper plan; if neither does,
-        it is the plan with the smaller violation.
+        A plan that keeps all limits is better than a plan that does not. If both plans keep all
+        limits, the cheaper plan is better; if no plan does, the one with the smaller violation.
         """
         points, steps = self.run_stages(case, field, guess, attempt, stages)
         plans = lax.map(lambda point: self.decode(case, point, steps), points[-2:])

@@ -97,7 +97,7 @@ class ReplanIntercept(Planner[Replanning, InterceptPlan]):
         if movers is None:
             moved = cases.movers.velocity * elapsed[..., None, None]
             movers = dataclasses.replace(cases.movers, centre=cases.movers.centre + moved)
-        # If the meeting time is free, the new plan may meet the target later than the previous one.
+        # If the meeting time is free, the new plan may meet the target later than the old plan.
         until = cases.time if self.problem.is_time_free else previous.time
         remainder = dataclasses.replace(
             cases,
@@ -113,15 +113,15 @@ class ReplanIntercept(Planner[Replanning, InterceptPlan]):
     def load_attempt(self, attempt: Search | Warm, tasks: Replanning) -> PyTree:
         """Return settings of an attempt in the form of an argument of the compiled `solve`.
 
-        The planner from scratch converts a `Search`, for which it gets the cases of `tasks`.
-        `Warm` settings are constants of a compiled program of their own.
+        Settings of a `Search` become arrays, so that its compiled program serves other searches,
+        too. `Warm` settings are constants of their own compiled program.
         """
         if isinstance(attempt, Search):
             return self.planner.load_attempt(attempt, tasks.case)
         return super().load_attempt(attempt, tasks)
 
     def solve(self, task: Replanning, attempt: Search | Warm) -> InterceptPlan:
-        """Return a new plan of one case: by `Warm` from the previous one, or by a `Search` anew."""
+        """Plan one case: by `Warm` from the previous plan, or by `Search` without that plan."""
         if isinstance(attempt, Search):
             return self.planner.solve(task.case, attempt)
         case, problem = task.case, self.problem
@@ -135,7 +135,7 @@ class ReplanIntercept(Planner[Replanning, InterceptPlan]):
         return problem.refine(case, make_field(case, grid), guess, attempt, stages)
 
     def solve_at_once(self, tasks: Replanning, attempt: Search | Warm) -> InterceptPlan:
-        """Return the plans of a batch, computed all at once."""
+        """Plan all cases of a batch together; a `Search` also tries all its paths together."""
         if isinstance(attempt, Search):
             return self.planner.solve_at_once(tasks.case, attempt)
         return super().solve_at_once(tasks, attempt)

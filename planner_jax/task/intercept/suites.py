@@ -214,8 +214,6 @@ def _maze(
     outer = mouth + THICKNESS
     slope = (end[:, 1:] - start[:, 1:]) / (end[:, :1] - start[:, :1])
     line = start[:, 1:] + slope * (across - start[:, :1])
-    # y position [m] of the dead end in front of each wall: where the straight line from start to
-    # meeting crosses the wall, moved as little as possible so that the wall's gap remains open.
     below = np.where(gap - half >= 2.0 * outer, np.clip(line, outer, gap - half - outer), np.inf)
     fits = SIZE - gap - half >= 2.0 * outer
     above = np.where(fits, np.clip(line, gap + half + outer, SIZE - outer), np.inf)

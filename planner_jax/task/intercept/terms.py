@@ -229,7 +229,7 @@ def obstacle_terms(
             jnp.concatenate([still_y, away_y]),
         )
 
-    # `lax.map` is a loop, so XLA computes the distances once instead of again for every use.
+    # Without the loop `lax.map`, XLA would compute the obstacles' distances anew for every use.
     far, away_x, away_y = lax.map(measure, ahead)  # (discs, 1 + N, M)
     inside = jnp.maximum(radius + weights.margin - far, 0.0)
     is_inside = inside > 0.0
@@ -257,7 +257,7 @@ def obstacle_terms(
 
 
 def join_obstacles(walls: Obstacles, movers: Obstacles) -> Obstacles:
-    """Join walls and moving obstacles; repeat corners so that all polygons have equally many."""
+    """Join walls and moving obstacles; repeat corners for equal numbers per polygon."""
     size = max(walls.corners.shape[1], movers.corners.shape[1])
 
     def pad(corners: Array) -> Array:
