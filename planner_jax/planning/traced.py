@@ -18,6 +18,7 @@ import json
 import operator
 import os
 import sys
+import threading
 from collections.abc import Callable, Hashable, Sequence
 from importlib import metadata
 from pathlib import Path
@@ -200,14 +201,15 @@ def _read(path: Path, results: Results) -> bytes | None:
 
 def _write(path: Path, content: bytes, results: Results) -> None:
     described = {"sha256": hashlib.sha256(content).hexdigest(), "results": results.to_json()}
-    with contextlib.suppress(OSError):  # a folder that cannot be written, or another process
+    with contextlib.suppress(OSError):  # a folder that cannot be written
         path.parent.mkdir(parents=True, exist_ok=True)
-        others = sorted(path.parent.iterdir(), key=lambda each: each.stat().st_mtime)
-        for oldest in others[: max(len(others) - MOST + 1, 0)]:
-            oldest.unlink()
-        scratch = path.with_name(f"{path.name}.{os.getpid()}")
+        scratch = path.with_name(f"{path.name}.{os.getpid()}.{threading.get_ident()}")
         scratch.write_bytes(json.dumps(described).encode() + b"\n" + content)
         scratch.replace(path)
+    with contextlib.suppress(OSError):  # a file that another thread or process has renamed
+        stored = sorted(path.parent.iterdir(), key=lambda each: each.stat().st_mtime)
+        for oldest in stored[: max(len(stored) - MOST, 0)]:
+            oldest.unlink()
 
 
 def _digest(identity: tuple, layout: Sequence[Any], platform: str) -> str:
