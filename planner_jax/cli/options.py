@@ -45,7 +45,7 @@ class Parser(argparse.ArgumentParser):
 
     Args:
         fill: function that adds the parser's options; it is called when the parser is used. With
-            it, options that the user omits are missing in the result; without it they are None.
+            `fill`, options that the user omits are missing in the result, otherwise None.
         **look: further arguments of `argparse.ArgumentParser`.
     """
 

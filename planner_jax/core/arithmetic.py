@@ -59,7 +59,7 @@ Components = Array | tuple[Array, Array, Array]  # (..., 3), or its three compon
 
 
 def components(x: Components) -> list[Array]:
-    """Return the n components of vectors (..., n) as arrays (...); a tuple has them already."""
+    """Return the components (...) of vectors (..., n); a tuple `x` already holds these arrays."""
     if isinstance(x, tuple):
         return [*x]
     return [jnp.squeeze(part, -1) for part in jnp.split(x, x.shape[-1], axis=-1)]

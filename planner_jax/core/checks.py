@@ -28,7 +28,7 @@ def format_shapes(tree: PyTree) -> str:
 
 
 def require_number(name: str, value: object, rule: Rule = FINITE) -> None:
-    """Raise unless `value` is a finite number that keeps `rule`; jax scalars are not tested."""
+    """Raise unless `value` is a finite number that keeps `rule`; jax scalars may have any value."""
     number = require_scalar(name, value)
     if not isinstance(number, jax.Array) and not all(r.holds(number, None) for r in (FINITE, rule)):
         words = rule.words if rule is FINITE else f"{FINITE.words} and {rule.words}"
@@ -36,7 +36,7 @@ def require_number(name: str, value: object, rule: Rule = FINITE) -> None:
 
 
 def require_scalar(name: str, value: object) -> Numbers:
-    """Return a number, finite or not, as an array (); raise `ArgumentTypeError` for others."""
+    """Return a number, finite or not, as an array (); raise `ArgumentTypeError` for all else."""
     number = numeric(value)
     if number is None or number.shape or number.dtype == np.bool_:
         raise ArgumentTypeError(name, "a number", value)

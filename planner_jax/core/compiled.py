@@ -18,8 +18,8 @@ from jax.extend.backend import backends
 Settings = TypeVar("Settings")
 
 _RUN_TIME: set[type] = set()
-# Until version 0.11 of JAX, XLA's older generator of code for a CPU compiles in 40 % less time.
-# Programs for one hit or catch are as fast with it, and steps of an arm in MJX are far faster.
+# Before version 0.11 of JAX, XLA also has an older code generator for CPUs. It needs 40 % less time
+# to compile. Its programs for a hit or catch are as fast, and steps of an arm in MJX far faster.
 _IS_OLD = jax.__version_info__ < (0, 11)
 QUICK_OPTIONS: Any = {"xla_cpu_use_fusion_emitters": False} if _IS_OLD else {}
 
@@ -27,7 +27,7 @@ QUICK_OPTIONS: Any = {"xla_cpu_use_fusion_emitters": False} if _IS_OLD else {}
 def with_run_time_numbers(*names: str) -> Callable[[type[Settings]], type[Settings]]:
     """Make a frozen dataclass a pytree whose leaves are the fields with these names.
 
-    Fields that hold objects of another such class, or tuples of them, become subtrees. All other
+    Fields that hold objects of other decorated classes, or tuples of them, become subtrees. Other
     fields are static and must be hashable. A field that is None is static, too.
     """
 

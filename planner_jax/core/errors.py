@@ -69,7 +69,7 @@ class ArgumentTypeError(ArgumentError, TypeError):
 
 
 class CaseError(ArgumentError):
-    """A number of a case breaks its field's rule, such as "> 0"; `index` is the first such case."""
+    """A number of a case breaks its field's rule; `index` is the first case that breaks it."""
 
     _where = "in lane"
 

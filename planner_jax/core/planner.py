@@ -150,7 +150,7 @@ class Planner(Generic[CaseT, PlanT]):
         raise NotImplementedError
 
     def plan_by(self, drive: Drive, cases: CaseT, /) -> PlanT:
-        """Return the plans of a batch, composed of plans that `drive` makes by other planners."""
+        """Return a batch's plans, composed of other planners' plans; `drive` calls the others."""
         raise NotImplementedError
 
     def starts_long(self, cases: CaseT) -> bool:

@@ -178,7 +178,7 @@ class Attempt:
     """Settings of one search for cases that earlier attempts left unsolved; static under jit."""
 
     starts: int = 1  # number of starting points from which each case is solved
-    # Greatest violation (relative excess over a limit) of a plan that is searched again; None: any.
+    # Greatest violation (relative excess over a limit) for a further search; None: no bound.
     within: float | None = dataclasses.field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
@@ -215,7 +215,7 @@ class Decision(Protocol):
         return plans.cost
 
     def explain(self, case: PyTree, status: Array, /) -> Array:
-        """Return `status` () of an unsolved case, or one that tells why it is unsolved; pure."""
+        """Return an unsolved case's `status` (), or a status that tells the reason; pure."""
         return status
 
 

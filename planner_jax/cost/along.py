@@ -1,8 +1,8 @@
 """Penalties integrated along trajectories with pieces of fixed time ratios [Yu2023catch, eq. 26].
 
-This is the innermost part of every search. On a GPU one CUDA kernel computes it (`along_kernel`),
-which keeps the samples of a trajectory in registers. Further kernels compute derivatives. On other
-devices JAX compiles the functions of this module.
+The integrals are the innermost part of every search. On a GPU one CUDA kernel (`along_kernel`)
+computes them, and keeps the samples of a trajectory in registers. Further kernels compute
+derivatives. On other devices JAX compiles the functions of this module.
 """
 
 import dataclasses
@@ -63,7 +63,7 @@ class Along:
             object.__setattr__(self, "groups", (every,))
 
     def __repr__(self) -> str:
-        """Return a text of all constants, the same in every process, which identifies kernels."""
+        """Return a text of all constants, equal in every process: a key of the compile cache."""
         code = self.excess.__module__, getattr(self.excess, "__qualname__", "")
         pieces = tuple(self.maps.proportions.tolist())
         shape = self.maps.order, pieces, self.maps.coefficients.shape[-1], self.nodes
@@ -74,7 +74,7 @@ class Along:
         """Return matrices (K, orders, C) from C columns to the motion at K samples.
 
         Columns are end states and waypoint offsets. The motion has position, velocity, ... for a
-        mean duration of 1 s.
+        mean piece duration of 1 s.
         """
         each = [self.maps.sample_matrix(self.nodes, d) for d in range(self.orders)]
         return np.stack(each, axis=1)

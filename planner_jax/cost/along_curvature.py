@@ -228,8 +228,8 @@ class _Constants:
     samples: np.ndarray  # (3 * orders * K, G + C)
     moving_samples: np.ndarray  # (orders, K, C)
     groups: tuple[tuple[Slot, ...], ...]
-    # Entries (pairs of axes, pairs of orders): the penalty has second derivatives by derivatives of
-    # the motion of these orders (1: velocity) along these axes.
+    # Entries (pairs of axes, pairs of orders); order 1 is the velocity. Only for these pairs the
+    # penalty's second derivatives by two components of the motion may differ from zero.
     pairs: tuple[tuple[tuple[tuple[int, int], ...], tuple[tuple[int, int], ...]], ...]
 
     @property

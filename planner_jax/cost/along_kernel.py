@@ -140,7 +140,7 @@ def along_kernel(
 
     The `mode` "values" returns penalties and greatest excesses, "slopes" also derivatives by
     columns (end states, waypoint offsets) and durations, "slopes by all" by the limits, too.
-    "curvature" returns directional derivatives of these; the direction of the limits may be None.
+    "curvature" returns derivatives of all these results along a direction, None for fixed limits.
     """
 
     def kernel(treedef: Treedef, leaves: Sequence[Array]) -> Sequence[Array] | None:

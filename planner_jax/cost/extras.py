@@ -208,8 +208,8 @@ def greatest_extras(
     """Return the greatest excess () over each limit that the user added, along one segment.
 
     `columns` (C, 3), end states and waypoint offsets, and the mean piece duration `duration` () [s]
-    determine the segment. The result is never too small if the excess is concave between samples,
-    since tangents at neighbouring samples intersect above it.
+    determine the segment, which the matrices `maps` sample. The result is never too small if the
+    excess is concave between samples: tangents at neighbouring samples intersect above the excess.
     """
     if not num_limits(extras):
         return ()
@@ -231,7 +231,7 @@ def greatest_extras(
 
 
 def extra_rate(motion: Motion, given: tuple) -> PyTree:
-    """Return the sum (N,) of the user's costs per second, `given[-1]`, at N samples."""
+    """Return the cost per second (N,) of all extras (user's terms), the last entry of `given`."""
     samples = motion.pos, motion.vel, motion.acc
     rates = (extra.cost(*samples) for extra in given[-1] if isinstance(extra, ExtraCost))
     return sum(rates, jnp.zeros_like(motion.height))

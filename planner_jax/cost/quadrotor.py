@@ -1,7 +1,7 @@
 """Functions that compute how far samples of a trajectory exceed the quadrotor's limits.
 
-Most functions return the excess q^2 / limit^2 - 1 of a quantity q. It is positive where the limit
-is exceeded, and needs no square root. `relative` converts it to q / limit - 1. Vectors may be
+Most functions return the excess q^2 / limit^2 - 1 of a quantity q. The excess is positive where the
+limit is exceeded, and needs no square root. `relative` converts it to q / limit - 1. Vectors may be
 tuples of their components, as they are in a CUDA kernel.
 """
 
@@ -57,7 +57,10 @@ def ground_excess(height: Array, limits: QuadrotorLimits) -> Array:
 def limits_along(
     motion: Motion, given: tuple[Array, QuadrotorLimits, tuple[Extra, ...]]
 ) -> tuple[PyTree, ...]:
-    """Return the excess (N,) at N samples over each limit of flight, then over user's limits."""
+    """Return the excess (N,) at N samples over each limit of flight, then over user's limits.
+
+    `given` is gravity [m/s^2], limits of flight, and extras (the user's limits and costs).
+    """
     gravity, limits, extras = given
     return (*flight_excess(motion, gravity, limits), *extra_excess(motion, extras))
 
@@ -206,8 +209,8 @@ def flight_along(
 ) -> Along:
     """Return the penalties for exceeding the limits of a case along the segments of a flight.
 
-    They start at a relative distance `margin` before each limit, are smoothed over `hinge_width`,
-    and are sampled at `nodes` intervals of each polynomial piece by the matrices `maps`.
+    Each penalty starts at a relative distance `margin` before its limit, and is smoothed over
+    `hinge_width`. The matrices `maps` sample it at `nodes` intervals of each polynomial piece.
     """
     factors = [measure.factor for measure in flight_measures(case.limits)]
     factors += [1.0] * num_limits(case.extras)

@@ -1,4 +1,4 @@
-"""Export of plans as MCAP files (profile ros2), with times since the start of the plan."""
+"""Export of plans as MCAP files of ROS 2 messages, with times since the start of the plan."""
 
 from typing import BinaryIO
 

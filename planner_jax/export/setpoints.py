@@ -66,7 +66,7 @@ def robot_of(plan: Plan) -> Robot:
 
 
 def require_one(name: str, all_of: str, shape: tuple[int, ...]) -> None:
-    """Raise unless `shape`, of a batch of plans or cases, is (); advise to take one of `all_of`."""
+    """Raise an error that names the batch `all_of` unless its batch shape, `shape`, is ()."""
     shown = f"a batch of shape {shape}"
     require(shape == (), name, f"one, as pj.take({all_of}, k) gives", shown=shown)
 

@@ -87,8 +87,8 @@ def usable_cores() -> int:
 def threads_of_a_computation() -> int:
     """Return the number of threads that XLA uses for one computation on a CPU.
 
-    It is the environment variable PJRT_NPROC or NPROC, else the number of usable cores. On some
-    CPUs it affects the last digits of results.
+    The environment variable PJRT_NPROC or NPROC sets this number, by default the number of usable
+    cores. On some CPUs the number of threads affects the last digits of results.
     """
     number = os.environ.get("PJRT_NPROC") or os.environ.get("NPROC", "")
     return max(int(number), 1) if number.isdecimal() else usable_cores()

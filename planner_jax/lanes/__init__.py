@@ -1,4 +1,4 @@
-"""Mapping of functions of one problem over a batch, whose axis is last, and CUDA kernels for it."""
+"""Mapping of functions of one problem over the last axis of a batch, on GPUs by CUDA kernels."""
 
 from planner_jax.lanes.kernels import with_kernel
 from planner_jax.lanes.over import over_lanes

@@ -21,7 +21,7 @@ _FEWEST = 16  # least number of lanes (problems of a batch) in a block of a kern
 
 
 def block_width(lanes: int, most: int) -> int | None:
-    """Return the lanes (problems) of a GPU block, gcd(lanes, most); None if it is below 16."""
+    """Return the number of lanes (problems) in a GPU block, gcd(lanes, most); None if below 16."""
     width = math.gcd(lanes, most)
     return width if width >= _FEWEST else None
 
@@ -113,7 +113,7 @@ def grid_index(axis: int) -> Array:
 
 
 def _spare_searches() -> None:
-    """Register an empty module, which JAX else searches in vain whenever it lowers a kernel."""
+    """Register the missing module `tt` as empty; else JAX searches for it at every kernel."""
     name = "jaxlib.mlir.dialects.tt"
     if name not in sys.modules and importlib.util.find_spec(name) is None:
         sys.modules[name] = types.ModuleType(name)

@@ -127,7 +127,7 @@ class PaperCatch(OptimisedPlanner):
     miss_weight: float = 1e4
     angle_weight: float = 1e2
     hinge_width: float = 0.01  # width of the smoothed penalties of limits and of the net's angle
-    # The penalty weights increase in stages, since the final penalties are too stiff to start with.
+    # Penalty weights rise in stages: a search that starts with the final weights converges badly.
     rounds: tuple[Round, ...] = (
         Round(
             starts=1,

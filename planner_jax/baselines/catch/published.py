@@ -1,4 +1,4 @@
-"""Comparison of a run's success rates on catches with [Yu2023catch, Tables I and III]."""
+"""Comparison of success rates on catches by a quadrotor with [Yu2023catch, Tables I and III]."""
 
 from typing import NamedTuple
 
@@ -35,7 +35,7 @@ SOURCE = (
 def make_table(manifest: Entries) -> RateTable:
     """Return a table of a run's success rate and optimal time ratio beside [Yu2023catch].
 
-    This ratio is the mean relative change of the initial catching times by the optimiser.
+    The optimal time ratio is the mean relative change from initial to optimised catching times.
     """
     summary, settings = manifest["summary"], manifest["parameters"]
     planner, names = settings["planner"], list({**SUITES, settings["suite"]: None})

@@ -39,9 +39,9 @@ _ORDER = 4  # derivative whose square is minimised: snap
 _COST_UNIT = 1e4  # divisor of the cost, so that the Hessian has moderate entries
 _DECODE_NODES = 24  # number of samples per piece at which the plan's violation is evaluated
 
-# Fractions in `transition_point` [Yu2023bat, Section VI-A]: alpha from the quadrotor's start to the
-# hit; phi from the ball's origin to its target (an assumption, since the paper does not define
-# phi); eta from the line through hit and phi's point to alpha's point.
+# Fractions of segments in `transition_point` [Yu2023bat, Section VI-A]. Point A is at alpha from
+# the quadrotor's start to the hit, point B at phi (assumed) from the ball's origin to its target.
+# The transition is at eta from the projection of A onto the line from B to the hit, to A.
 _ALPHA, _ETA, _PHI = 0.5, 2.0 / 3.0, 0.5
 _SLOWING = np.array([0.5, 0.5, 1.0 / 3.0])  # (velocity at transition) / (velocity at hit), x, y, z
 _ACCELERATION_SHARE = 2.0 / 3.0  # (acceleration at transition) / (acceleration at hit)
@@ -208,7 +208,7 @@ class BatHit(OptimisedPlanner):
         return impact, hit.defect
 
     def guesses(self, context: HitContext, num: int) -> Array:
-        """Return the initial guess (1, n), a minimum-jerk motion [Yu2023bat, Section VI-A]."""
+        """Return one initial guess (1, n), a minimum-jerk motion [Yu2023bat, Section VI-A]."""
         require(num == 1, "starts", "1", num)
         case, dtype = context.case, context.landing_time.dtype
         stages = self.stage_times if self.transition else self.stage_times[:1]
@@ -289,7 +289,7 @@ class BatHit(OptimisedPlanner):
         return self.limit_weight * duration * jnp.sum(hinges * weights[None])
 
     def objective(self, point: Array, context: HitContext) -> Evaluation:
-        """Return the sum of snap, time and penalties [Yu2023bat, eq. 20], over `_COST_UNIT`.
+        """Return the sum of snap, time and penalties [Yu2023bat, eq. 20] / `_COST_UNIT`.
 
         The reported violation is always zero, so that the solver does not prefer iterates that keep
         the limits, and returns its last iterate.
@@ -310,7 +310,7 @@ class BatHit(OptimisedPlanner):
         return is_too_far(context)
 
     def decode(self, point: Array, context: HitContext) -> HitPlan:
-        """Return the plan of a vector of variables; its violation is sampled 24 times per piece."""
+        """Convert the variables `point` to a plan; its violation is sampled 24 times per piece."""
         case = context.case
         offsets, rows, duration, impact, defect = self._unpack(point, context)
         columns = jnp.concatenate([rows, offsets])

@@ -1,4 +1,4 @@
-"""Shared parts of the baselines of [Yu2023bat]: the impact, and the largest excess over a limit."""
+"""Shared parts of the planners of hits of [Yu2023bat]: impact, and largest excess over a limit."""
 
 import jax.numpy as jnp
 from jax import Array
@@ -63,7 +63,7 @@ def make_impact(
 
 
 def largest_violation(along: Array, impact: Impact, case: HitCase) -> Array:
-    """Return the largest relative excess over any limit, (); for the ground it is in metres.
+    """Return the largest relative excess () over any limit; a lack of height counts in metres.
 
     Args:
         along: (4, N) excess at N samples of the trajectory, from `motion_excess`.
@@ -81,7 +81,7 @@ def largest_violation(along: Array, impact: Impact, case: HitCase) -> Array:
 def motion_excess(motion: Motion, gravity: Array, limits: QuadrotorLimits) -> tuple[Array, ...]:
     """Return the excess (N,) of N samples over each of four limits [Yu2023bat, eq. 18a].
 
-    It is (value / limit)^2 - 1 for speed, acceleration and body rate, and the lack of height [m].
+    An excess is (value / limit)^2 - 1 for speed, acceleration and body rate, z_min - z for height.
     """
     return (
         speed_excess(motion.vel, limits),

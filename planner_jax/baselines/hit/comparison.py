@@ -1,4 +1,4 @@
-"""Comparison of a run's success on hits with the outcomes and rates published by [Yu2023bat]."""
+"""Comparison of a quadrotor's success on hits with the results published by [Yu2023bat]."""
 
 import hashlib
 from collections import Counter
@@ -16,7 +16,7 @@ from planner_jax.task.hit.suites import Serves
 
 
 def describe_serves(serves: Serves) -> Entries:
-    """Return the number of distinct balls among serves, and a hash that identifies the serves."""
+    """Return the number of distinct served balls, and the SHA-256 hash of all balls and targets."""
     balls = np.column_stack([serves.position, serves.velocity])
     digest = hashlib.sha256(np.column_stack([balls, serves.target]).tobytes()).hexdigest()
     return {"distinct": len(np.unique(balls, axis=0)), "sha256": digest}
@@ -65,7 +65,7 @@ class ScenarioCounts:
             self._published.update((planner, name) for name in scenario[solved])
 
     def summary(self) -> Entries:
-        """Return, as `per_scenario`, success rates of the run and of the published planners."""
+        """Return the entry `per_scenario`: success rates of the run and of published planners."""
         found = {
             name: {
                 "num": self._num[name],

@@ -1,7 +1,7 @@
 """The impact of a ball on a quadrotor's racket by [Yu2023bat, Section IV-B] (eqs 11-14).
 
-Two components of the racket's velocity and two of the quadrotor's thrust are given. The remaining
-components follow from the ball and the target.
+The caller chooses two components of the racket's velocity and two of the quadrotor's thrust. The
+remaining components follow from the ball and the target.
 """
 
 import jax.numpy as jnp
@@ -19,7 +19,7 @@ _LEAST_PUSH = 1e-3  # [s], least (change of the ball's velocity) / thrust
 
 @struct.dataclass
 class DecoupledHit:
-    """A hit with given racket velocity y, z and thrust x, z, by [Yu2023bat, eqs 13-14]."""
+    """A hit from y, z of the racket's velocity and x, z of the thrust [Yu2023bat, eqs 13-14]."""
 
     ball_vel_after: Array  # (3,) [m/s], velocity of the ball after the impact
     flight_time: Array  # () [s], of the ball from the impact to the target

@@ -1,4 +1,4 @@
-"""Data published with [Yu2023bat]: trial files with serves and outcomes, and success rates."""
+"""Data of [Yu2023bat] on hits by a quadrotor: files of serves and outcomes, and success rates."""
 
 import csv
 import dataclasses
@@ -184,7 +184,7 @@ def _list_out_of_play(trials: list[Trial]) -> list[str]:
 class PublishedRates:
     """Published success rates in percent, one row per court scenario, one column per planner.
 
-    The paper and its trial files differ by up to 20 percentage points.
+    The rates in the paper's table and in its trial files differ by up to 20 percentage points.
     """
 
     paper: np.ndarray  # (36, 3) [%], Table I of the paper

@@ -1,1 +1,1 @@
-"""Published methods for interceptions by a car, and the searches and splines that they use."""
+"""Published methods for interceptions (a car meets a moving target), with searches and splines."""

@@ -33,7 +33,7 @@ def words_to_pose(x, y, heading, lengths):
         if side == 1:
             y, sin, heading = -y, -sin, -heading
         row = 3 * side
-        # Vector between the centres of the first and the last turning circle, if both turn alike.
+        # Vector between the centres of the first and last turning circle, with equal directions.
         across, up = x - sin, y + cos - 1.0
         far = math.sqrt(across**2 + up**2)
         if far < 1e-9:

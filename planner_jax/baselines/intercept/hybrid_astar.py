@@ -189,7 +189,6 @@ def _sample_arcs(
 
 
 def _chords(heading: np.ndarray, curvature: np.ndarray, length: np.ndarray) -> np.ndarray:
-    """Return the vectors (..., 2) [m] from the start to the end of arcs."""
     half = 0.5 * curvature * length
     chord = length * np.sinc(half / np.pi)
     return chord[..., None] * np.stack([np.cos(heading + half), np.sin(heading + half)], axis=-1)

@@ -1,6 +1,6 @@
-"""The planner `paper` [Qu2022]: a path by Hybrid A*, then a speed along the path.
+"""The planner `paper` [Qu2022]: a car meets a moving target by a path, then a speed along the path.
 
-Hybrid A* runs on the host, one case after another. One compiled program smooths the paths by
+Hybrid A* searches paths on the host, one after another. One compiled program smooths the paths by
 gradient descent, and plans the speeds by dynamic programming and Bezier curves. If the paper does
 not report a limit, the limit of the case is used. The curvature of a searched path jumps, and
 differs from the car's curvature at the start. The car therefore drives a path close to the smoothed

@@ -1,4 +1,4 @@
-"""Smoothing of searched paths by gradient descent [Qu2022, Section III-C].
+"""Smoothing of a car's searched paths by gradient descent [Qu2022, Section III-C].
 
 Gradient descent moves the inner points of the path. The cost (eq. 12) keeps them away from
 obstacles (eq. 13), within the curvature limit (eq. 14) and evenly spaced on a line that is as
@@ -34,7 +34,7 @@ from planner_jax.core.errors import ArgumentError
 from planner_jax.plane.obstacles import Obstacles, distances, separation
 
 _FINE = 8  # number of samples per piece of the spline, for the computation of its length
-# Fractions of the shift to the smoothed points, tried in turn until a path keeps all limits.
+# Fractions of the shift from given to smoothed points, tried until a path keeps all limits.
 _SHARES = (1.0, 0.5, 0.25, 0.0)
 # Relative excess over the curvature limit that is allowed, because of rounding errors.
 _CURVATURE_TOLERANCE = 1e-3
@@ -244,7 +244,7 @@ def resample(
     pieces = points.shape[0] - 1
     control = _clamp_ends(points, start_heading, end_heading)
     places = jnp.linspace(0.0, pieces, pieces * _FINE + 1, dtype=points.dtype)
-    # Lengths by Simpson's rule, with the midpoint of every interval as the middle node.
+    # Lengths of the spline's intervals by Simpson's rule, with their midpoints as middle nodes.
     half = 0.5 / _FINE
     speed, between = (
         jnp.linalg.norm(_spline(control, at)[1], axis=1) for at in (places, places[:-1] + half)

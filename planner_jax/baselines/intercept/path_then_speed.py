@@ -1,4 +1,4 @@
-"""Planners that first find a path and then a speed along the path [Qu2022].
+"""Planners that first find a path for a car, and then a speed along the path [Qu2022].
 
 An obstacle that stays on a path cannot be avoided by a speed along this path. These planners
 therefore try several paths, which pass the standing obstacles on different sides.
@@ -114,7 +114,7 @@ class PathThenSpeed(Planner):
 
     @property
     def attempts(self) -> tuple[Search, ...]:
-        """The searches, each with a number `paths` of paths; unsolved cases get the next search."""
+        """The searches, each for a number `paths` of paths; unsolved cases get the next search."""
         return self.searches
 
     def solve(self, case: InterceptCase, attempt: Search) -> InterceptPlan:
@@ -191,9 +191,9 @@ def lattice(**fields: object) -> PathThenSpeed:
 def em(**fields: object) -> PathThenSpeed:
     """Create the planner `em`: one of eight searched paths, with the speed planner of [Fan2018].
 
-    The path allows the least acceleration past the moving obstacles in a search on a grid of times
-    and distances along the path. The speed has 20 polynomial pieces, whose bounds hold at 5 samples
-    each. `fields` are fields of the planner that replace defaults.
+    Dynamic programming over time and distance finds a drive past the moving obstacles along each
+    path; the path of least acceleration is selected. The speed has 20 polynomial pieces, whose
+    bounds hold at 5 samples each. `fields` are fields of the planner that replace defaults.
     """
     speed = dataclasses.replace(SPEED_PLANNERS["em"], pieces=20, samples=5)
     return PathThenSpeed(**{"tries": 1, "step": SpeedStep(speed=speed), **fields})

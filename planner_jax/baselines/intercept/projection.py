@@ -122,7 +122,7 @@ def overlap(
 
     The body is enlarged by `margin` [m]. A further enlargement makes the interval of a path point
     hold for all positions on the path within `half_step` () [m] of this point. Without an overlap
-    the interval starts after its end. For an obstacle at standstill it may be infinite.
+    the interval starts after its end. For a standing obstacle the interval may be infinite.
     """
     turned = half_step * jnp.abs(path.curvature)
     ahead, behind = body.length - body.rear_overhang, body.rear_overhang
@@ -150,7 +150,6 @@ def overlap(
         mine = [x * corner[None, :, 0] + y * corner[None, :, 1] for corner in own]
         other = [x * theirs[:, k, :1] + y * theirs[:, k, 1:] for k in range(theirs.shape[1])]
         rate = x * movers.velocity[:, :1] + y * movers.velocity[:, 1:]
-        # On the axis (x, y), body and polygon overlap at the times t with -after < rate t < before.
         before = _most(mine) - _least(other)
         after = _most(other) - _least(mine)
         is_still = jnp.abs(rate) < 1e-7

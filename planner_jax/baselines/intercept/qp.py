@@ -57,7 +57,7 @@ class QpSolution:
 
 @dataclasses.dataclass(frozen=True)
 class QpConfig:
-    """Greatest numbers of active bounds and steps; if they do not suffice: status MAX_STEPS."""
+    """Greatest numbers of active bounds and steps; the status is MAX_STEPS if one is exceeded."""
 
     active: int = 64  # greatest number of active bounds
     max_steps: int = 60  # greatest number of steps; a step adds or drops one active bound
@@ -117,7 +117,7 @@ def qp_template(
 class _Search:
     """State of the dual method: a point, and its working set of at most A active bounds.
 
-    The point is optimal if only these bounds count. A row's two bounds are two parallel planes.
+    The point is the optimum without all other bounds. A row's bounds are two parallel planes.
     """
 
     point: Array  # (d,), coordinates of the point along d free directions
@@ -159,7 +159,7 @@ def solve_qp(
     dtype = lower.dtype
     t: QpTemplate = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), template)
     unbounded = _product(t.reach, right_side)
-    # `low` and `high` bound the products of unit normals and point; `slack` is for rounding errors.
+    # `low` and `high` bound (unit normal) @ point for each row; `slack` is for rounding errors.
     low, high = (lower - unbounded) / t.scales, (upper - unbounded) / t.scales
     eps = jnp.finfo(dtype).eps
     slack = 16.0 * eps * (1.0 + jnp.where(jnp.isfinite(low), jnp.abs(low), 0.0))

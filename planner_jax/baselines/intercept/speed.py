@@ -1,4 +1,4 @@
-"""Speed along a known path: the second half of [Qu2022] (Section IV), and its baselines.
+"""Speed of a car along a known path: the second half of [Qu2022] (Section IV), and baselines.
 
 The station is the distance along the path. In the graph of station over time, moving obstacles
 block polygons. Dynamic programming finds a line between the polygons. A quadratic program then
@@ -63,7 +63,7 @@ class SpeedPlanner:
     samples: int | None = None
     margin: float = 1e-3  # [m], least distance from polygons
     # Weight of the curve's squared final distance from the path's end, 300 in [Qu2022] for a
-    # horizon of 10 s. With None the curve ends exactly there.
+    # horizon of 10 s. With None the curve ends exactly at the path's end.
     end_weight: float | None = None
     grid: StationTimeGrid = StationTimeGrid()
     solver: QpConfig = QpConfig()
@@ -137,7 +137,6 @@ def speed_template(planner: SpeedPlanner) -> QpTemplate:
 
 
 def _rows_of_piece(planner: SpeedPlanner, order: int) -> np.ndarray:
-    """Return the matrix from control points to stations (`order` 0), speeds or accelerations."""
     rows = hodograph(planner.degree, order, planner.pieces)
     if planner.samples is None:
         return rows

@@ -1,4 +1,4 @@
-"""Paths that pass standing obstacles on different sides, for planners that split path and speed.
+"""Paths of a car past standing obstacles on different sides, for planners of path, then speed.
 
 The paths are planned by the parts of the planner `spacetime`, for a case without moving obstacles
 and with a target that stands at the meeting point. Random paths are drawn through the reach set,

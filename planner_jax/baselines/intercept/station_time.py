@@ -293,10 +293,10 @@ def corridor(
 
 
 def _speed_limits(problem: StationTimeProblem, joints: Array) -> tuple[Array, Array, Array]:
-    """Return least station, greatest station [m] and speed limit [m/s] in each of K intervals.
+    """Return bounds on the station [m] and a speed limit [m/s] for each of K time intervals.
 
-    Between the two stations no part of the path has a lower limit. The line has the stations
-    `joints` (K + 1,) [m] at the ends of the intervals.
+    No part of the path between a lower and an upper bound has a lower speed limit. `joints`
+    (K + 1,) [m] are the stations of a line at the ends of the intervals.
     """
     limit = problem.speed_limit
     edge = jnp.linspace(0.0, 1.0, limit.shape[-1] + 1)[None] * problem.end_station

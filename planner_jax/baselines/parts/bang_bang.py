@@ -70,8 +70,8 @@ def bang_bang(
     """
     joints = _mirror(turn, rate, acceleration)
     u, d, a = joints.rate, joints.turn, acceleration
-    # The equation for the rate p at which a joint coasts is quadratic if p is above the initial
-    # rate, else linear; the module's docstring states it.
+    # The equation in the module's docstring for the rate p at which a joint coasts is quadratic if
+    # p is above the initial rate u, else linear.
     b, c = a * duration + u, a * d + 0.5 * u**2
     above = 2.0 * c / jnp.maximum(b + _root(b**2 - 4.0 * c), 1e-9)
     below = (d - 0.5 * u**2 / a) / jnp.maximum(duration - u / a, 1e-9)

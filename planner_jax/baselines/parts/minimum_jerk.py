@@ -70,8 +70,8 @@ def minimum_jerk_after_ramp(
         return 6.0 * primitive(jerk).coeffs[0, 3]
 
     constant = first_jerk(jnp.zeros_like(j0))
-    # Derivative of `first_jerk` by its argument, in closed form. Two values of `first_jerk` differ
-    # by a thousandth of their size, so that a finite difference would have a large rounding error.
+    # Derivative of `first_jerk` by its argument, in closed form. A finite difference would have a
+    # large rounding error, since the difference is only a thousandth of the values of `first_jerk`.
     share = t / (duration - t)
     slope = -share * (4.5 + share * (6.0 + 2.5 * share))
     jerk = constant / (1.0 - slope)
