@@ -62,7 +62,7 @@ def _is_run_time(value: object) -> bool:
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class Fixed:
-    """An attempt (settings of a search) as a static argument, for which JAX compiles a program."""
+    """A search's settings as a static argument: JAX compiles a program for each of their values."""
 
     attempt: object
 

@@ -150,7 +150,7 @@ class Planner(Generic[CaseT, PlanT]):
         raise NotImplementedError
 
     def plan_by(self, drive: Drive, cases: CaseT, /) -> PlanT:
-        """Return a batch's plans, composed of other planners' plans; `drive` calls the others."""
+        """Compose the plans of a batch from plans of other planners, which `drive` calls."""
         raise NotImplementedError
 
     def starts_long(self, cases: CaseT) -> bool:
@@ -244,7 +244,7 @@ def require_planner(planner: object) -> None:
 
 
 def require_fit(planner: Planner, cases: object) -> None:
-    """Raise unless `planner` is a pytree with at least one attempt (search), for these cases."""
+    """Raise unless `planner` is a pytree with an attempt (search), and for the class of `cases`."""
     require_planner(planner)
     if jax.tree_util.all_leaves([planner]) and planner.kind is not Kind.HOST:
         rule = "a pytree: put @jax.tree_util.register_static over its frozen dataclass, or make it "

@@ -65,6 +65,6 @@ def to_disk(path: Path) -> None:
 
 
 def is_scratch(path: Path) -> bool:
-    """Return whether a file is named like a scratch file of `replacing` in a killed process."""
+    """Return whether a file is named like the scratch files that `replacing` creates."""
     first, _, rest = path.name.removeprefix(".").partition(".")
     return path.name.startswith(".") and first.isdigit() and rest.startswith("tmp.")
