@@ -47,7 +47,6 @@ STRAIGHT = OnlineBlock(searches=(Search(straight=48, tries=0),))
 
 
 def from_home(cases: Any, homes: np.ndarray) -> Any:
-    """Combine B cases with H start poses (H, 6) [rad]: return H x B cases, ordered by pose."""
     num = len(homes)
 
     def repeat(leaf: Any) -> np.ndarray:
@@ -61,7 +60,6 @@ def from_home(cases: Any, homes: np.ndarray) -> Any:
 
 
 def share_solved(planner: Any, cases: Any, homes: np.ndarray) -> np.ndarray:
-    """Return the share of cases that a planner solves from each of H start poses, (H,)."""
     plans = pj.plan(planner, from_home(cases, homes))
     return pj.are_solved(plans).reshape(len(homes), -1).mean(axis=1)
 

@@ -82,9 +82,6 @@ def build_timed(bench: Bench, path: Path, layout: str, regime: str) -> Library:
     home = irb1600().home
     own = LAYOUTS[layout]
     tunnel = tunnels(own, scene.inner, scene.outer)
-    # Motions for some pairs of cells are planned only to compile the programs of every batch size.
-    # These pairs are spread over all pairs, so that straight motions fail for some of them. Those
-    # need, and compile, the search by least squares.
     few = np.flatnonzero(tunnel.is_feasible)[:: tunnel.is_feasible.sum() // 64]
     began = time.perf_counter()
     for size in set(building.portions().lanes):
@@ -117,11 +114,6 @@ def describe(bench: Bench, library: Library) -> None:
 
 
 def referee(bench: Bench, library: Library, num: int, name: str) -> None:
-    """Draw `num` balls for which the library stores motions; report how many are blocked.
-
-    The referee, an independent check in float64, judges each motion. Also report how many motions
-    the planner reports as blocking and the referee rejects. `name` labels the printed line.
-    """
     found = check(library, num, SEED)
     wrong = int((found.claimed & ~found.verdict.success).sum())
     bench.say(

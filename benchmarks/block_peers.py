@@ -64,8 +64,8 @@ PLANNERS: dict[str, tuple[str, dict[str, Any]]] = {
 }
 NEED_PEERS = ("rrt-connect", "epase")
 LASTS_UNTIL_CONTACT = ("online", "brisk")
-# [%] To count planning time, `online` and `brisk` plan for an arm that starts later by this
-# quantile of their planning times.
+# [%] Quantile of the planning times of `online` and `brisk`. They plan for an arm that starts later
+# by the quantile, so that their motions are in time although planning takes time.
 RESERVE = 90.0
 WARM = 2  # Number of throws, drawn with another seed, that are planned before the measurement.
 # Tables I and II of [Natarajan2024] as printed. Columns of Table I: motion found [%], blocked if
@@ -144,7 +144,6 @@ def remove_waits(motion: PiecewisePolynomial) -> PiecewisePolynomial:
 
 
 def is_found(plans: BlockPlan, verdict: BlockVerdict) -> np.ndarray:
-    """Return for each plan (B,) whether its motion is free of collision, even if it is too late."""
     claims = pj.are_solved(plans)
     late = np.isfinite(plans.violation) & (verdict.failed_limit == "time")
     return (claims & verdict.success) | (late & ~claims)

@@ -103,7 +103,7 @@ PIPELINES: dict[str, tuple[float | None, tuple[float, float, float], dict[str, A
 def errors_after(
     cases: Any, eye: Eye, times: Array, places: Array, moments: Array, middle: Array
 ) -> tuple[Array, Array]:
-    """Fit the flights of B balls M times, from ever more observations; return position errors.
+    """Fit the flights of B balls at M times; return the errors of the fitted positions.
 
     The camera `eye` observes the positions `places` (B, K, 3) [m] at the times `times` (K,) [s].
     Fit m uses the observations up to the time `moments[m]` (M,) [s]. Returns the errors of the
@@ -126,7 +126,6 @@ def errors_after(
 
 @jax.jit
 def middle_of(cases: Any) -> Array:
-    """Return the times (B,) [s] when balls are midway between two nested boxes around the arm."""
     flights = jax.vmap(flight_of)(cases)
     return 0.5 * (flights.earliest + flights.latest)
 
@@ -144,11 +143,6 @@ class Table:
         bench.say("|---|---|---|" + "---|" * len(heads))
 
     def line(self, suite: str, rate: float, noise: str, errors: np.ndarray, stds: Any) -> None:
-        """Print the row of one suite of throws, frame rate [Hz] and kind of noise.
-
-        `errors` (B, M) [m] of B balls and M fits are NaN for balls that were not seen. `stds` (B,
-        M) [m] are the standard deviations that the fits estimate for these errors.
-        """
         within = np.mean(errors < ROOM, axis=0)  # False for balls not seen (NaN).
         medians = np.nanmedian(errors, axis=0)
         cells = [
@@ -171,7 +165,6 @@ class Table:
 
 
 def report_models(bench: Bench, num: int, seed: int) -> None:
-    """Print errors of fitted flights for each suite, frame rate and noise model, without images."""
     bench.say(f"Median error, and share of {num} throws within {ROOM:g} m", "")
     table, moments = Table(bench), jnp.asarray(MOMENTS)
     for suite in ("short", "pole"):
@@ -196,10 +189,6 @@ def report_models(bench: Bench, num: int, seed: int) -> None:
 
 
 def report_images(bench: Bench, num: int, seed: int) -> None:
-    """Print errors of flights fitted to rendered images, and to observations with modelled noise.
-
-    Also print the times to process an image and to fit a flight. `num` throws are rendered.
-    """
     from planner_jax.sims.board import calibrate_camera
     from planner_jax.sims.camera import RenderError, SceneCamera
 
@@ -308,7 +297,6 @@ def moments_of(first: float, last: float, rate: float) -> list[float]:
 
 
 def pipeline(bench: Bench, num: int, seed: int) -> None:
-    """Simulate arms that plan from noisy observations; print the share of balls that they block."""
     bench.say("", f"{num} throws of short, R1 wide, seed {seed}: the whole pipeline", "")
     bench.say(
         "| decided | noise | success % (95 %) | on the shield, % | without a plan, % | motions | "
@@ -359,7 +347,6 @@ def pipeline(bench: Bench, num: int, seed: int) -> None:
 
 
 def planning(bench: Bench, num: int, seed: int) -> None:
-    """Report planning times for one throw: for the arm's first motion, and for re-planning."""
     cases = jax.tree.map(np.asarray, pj.block.draw(num, "short", seed, regime="R1", wide=True))
     planner, sensor = pj.block.planner(), eye(std=0.02)
     known = [
@@ -386,13 +373,6 @@ def planning(bench: Bench, num: int, seed: int) -> None:
 
 
 def time_with_aims(planner: Any, entries: Any) -> tuple[Any, np.ndarray]:
-    """Plan B problems one by one, and time the planner.
-
-    The ball's position is only an estimate. Each problem is therefore first planned with a contact
-    within 5 mm of the shield's centre and an arm at standstill. Until a plan is solved, it is
-    planned again without standstill, then within 3 cm and within 9 cm. Returns the plans, and for
-    each problem the total planning time, (B,) [s].
-    """
     (num,), own = entries.batch_shape, isinstance(planner, ReplanBlock)
     aimed = []
     for aim in AIMS:

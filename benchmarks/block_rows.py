@@ -78,13 +78,12 @@ def has_end_pose(case: pj.block.BlockCase) -> Array:
 
 @jax.jit
 def long_search(cases: pj.block.BlockCase, bumps: Array, ranks: Array) -> pj.block.BlockPlan:
-    """Plan each of B cases by least squares from N starts; return the plan nearest to feasible.
+    """Plan each of B cases by least squares from N starts; return the best plan of each case.
 
-    This is the plan that exceeds the limits by the least amount.
-
-    The planner sorts the poses in which the shield meets the ball. Start n is a motion to the pose
-    with rank `ranks[n]` in this order, in which all joints move in proportion, plus a smooth
-    deviation of the joints by up to `bumps[n]` (6,) [rad].
+    The best plan is the plan that exceeds the limits by the least amount. Start n is a straight
+    motion, in which all joints move in proportion, plus a smooth deviation of the joints by up to
+    `bumps[n]` (6,) [rad]. The planner sorts the poses in which the shield meets the ball, and the
+    straight motion ends at the pose with rank `ranks[n]` in this order.
     """
     online = OnlineBlock()
 

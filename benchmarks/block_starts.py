@@ -13,8 +13,8 @@ a right angle, and the arm may start after 0.05 s. No reported result uses these
 no straight motion blocks are planned from random starting points. Then there are two kinds of
 candidates for the bumps: random bumps that led to plans, and typical deviations of these plans from
 straight motions. Each candidate is tried with the first ten end poses, on all throws for which a
-plan was found. The starting points are selected greedily: each is the one that blocks most of the
-throws that the points before it do not block.
+plan was found. The starting points are selected greedily: of the throws that no selected point
+blocks yet, the next selected point blocks the largest number.
 
 --write replaces the file that the library ships. The shipped file was learned with the options
 --num 2400 --tries 384 --lanes 16384, in half a minute on one H200.
@@ -175,8 +175,8 @@ def select_starts(solves: np.ndarray) -> list[int]:
     """Select greedily from which initial motions the planner of blocks starts its search.
 
     Entry (throw, motion) of the table `solves` (throws, motions) bool is true if a search from the
-    initial motion blocks the throw. Each selected motion solves most of the throws that the
-    selected motions before it do not solve. Returns at most 16 column indices.
+    initial motion blocks the throw. Of the throws that no selected motion blocks yet, the next
+    selected motion blocks the largest number. Returns at most 16 column indices.
     """
     left, chosen = np.ones(len(solves), bool), []
     while left.any() and len(chosen) < MOST:
@@ -222,14 +222,10 @@ def learn(bench: Bench, num: int, tries: int, lanes: int) -> list[dict[str, Any]
     if not solvable.size:
         return []
 
-    # Candidates come from random starting points that solve a throw, at most 8 of each throw.
-    # Otherwise most of them would come from easy throws, which nearly every starting point solves.
     some = [rng.permutation(np.flatnonzero(good & (places == throw)))[:8] for throw in solvable]
     picked = np.concatenate(some)
-    # The planned motions deviate from straight motions, in which all joints move in proportion. The
-    # cluster centres of these deviations are candidates for bumps. The initial centres are drawn
-    # here: the argument `seed` of `kmeans2` is deprecated, and its argument `rng` would draw other
-    # numbers than the shipped file used.
+    # The initial cluster centres are drawn here, because the argument `seed` of `kmeans2` is
+    # deprecated. With its argument `rng` the shipped file could not be reproduced.
     first = np.random.RandomState(1).choice(len(picked), min(KINDS, len(picked)), replace=False)
     middles, _ = kmeans2(beside[picked], beside[picked[first]], minit="matrix")
     candidates = np.concatenate([middles, bumps[rng.permutation(picked)[:KINDS]]])

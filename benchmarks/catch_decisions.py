@@ -44,9 +44,9 @@ SHORT = ExactCatch(rounds=(Round(starts=1, solver=LbfgsConfig(max_steps=25)),))
 
 
 def decision_time(decision: Any, cases: Any, num: int) -> float:
-    """Measure the median time [s] to decide the order and times of one case, on a CPU.
+    """Measure the median time [s] to decide the order and times of catches, on a CPU.
 
-    A compiled function maps a NumPy vector with the case's numbers to a vector with the decision.
+    A compiled function maps a NumPy vector with one case's numbers to a vector with the decision.
     """
     cpu = jax.local_devices(backend="cpu")[0]
     lanes = [pj.take(cases, k % cases.batch_shape[0]) for k in range(num)]
@@ -93,7 +93,7 @@ def run_row(bench: Bench, suite: str, name: str, decision: Any, options: Any) ->
 
 
 def measure(bench: Bench, suites: list[str], options: argparse.Namespace) -> None:
-    """Print a table with one row for each suite and each method that decides order and times."""
+    """Print a row for each suite and each method to decide the order and times of catches."""
     decisions = {
         "best": pj.catch.Best(),
         "greedy": pj.catch.Greedy(),

@@ -1,4 +1,4 @@
-"""Measure both catch planners on the 240 throws with published optima of a C++ program.
+"""Measure two planners of catches on the 240 throws with published optima of a C++ program.
 
     python -m benchmarks.catch_reference [--data tests/data] [--repeats 5] [--out DIR]
 
@@ -42,17 +42,16 @@ from planner_jax.optimise.settings import Round, Stage
 
 SETS = ("paper", "hard")
 BATCH_COPIES = 64
-# Maximum numbers of iterations of the planner whose speed is measured: in its second stage, which
-# checks limits at all samples of a trajectory, and in its first stage, which uses a quarter of
-# them.
+# Maximum numbers of the planner's iterations in the second stage of its search, which checks limits
+# at all samples of a trajectory, and in the first stage, which checks them at every fourth sample.
 _QUICK, _QUICK_COARSE = 45, 60
 
 
 def read_set(path: Path, dtype) -> tuple[pj.catch.CatchCase, dict[str, np.ndarray]]:
     """Read a CSV file of throws; return cases, and published numbers by their columns.
 
-    `Tp` and `T_ref` [s] are the catching times of the initial guess and of the optimum, `J0_M4` and
-    `J0_M8` the costs of the guess with 4 and 8 pieces, and `cost_ref` is the cost of the optimum.
+    `Tp` and `T_ref` [s] are the catching times of the initial guess and of the optimum. `J0_M4` and
+    `J0_M8` are the costs of a guess with 4 and 8 polynomial pieces, `cost_ref` is the optimal cost.
     """
     with path.open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
@@ -78,7 +77,7 @@ def read_set(path: Path, dtype) -> tuple[pj.catch.CatchCase, dict[str, np.ndarra
 def guess_cost(planner: PaperCatch, case: pj.catch.CatchCase) -> jax.Array:
     """Return the cost [Yu2023catch, eqs 18-28] at the planner's initial guess for a case.
 
-    The planner divides its cost by `COST_UNIT`; the returned cost is multiplied by it.
+    The planner divides its cost by the constant `COST_UNIT`; the returned cost is not divided.
     """
     context = planner.prepare(case)
     return COST_UNIT * planner.objective(planner.guesses(context, 1)[0], context).cost

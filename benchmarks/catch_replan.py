@@ -51,7 +51,7 @@ SCRATCH, AGAIN = pj.catch.ExactCatch(), pj.catch.ReplanCatch()
 
 
 class Estimator:
-    """Kalman filter of one ball's position and velocity; a vector stores mean and covariance."""
+    """Kalman filter of a ball's position and velocity, with mean and covariance in one vector."""
 
     def __init__(self, period: float, noise: float, drag: Any, gravity: Any) -> None:
         model = EkfModel(
@@ -121,7 +121,6 @@ def stack(trees: list) -> Any:
 
 
 def balls_of(case: CatchCase) -> pj.BallPath:
-    """Return the ball's path, which is the target of every case of the suite `throws`."""
     assert isinstance(case.targets, pj.BallPath)
     return case.targets
 
@@ -248,7 +247,6 @@ def report_times(bench: Bench, name: str, seconds: list[float]) -> None:
 
 
 def report_catches(bench: Bench, name: str, verdict: dict[str, np.ndarray]) -> None:
-    """Print the success rate, the ball's distances from the net's centre, and failed limits."""
     p50, p90, p99 = 100.0 * np.percentile(verdict["net_distance"], [50, 90, 99])
     limits = np.unique([limit for limit in verdict["failed_limit"] if limit], return_counts=True)
     failures = ", ".join(f"{limit} {count}" for limit, count in zip(*limits, strict=True))

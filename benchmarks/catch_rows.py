@@ -29,10 +29,6 @@ from planner_jax.task.catch.spec import DECISIONS, SUITES, TASK
 
 
 def run_row(bench: Bench, suite: str, name: str, options: argparse.Namespace) -> dict[str, Any]:
-    """Plan the cases of one suite with the planner `name`; return rates, costs and times by name.
-
-    The successes are added to the run's summary.
-    """
     num, seed = options.num, options.seed
     planner, cases = pj.catch.planner(name, decide=options.decide), pj.catch.draw(num, suite, seed)
     began = time.perf_counter()

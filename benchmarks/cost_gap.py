@@ -39,12 +39,12 @@ def cost_gaps(
     other planner it is another planner, which the task specification names as `yardstick`.
 
     Args:
-        planner: the planner that made the plans. If it also decides order and times
-            (`DecidedPlanner`), the long search uses the same decisions.
+        planner: the planner that made the plans. If it also decides the order and times of
+            contacts (`DecidedPlanner`), the long search uses the same decisions.
         cases: a batch; only the first 1,024 cases (`COMPARED`) are compared.
         plans: one plan for each case.
         devices: devices of the long search; None for all devices.
-        card: specification of the planner's task. With None there is no other planner, so the
+        card: specification of the planner's task, which may name a `yardstick`. With None the
             result is None for a planner that does not minimise a cost.
 
     Returns:
@@ -63,11 +63,6 @@ def cost_gaps(
 
 
 def _reference_planner(planner: Any, cases: Any, card: Task | None) -> Any:
-    """Return the planner with whose costs the costs of plans are compared, or None.
-
-    There is none for a planner that does not minimise a cost, if the task specification `card`
-    names no planner of comparison (`yardstick`) for cases of this class.
-    """
     if isinstance(planner, OptimisedPlanner):
         return with_long_search(planner)
     if card is None or card.yardstick is None:

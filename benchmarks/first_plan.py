@@ -29,7 +29,7 @@ from planner_jax.benchmarks.run import argument_parser, begin, parse_names
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """One measurement of a first plan: which cases the task's function `draw` draws for it."""
+    """One row of the table: a task, and the cases that are drawn for the first plan."""
 
     task: str
     num: int | None = None  # number of cases in a batch; None for one case without a batch axis
@@ -50,7 +50,7 @@ ROWS = {
     # With a fifth of the usual limits there is no solution, so the planner makes all of its
     # attempts.
     "later-hit": Row("hit", options={"limit_scale": 0.2}, is_later=True),
-    # No motion in which all joints move in proportion blocks this ball.
+    # Case 2 of the suite: no motion in which all joints move in proportion blocks its ball.
     "later-block": Row("block", options={"first": 2}, is_later=True),
 }
 _PROCESS = """

@@ -86,12 +86,6 @@ def _double(tree: Any) -> Any:
 
 
 def _errors(found: np.ndarray, best: np.ndarray, lanes: np.ndarray) -> str:
-    """Format quantiles of the relative difference between gradients `found` and `best` (B, n).
-
-    Both have n components for each of B cases. Each component is first divided by the median of its
-    absolute value in `best`, because components have different units. Only the cases with the
-    indices `lanes` are compared.
-    """
     has_none = ~np.isfinite(found[lanes]).all(axis=1)
     none, lanes = has_none.mean(), lanes[~has_none]
     unit = np.median(np.abs(best[lanes]), axis=0)

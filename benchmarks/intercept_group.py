@@ -48,7 +48,7 @@ STEP = 0.005  # [s] Time step of the lower bound on the time of the last meeting
 
 
 def draw(num: int, seed: int) -> InterceptGroup:
-    """Draw `num` groups of moving targets, each reduced to its first three; NumPy arrays."""
+    """Draw `num` groups of moving targets in NumPy arrays; keep the first three of each group."""
     groups = jax.tree.map(np.asarray, pj.group.draw(num, seed=seed))
     present = np.broadcast_to(np.arange(groups.num_targets) < TARGETS, groups.present.shape)
     return dataclasses.replace(groups, present=present)
@@ -75,7 +75,7 @@ def limit_times(groups: InterceptGroup) -> np.ndarray:
     limits, ahead = shared.limits, np.asarray(shared.body.middle)
     # On a path of curvature kappa the speed of the body's middle is sqrt(v^2 + (ahead v kappa)^2),
     # where v is the speed of the rear axle. The term (v kappa)^2 is the curvature kappa times the
-    # lateral acceleration v^2 kappa, and both are limited. The bound on v never decreases.
+    # lateral acceleration v^2 kappa, and both are limited.
     v = np.minimum(
         limits.speed[:, None], shared.speed[:, None] + limits.acceleration[:, None] * times
     )
@@ -99,19 +99,6 @@ def _meet_in_order(
     places: np.ndarray,
     tolerance: np.ndarray,
 ) -> np.ndarray:
-    """Return the times (B,) [s] at which a fast point has met all targets in a given order.
-
-    The point replaces the car of each of B groups for the lower bound. The time is infinite if the
-    point cannot meet all targets.
-
-    Args:
-        order: indices of the targets.
-        place: (B, 2) [m], position of the point at time 0.
-        travel: (B, T) [m], greatest distance that the point has covered at each time.
-        times: (B, T) [s], times at which meetings are checked.
-        places: (B, N, T, 2) [m], positions of the N targets.
-        tolerance: (B,) [m], greatest distance of a meeting from the target.
-    """
     lanes, at, slack = np.arange(len(travel)), np.zeros(len(travel), int), tolerance
     met = np.ones(len(travel), bool)
     for target in order:

@@ -223,8 +223,8 @@ TASKS = {
 def measure(bench: Bench, task: str, num: int, seed: int) -> dict[str, np.ndarray]:
     """Measure the scales of the variables of a task's planners, and compare with shipped scales.
 
-    `task` is "hit" or "catch". `num` and `seed` define the drawn cases. Returns the measured scales
-    by planner, "exact-" and its number of pieces.
+    `task` is "hit" or "catch". `num` and `seed` define the drawn cases. Returns the scales by
+    the planner's name, such as "exact-6" for a trajectory of 6 pieces.
     """
     draw, planners, options = TASKS[task]
     cases, found = draw(num, seed), {}

@@ -31,7 +31,7 @@ PLANNER = ExactHit()
 
 
 def make_own_solver(iterations: int) -> Callable:
-    """Return a function that minimises the planner's objective for one hit with own L-BFGS.
+    """Return a function that minimises the objective of one hit with this library's L-BFGS.
 
     The function maps a case to n decision variables (n,) and the number of iterations.
     """

@@ -46,7 +46,7 @@ def poison(cases: Any, lanes: np.ndarray, spared: Collection[str] = ()) -> Any:
 
     Args:
         cases: a batch.
-        lanes: indices of the cases to change. They take turns through all invalid numbers.
+        lanes: indices of the cases to change. Each gets the next of the values from `poisons`.
         spared: names of arrays that are not changed.
     """
     paths, tree = jax.tree_util.tree_flatten_with_path(cases)
@@ -67,7 +67,7 @@ def compare(task: Any, num: int, every: int, seed: int) -> dict[str, int]:
     Args:
         task: specification of the task.
         num: number of cases.
-        every: one in this number of cases is made invalid.
+        every: number N; one of every N cases is made invalid.
         seed: seed of the cases.
     """
     cases, planner = task.draw(num, seed=seed), task.planner(**task.bench)

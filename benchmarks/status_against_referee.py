@@ -92,7 +92,6 @@ def _point_on_plan(row: Row, cases: Any, random: np.random.Generator) -> np.ndar
 
 
 def _add_constraint(cases: Any, extra: Any) -> Any:
-    """Return cases with the constraint `extra`, such as an obstacle, in single precision."""
     return cases.replace(extras=(jax.tree.map(lambda leaf: leaf.astype(np.float32), extra),))
 
 

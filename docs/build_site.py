@@ -27,7 +27,7 @@ CODE = re.compile(r"(^```.*?^```)", re.MULTILINE | re.DOTALL)
 
 
 def rewrite_links(text: str, source: str, problems: list[str]) -> str:
-    """Return the text of a page with links that are relative to its place in the site.
+    """Return the text of a page with links that are relative to the page's place in the site.
 
     Links to files that are no pages become plain text. `source` is the path of the page in the
     repository; messages about links to missing files are appended to `problems`.
@@ -71,8 +71,8 @@ def stage_pages() -> list[str]:
 def public_names(package: str) -> list[str]:
     """Return the full names of the public functions and classes of a package.
 
-    A function that has the name of a submodule, such as `case`, is named by the module that defines
-    it, because its name in the package would find the submodule.
+    A function with the name of a submodule, such as `case`, is listed by the module that defines
+    the function, because the function's name in the package would find the submodule.
     """
     module = importlib.import_module(package)
     names = []

@@ -98,10 +98,6 @@ def unpack(vector, sizes: dict[str, int]) -> dict:
 
 
 def advance(motion: list, time) -> list:
-    """Return a motion `time` [s] later, where its last derivative is constant.
-
-    A motion is a list of the position and its time derivatives in ascending order.
-    """
     orders = range(len(motion))
     return [
         sum(motion[n + i] * (time**i / math.factorial(i)) for i in orders[: len(motion) - n])

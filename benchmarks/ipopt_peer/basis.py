@@ -90,8 +90,6 @@ class Basis:
         factors = {place: bends[k, :].T for k, place in enumerate(places)}
         sizes = (num, num, num, 1)
         blocks = [[ca.MX.zeros(a, b) for b in sizes] for a in sizes]
-        # The constant matrices map coefficients to samples. In this order of the loops each product
-        # with one of them is computed only once.
         for i, (order, axis) in enumerate(PLACES):
             inside: dict[int, Any] = {}
             for j, (other, of) in enumerate(PLACES):

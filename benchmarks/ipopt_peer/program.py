@@ -323,7 +323,6 @@ class Program:
         of_samples, bends = self._bends(self._basis.sample(columns), h, params, multipliers)
         by_columns = self._basis.gradient(of_samples)
         full = self._basis.hessian(bends, self._bend_places)
-        # Second derivatives of the limits and of the snap energy, the integral of the squared snap.
         power, energy = self._power, of_f * self._offset_energy(offsets, h)
         bend = 2.0 * of_f * self._own / h**power
         outer, place = self._basis.outer, self._basis.place
