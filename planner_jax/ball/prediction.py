@@ -71,7 +71,6 @@ def predict_path(
 
 @functools.cache
 def _node_function(num_nodes: int) -> Callable:
-    # Derivatives use forward mode, also inside reverse mode, so that no states must be stored.
     def integrate(
         pos: Array, vel: Array, resolution: Array, drag: Array, gravity: Array
     ) -> tuple[Array, Array]:
@@ -123,8 +122,8 @@ def horizon_of(table: PathTable) -> Array:
 def convolution_weights(u: Array) -> Array:
     """Return the weights (4,) of cubic convolution [Keys1981; Yu2023bat, eqs 8 and 10b].
 
-    They multiply the values at four neighbouring nodes. The point of interpolation lies between the
-    second and third node, at the fraction `u` () of the interval.
+    The weights multiply values at four neighbouring nodes. The point of interpolation lies between
+    the second and third node, at the fraction `u` () of the interval.
     """
     far = lambda x: ((-0.5 * x + 2.5) * x - 4.0) * x + 2.0  # noqa: E731
     near = lambda x: (1.5 * x - 2.5) * x * x + 1.0  # noqa: E731

@@ -19,7 +19,7 @@ from planner_jax.lanes.kernels import Treedef
 from planner_jax.lanes.pallas import block_width, kernel_by_lanes
 
 _THREADS = 32  # greatest number of threads (balls) in one GPU block
-# Index of the velocity among the arguments: position, velocity, resolution, drag, gravity.
+# Index of the velocity among the kernel's arguments: position, velocity, resolution, drag, gravity.
 _VEL = 1
 
 
@@ -30,10 +30,10 @@ def table_kernel(
 
     Args:
         num_nodes: number N of nodes.
-        moving: arguments by which states are differentiated: 1 velocity, 2 resolution, 3 drag, 4
-            gravity; the initial position only shifts a path. If there are any, the kernel returns
-            derivatives instead of states: the positions' derivatives (N, 3) by each argument, or
-            (N, 3, 3) by the velocity, in the order of `moving`, then the velocities' derivatives.
+        moving: arguments by which states are differentiated: 1 initial velocity, 2 resolution (time
+            between nodes), 3 drag, 4 gravity. With () the kernel returns states. Otherwise it
+            returns derivatives: of the positions, (N, 3) by each argument, or (N, 3, 3) by the
+            velocity, in the order of `moving`; then of the velocities in the same shapes.
         interpret: run the kernel in Pallas's interpreter, without a GPU, for tests.
     """
 
@@ -52,13 +52,12 @@ def table_kernel(
 
 @dataclasses.dataclass(frozen=True)
 class _Direction:
-    """One scalar input by which the states at the nodes are differentiated."""
+    """One scalar input of a ball's flight, by which the kernel differentiates the ball's states."""
 
-    # Index of the result array (N, 3) or (N, 3, 3) with derivatives of positions by this input.
-    result: int
+    result: int  # index of the array of results that holds the derivatives by this input
     index: tuple[int, ...]  # component of the velocity (last axis of the array); () for a scalar
     vel: tuple[float, ...]  # (3,) tangent of the velocity at time 0
-    numbers: tuple[float, ...]  # (3,) tangent: of the scalars resolution, drag and gravity
+    numbers: tuple[float, ...]  # (3,) tangents of the scalars resolution, drag and gravity
 
 
 def _directions(moving: tuple[int, ...]) -> list[_Direction]:

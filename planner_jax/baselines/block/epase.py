@@ -64,7 +64,7 @@ class OpenStates:
         return None
 
     def steps_from(self, state: State) -> list[State]:
-        """Return neighbours in unexpanded grid cells to which no path as short is known."""
+        """Return neighbours in unexpanded grid cells to which no shorter path is known."""
         neighbours = state.angles + STEPS
         lengths = state.length + np.linalg.norm(neighbours - state.angles, axis=1)
         return [
@@ -75,7 +75,7 @@ class OpenStates:
         ]
 
     def push(self, state: State) -> None:
-        """Add a state, and record its path length as the shortest to its grid cell."""
+        """Add an unexpanded state, and store its path length as the least for its grid cell."""
         self._lengths[_cell_of(state.angles)] = state.length
         ahead = float(np.linalg.norm(state.angles - self._goal))
         entry = state.length + self._weight * ahead, next(self._number), state

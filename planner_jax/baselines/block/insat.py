@@ -115,7 +115,7 @@ class InsatBlock(PoseByPose):
         return None
 
     def lift(self, case: BlockCase, free: FreeSpace, goal: Goal, state: State) -> bool:
-        """Store in `state` the best spline from the start to it; return False if there is none."""
+        """Store in `state` the cheapest spline that leads to it; return whether one exists."""
         found = self.best_spline(case, free, goal, state, rests=False)
         if found is None:
             return False
@@ -154,7 +154,7 @@ class InsatBlock(PoseByPose):
             ),
         )
         good = splines.time <= goal.available
-        # Every eighth sample is checked first: these few reject most iterates that collide.
+        # Every eighth sample is checked first, which rejects most iterates that collide.
         is_first = np.arange(len(_SHARES)) % 8 == 0
         for some in (is_first, ~is_first):
             if good.any():

@@ -118,7 +118,7 @@ def _compose(cubic: np.ndarray, speed: np.ndarray, rise: np.ndarray) -> np.ndarr
 def _excess(
     coeffs: np.ndarray, durations: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray
 ) -> float:
-    """Return the factor >= 1 by which a motion must be slowed down to keep its joint limits."""
+    """Return the factor >= 1 on a motion's durations that is needed to keep the joint limits."""
     powers = np.arange(coeffs.shape[1])
     times = (_INSIDE * durations[:, None])[..., None]  # (M, S, 1)
     rates = np.where(powers > 0, times ** np.maximum(powers - 1, 0), 0.0) * powers

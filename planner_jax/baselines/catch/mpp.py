@@ -159,17 +159,17 @@ class MppCatch(Planner):
         )
 
     def times(self, context: CatchContext) -> tuple[Array, Array]:
-        """Return increasing catching times (N,) [s] of N targets, and numbers (N,) > 0 if invalid.
+        """Return increasing catching times (N,) [s] of N targets, and their violations (N,).
 
-        A time is valid if the target falls through the height `self.height` then, later than the
-        previous target. The number is the missing time [s] between the two falls, or 1 if the
-        target does not fall. Absent targets come last and have the time of the last catch.
+        A target is caught when it falls through the height `self.height`. The violation is
+        positive if the target falls too soon after the previous target, by the lacking time [s],
+        or at least 1 if it does not fall. Absent targets have the time of the last catch.
         """
         height = jnp.asarray(self.height, context.horizon.dtype)
         find = lambda target, end: falling_time(target, height, end, self.time_nodes)  # noqa: E731
         fall, found = jax.vmap(find)(context.targets, context.horizon)
         before = jnp.concatenate([jnp.zeros_like(fall[:1]), fall[:-1]])
-        # If a target falls before the previous target, the time between the catches is `_SHORTEST`.
+        # A catch comes `_SHORTEST` [s] after the previous catch if its target falls earlier.
         duration = jnp.maximum(fall - before, _SHORTEST)
         times = jnp.cumsum(jnp.where(context.active, duration, 0.0))
         late = jnp.maximum(_SHORTEST - (fall - before), jnp.where(found, -1.0, 1.0))

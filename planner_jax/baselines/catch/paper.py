@@ -50,7 +50,7 @@ def limits_excess(motion: Motion, given: tuple[Array, QuadrotorLimits]) -> tuple
     """Return excesses over limits of speed, body rate, thrust, height [Yu2023catch, eqs 26-28].
 
     Each excess is a difference of squares in SI units; for the height it is a difference [m].
-    Excesses are computed at samples of the motion. `given` has gravity and limits of a case.
+    Excesses are computed at samples of the motion. `given` is (gravity [m/s^2], robot's limits).
     """
     gravity, limits = given
     return (

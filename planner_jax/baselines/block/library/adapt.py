@@ -40,10 +40,10 @@ _HIGHEST = lax.Precision.HIGHEST
 # Weights of six joints in the squared change of a stored motion's end pose. The wrist joints have
 # low weights, since they carry little mass; the last joint keeps its stored angles.
 _WEIGHTS = np.array([1.0, 1.0, 1.0, 0.3, 0.3, 0.0])
-# [rad^2], weight of (distance / cell size)^2, from the point where the ball enters a box to the
-# centre of the cell (rectangle on the box) for which a motion was stored; summed over two boxes.
+# [rad^2], weight of the squared distance, in cell sizes, between the point where a ball enters a
+# box around the arm and the centre of the box's cell for which a motion was stored.
 _AWAY = 0.02
-_LATE = 10.0  # [rad^2], penalty of a motion that exceeds a joint limit by the limit itself
+_LATE = 10.0  # [rad^2], penalty of a motion that exceeds a joint limit by 100 %
 _NEAR = 30.0  # [rad^2/m], penalty per metre by which the arm is too close to the pole
 
 
@@ -110,7 +110,7 @@ class AdaptBlock(Planner):
         self.stored.check(cases)
 
     def solve(self, case: BlockCase, attempt: Effort) -> BlockPlan:
-        """Return one case's plan: the first warped, else refined motion that keeps all limits."""
+        """Return a plan: the first warped motion that keeps all limits, or else a refined one."""
         flight = flight_of(case)
         home, fits = self.stored.home_of(case)
         poses = end_poses(case, flight, attempt.points, self.online.pieces)

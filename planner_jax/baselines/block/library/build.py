@@ -46,12 +46,12 @@ from planner_jax.task.block.default_planner import OnlineBlock, read_learned_sta
 from planner_jax.task.block.motion import angles_at
 from planner_jax.task.block.scene import Scene
 
-# Indices of initial guesses of the least squares (file `learned_starts.json`), in the order of use.
-# For pairs of cells with a motion, a build tries `STARTS`, which may find one that blocks earlier
-# balls; for pairs without a motion it tries all guesses. A repair after an obstacle has moved
-# starts from the old motion and from `REPAIR_STARTS`.
+# Indices of initial guesses of arm motions for least squares (file `learned_starts.json`). A build
+# of a library first uses `STARTS` in this order; a repair, after an obstacle has moved, first uses
+# the old motion and `REPAIR_STARTS`. Pairs of cells that still lack a motion get further guesses.
 STARTS, REPAIR_STARTS = (2, 0, 1, 3, 4, 5), (2,)
-# [s] A motion is improved if, without obstacles, the arm could block a ball this much earlier.
+# [s] A stored motion is planned again if, without obstacles, the arm could block a ball that comes
+# earlier by this time.
 _WORTH = 0.03
 _CHECKED_AT_ONCE = 1024  # number of stored motions whose distances are computed in one batch
 
@@ -74,13 +74,13 @@ _FEW = 6  # number of planner calls of the small size that take as long as one o
 
 @dataclasses.dataclass(frozen=True)
 class _Motions:
-    """The best motions found so far for P pairs of cells: they block balls that come earliest."""
+    """For each of P pairs of cells the best motion so far, which blocks the earliest ball."""
 
     # (P, 6 K + 1): rates of 6 joints at K knots, times the duration [rad]; then the duration [s].
     point: np.ndarray
-    # (P,) [s], earliest entry into the outer box of a ball that the motion blocks; or infinite.
+    # (P,) [s], earliest entry into the outer box of a ball that the motion blocks; inf without one.
     entry: np.ndarray
-    quickest: np.ndarray  # (P,) [s], earliest entry if there were no obstacles
+    quickest: np.ndarray  # (P,) [s], earliest entry that can be blocked without obstacles
 
 
 def build(
@@ -315,7 +315,7 @@ def _is_free(setting: Setting, home: np.ndarray, rows: np.ndarray) -> np.ndarray
     near = [
         _nearest_on_motion(setting, home, some, shares) for some in _in_parts(np.asarray(steps))
     ]
-    # Rounding errors of distances are less than 1e-5 m.
+    # The tolerance 1e-5 m is greater than the rounding errors of the distances.
     return np.concatenate(near)[: len(rows)] >= online.margin - 1e-5
 
 
@@ -356,7 +356,7 @@ class _Parts:
         }
         text = json.dumps(header, sort_keys=True)
         known = folder / "what.json"
-        # Delete files of another library, or of another version of the planning method.
+        # Delete parts that an interrupted build of another library or code version has left.
         if not known.exists() or known.read_text() != text:
             self.remove()
             folder.mkdir(parents=True)

@@ -86,7 +86,7 @@ def build_library(
 
 
 def show_library(path: str, *, map: str | None = None) -> None:
-    """Print for which share of pairs of cells a motion is stored; draw a map to the path `map`."""
+    """Print which share of pairs of cells has a stored motion; draw it into the file `map`."""
     library = load_library(path)
     covered = coverage(library)
     _print(path, library, covered)

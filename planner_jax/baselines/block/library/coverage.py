@@ -39,7 +39,7 @@ class Coverage:
     is_sure: np.ndarray
 
     def share(self, of: np.ndarray) -> np.ndarray:
-        """Return for H start poses which fraction (H,) of the pairs in `of` (P,) has a motion."""
+        """Return for H start poses the fraction of pairs in the mask `of` (P,) with a motion."""
         return (self.found & of).sum(axis=1) / of.sum()
 
 
@@ -54,7 +54,7 @@ def coverage(library: Library) -> Coverage:
         is_feasible=tunnel.is_feasible,
         is_centred=tunnel.is_centred,
         found=found,
-        # Half of the shield's edge may be 0.1 mm too short, because of rounding errors.
+        # Balls may miss the shield by 0.1 mm, which tolerates rounding errors.
         is_sure=found & (far <= half + 1e-4),
     )
 

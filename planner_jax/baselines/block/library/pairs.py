@@ -44,7 +44,7 @@ FINE, COARSE = STRICT, (0.08, np.deg2rad(20.0))
 # [s], how much later than without obstacles a ball may come; if not even this ball can be blocked,
 # no motion is stored for the two cells through which it flies.
 _PATIENCE = 0.8
-# [rad], greatest angle of the shield's edge from horizontal, if it must block all possible balls.
+# [rad], greatest angle of a shield's edge from horizontal, if it must block all balls of a pair.
 _ROLL = np.deg2rad(1.0)
 # [s] Penalty of end poses that collide. It is added to a time in seconds by which end poses are
 # sorted, so that these poses are tried last.
@@ -101,7 +101,7 @@ class PairPlanner(Planner):
     is_sequential: ClassVar[bool] = True
 
     def case_of(self, pair: PairCase, entry: Array) -> tuple[BlockCase, Flight]:
-        """Return the case of a ball that enters the outer box at `entry` [s], and contact times."""
+        """Return a case whose ball enters the outer box at `entry` [s], and its contact window."""
         ball, span = nominal_ball(pair.outer, pair.inner)
         gravity = jnp.asarray(GRAVITY, span.dtype)
         case = BlockCase(
@@ -277,7 +277,7 @@ def _entry(effort: Array) -> Array:
 
 @dataclasses.dataclass(frozen=True)
 class Bends(Attempt):
-    """An attempt: a bisection of the ball's entry time, with least squares for each time."""
+    """Settings of a bisection of the ball's entry time; least squares plans for each time."""
 
     rounds: int = 4
     solver: LevenbergConfig = LevenbergConfig(
@@ -299,7 +299,7 @@ class BentPair(PairPlanner):
 
     @property
     def attempts(self) -> tuple[Bends, ...]:
-        """The only attempt: the bisection that the field `search` describes."""
+        """The only attempt: a bisection of the ball's entry time, with the settings `search`."""
         return (self.search,)
 
     def solve(self, pair: PairCase, attempt: Bends) -> PairPlan:
@@ -318,7 +318,6 @@ class BentPair(PairPlanner):
         learned = online.encode_straight(case, poses, place).at[:-1].add(bump.astype(dtype))
         is_given = pair.start < 0
         start = jnp.where(is_given, pair.given, learned)
-        # The motion `given` meets the ball midway between the cells, half a `span` after its entry.
         span = nominal_ball(pair.outer, pair.inner)[1]
         entry = jnp.where(is_given, pair.given[-1] - 0.5 * span, of_place)
         none = jnp.isinf(pair.best)

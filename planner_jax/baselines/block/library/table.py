@@ -67,7 +67,7 @@ class Table:
 class Row(NamedTuple):
     """A stored motion and the shield's pose at its end; batches have leading axes.
 
-    `Row` and `Answer` are tuples, since Python creates a tuple ten times as fast as a dataclass.
+    It is a tuple, since Python creates a tuple ten times as fast as a dataclass.
     """
 
     steps: Array | np.ndarray  # (K, 6) [rad], joint rates at K knots, times the duration
