@@ -18,9 +18,9 @@ is a motion in which all joints move in proportion. Columns are in percent of al
 
 In all columns but "end pose" the referee, an independent check in float64, decides whether a ball
 is blocked. --write stores the throws and the results in `block_throws.csv` beside this file, one
-line a throw. The column of each method has one digit for every row of the throw's suite, in the
-order stated at the top of the file; 1 means blocked. Read these columns as text, because they may
-begin with zeros.
+line a throw. The column of each method has one digit for every row of the table that uses the
+throw, in the order stated at the top of the file; 1 means blocked. Read the columns of methods as
+text, because their values may begin with zeros.
 """
 
 import csv

@@ -123,11 +123,6 @@ def contact_errors(flown: Flown) -> tuple[np.ndarray, np.ndarray]:
 
 
 def prediction_errors(flown: Flown) -> None:
-    """Print quantiles of the errors of the predicted contact position along x, y and z.
-
-    The errors are grouped by the time from the prediction until the contact, in five intervals from
-    0.1 to 1.1 s.
-    """
     assert flown.record is not None
     horizon, error = flown.record.horizon[:, :, 0], np.abs(flown.record.error[:, :, 0])
     for low, high in HORIZONS:

@@ -394,11 +394,6 @@ def shift_bits(plane: int, shift: int) -> int:
 
 
 def _spread(row: list[int], turn: int) -> list[int]:
-    """Add to each heading's cells the cells of up to `turn` neighbouring headings on either side.
-
-    `row` has for every heading the set of reached cells, as bits of an integer; `turn` is a number
-    of headings. Each step of the loop doubles the number of headings whose sets are united.
-    """
     # In the loop, spread[h] is the union of the sets of cells row[h], ..., row[h + width - 1].
     target, width, spread = 2 * turn + 1, 1, row
     while width < target:

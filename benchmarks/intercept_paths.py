@@ -184,7 +184,6 @@ def say_rows(bench: Bench, suite: str, heading: str, rows: dict[str, Row]) -> No
 
 
 def say_smoothing(bench: Bench, suite: str, batch: Any, cases: list, meetings: np.ndarray) -> None:
-    """Search paths with 0.9 times the curvature limit, smooth them, and print lengths and times."""
     pairs = zip(cases, meetings, strict=True)
     paths = [search(case, meeting, CURVATURE_SHARE) for case, meeting in pairs]
 

@@ -18,8 +18,8 @@ grow with time as errors of degree 2 do.
 The success rate in the run's summary is the share of predictions by `select` within 0.3 m at 10 s,
 for straight and turning targets. The time is for one prediction on one core without compilation,
 from NumPy arrays to NumPy arrays. The constants of `select` were tuned with other seeds. The mean
-error of 1,000 turning targets at 10 s has a standard error of 0.01 m. Some methods differ by less,
-so use many more targets to compare them.
+error of 1,000 turning targets at 10 s has a standard error of 0.01 m. Some methods differ by less
+than this error, so a comparison needs many more targets.
 """
 
 import os

@@ -22,7 +22,7 @@ load affects all of them.
 With --batch the program also prints how many problems per second the device solves in a batch. With
 the extra `peers`, the solvers Clarabel and OSQP also solve the quadratic programs of `trapezoid`
 and `em`. The cost gap in the run's summary is the relative excess of this library's costs over
-Clarabel's.
+the costs of Clarabel.
 """
 
 import dataclasses

@@ -103,7 +103,6 @@ def measure(bench: Bench, settings: ThroughputSettings) -> None:
 
 
 def _with_iterations(planner: Any, iterations: int) -> Any:
-    """Return a copy of the planner with another number of iterations in its first search."""
     if isinstance(planner, DecidedPlanner):
         return dataclasses.replace(planner, planner=_with_iterations(planner.planner, iterations))
     first, *rest = planner.rounds
