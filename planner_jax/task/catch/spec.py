@@ -1,4 +1,4 @@
-"""Registry entry of the task `catch`: names of planners and suites. The module imports no JAX."""
+"""Names of planners and suites of the task `catch` (quadrotor catches targets), without JAX."""
 
 import dataclasses
 

@@ -1,4 +1,4 @@
-"""The public functions `pj.group.planner` and `pj.group.judge` of the task `group`."""
+"""Public functions of the task `pj.group`: make and judge plans of a car that meets targets."""
 
 from planner_jax.core.protocol import Decision
 from planner_jax.planning.decided import DecidedPlanner

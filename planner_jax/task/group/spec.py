@@ -1,4 +1,4 @@
-"""Registry entry of the task `group`: names of planners and suites. The module imports no JAX."""
+"""Names of planners and suites of the task `group` (a car meets several targets), without JAX."""
 
 from planner_jax.core.registry import Task
 from planner_jax.task.intercept.spec import Suite

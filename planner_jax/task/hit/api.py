@@ -1,4 +1,4 @@
-"""The public functions `draw`, `planner` and `judge` of the task `pj.hit`."""
+"""Public functions of the task `pj.hit`, in which a quadrotor returns a ball with a racket."""
 
 from collections.abc import Sequence
 

@@ -186,8 +186,8 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
 
         There is one network for planners with waypoint velocities as variables, and one for other
         planners; `proportions` and `scale` must have their defaults. There is none for cases with
-        obstacles or other extra terms: the side of an obstacle on which a search starts decides on
-        which side it ends.
+        obstacles or other extra terms: the network ignores obstacles, and a search that starts on
+        the wrong side of an obstacle also ends there.
         """
         if not self.learned or not (self.proportions == _PROPORTIONS and not case.extras):
             return None

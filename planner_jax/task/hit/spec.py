@@ -1,4 +1,4 @@
-"""Registry entry of the task `hit`: names of planners and suites. The module imports no JAX."""
+"""Names of planners and suites of the task `hit` (quadrotor returns a ball), without JAX."""
 
 from planner_jax.core.registry import Task
 

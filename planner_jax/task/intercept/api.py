@@ -1,4 +1,4 @@
-"""The public functions `draw`, `observe`, `planner` and `judge` of the task `pj.intercept`."""
+"""Public functions of the task `pj.intercept`, in which a car meets a moving target."""
 
 import zlib
 from typing import cast

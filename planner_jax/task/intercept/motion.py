@@ -44,7 +44,7 @@ class Motion:
 
 @struct.dataclass
 class Quadratic:
-    """Half the first and second derivatives of a sum of squares, which omits their factor 2.
+    """Half the gradient and half the Hessian of a cost that is a sum of weighted squares.
 
     The cost has terms that depend on x, y, heading and time of one sample, and terms that depend on
     the five variables of one piece: speed and curvature at its start and end, and the end time.

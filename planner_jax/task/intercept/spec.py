@@ -1,4 +1,4 @@
-"""Registry entry of the task `intercept`: names of planners and suites. It imports no JAX."""
+"""Names of planners and suites of the task `intercept` (a car meets a target), without JAX."""
 
 import dataclasses
 
