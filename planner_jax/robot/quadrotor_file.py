@@ -248,7 +248,7 @@ class _Loader(yaml.SafeLoader):
     """YAML loader that raises an error for repeated fields and for references (`*name`)."""
 
     def compose_node(self, parent: yaml.Node | None, index: Value) -> yaml.Node | None:
-        """Compose a node; raise for references, by which a short text can expand without bound."""
+        """Compose a YAML node; raise an error for references, which can expand to a huge text."""
         if self.check_event(yaml.AliasEvent):
             raise yaml.MarkedYAMLError(None, None, "no *reference", self.peek_event().start_mark)
         return super().compose_node(parent, index)
@@ -318,7 +318,7 @@ def _to_si(given: Mapping[str, Value], part: str, place: str) -> dict[str, Value
 
 
 def _to_numbers(value: Value, quantity: _Quantity) -> Value:
-    """Convert a field's value to SI units; eight numbers become pairs (x, y) of four rotors."""
+    """Convert a field's value to SI units; eight numbers become positions (x, y) of four rotors."""
     is_pairs = quantity.count == 8
     if is_pairs and isinstance(value, list | tuple):
         pairs = (pair if isinstance(pair, list | tuple) else [pair] for pair in value)

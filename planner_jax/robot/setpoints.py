@@ -60,7 +60,6 @@ def sample_at_rate(
 def _in_tiles(
     leaves: object, times: np.ndarray, setpoint_at: Callable, tile: tuple[int, int]
 ) -> dict[str, np.ndarray]:
-    """Evaluate B plans at K times, by compiled calls for tile[0] plans and tile[1] times each."""
     num, found = jax.tree.leaves(leaves)[0].shape[0], {}
     for i in range(0, num, tile[0]):
         plans = np.minimum(np.arange(i, i + tile[0]), num - 1)

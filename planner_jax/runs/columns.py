@@ -106,8 +106,8 @@ OUTCOME = [
 def leaf_columns(batch: RefereedBatch) -> list[Column]:
     """Return a column for every leaf of the cases, the plans and the verdict.
 
-    A column's name is the path of its leaf, such as "plan.motion.durations", or just the last name
-    if all runs have it, such as "cost". Unit and meaning are metadata of the dataclass field.
+    A column's name is the path of its leaf, such as "plan.motion.durations". Columns that the runs
+    of all tasks have, such as "cost", have short names. Dataclass fields state unit and meaning.
     """
     known = {f"plan.{c.name}" for c in SOLVER} | {f"verdict.{c.name}" for c in OUTCOME}
     found = [INDEX]

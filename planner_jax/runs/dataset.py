@@ -2,7 +2,7 @@
 
 A part is one file of rows, such as `part-000007-1a2b3c4d.parquet`, whose name holds its number and
 its CRC-32 checksum. Its metadata hold a record: a JSON object with the number of rows, the times of
-planning, and a digest of the settings and the code that made them.
+planning, and a digest of the settings and the code that made the rows.
 """
 
 import io
@@ -94,7 +94,7 @@ class Dataset:
         self.write(0, encode(rows, {}))
 
     def damages(self, num: int | None = None) -> dict[Path, str]:
-        """Return path -> damage of that file; the folder is an entry if it lacks `num` rows."""
+        """Map damaged files to error texts, or the folder if only its row count is wrong."""
         found, counted = {}, 0
         for place, path in enumerate(self.files()):
             try:
@@ -114,7 +114,7 @@ class Dataset:
         return self._open().to_table(columns=None if columns is None else list(columns))
 
     def parts(self, columns: Sequence[str] | None = None) -> Iterator[pa.Table]:
-        """Yield a table of the named columns (None: all) for each file, if the file has them."""
+        """Yield a table for each file, of the named columns that the file has; None: of all."""
         for fragment in self._open().get_fragments():
             names = fragment.physical_schema.names
             known = None if columns is None else [name for name in columns if name in names]

@@ -32,7 +32,7 @@ _TRIES, _BETWEEN = 20, 0.01  # number of attempts to take the lock, and [s] paus
 
 
 class RunFolder:
-    """The folder `path` of one run; in error messages, `name` stands for the argument `path`."""
+    """The folder `path` of one run; error messages call it `name`, such as "out"."""
 
     def __init__(self, path: str | os.PathLike, name: str = "out"):
         self.name = name
@@ -43,7 +43,7 @@ class RunFolder:
         self._made: list[Path] = []
 
     def require(self, holds: bool, rule: str, shown: str) -> None:
-        """Raise an error with the text "NAME must be RULE, got SHOWN" unless `holds` is true."""
+        """Raise an error that the folder must be `rule` but is `shown` unless `holds` is true."""
         require(holds, self.name, rule, shown=shown)
 
     def require_new(self) -> None:
@@ -183,7 +183,7 @@ class RunRows:
     failures: list[Row]  # the first rows whose plans the referee rejected
 
     def sample(self) -> list[Row]:
-        """Return rows for figures: about 60, evenly spaced, then failures until 12 have failed."""
+        """Return about 60 evenly spaced rows for figures, with further rejected plans up to 12."""
         last = self.manifest["summary"]["num"] - 1
         spread = np.linspace(0, last, _CASES_SHOWN).astype(int).tolist()
         shown = self.folder.plans.pick(spread)
@@ -192,9 +192,9 @@ class RunRows:
         return shown + others[: max(missing, 0)]
 
     def same_case(self) -> list[tuple[str, Row]]:
-        """Return (planner, row) of each plan for the case in the figures, the run's planner first.
+        """Return (planner's name, row) of each plan of the example case that figures show.
 
-        The sweep chose the case, and also planned it with other planners for comparison.
+        The run's own planner comes first, then other planners that planned the case to compare.
         """
         own = self.folder.plans.pick([self.manifest["example"]])[0]
         others = self.folder.baselines

@@ -34,7 +34,7 @@ def recovery_option(usual: str = NONE) -> str:
     """Return a dataclass field for the option `recovery`, with the default value `usual`.
 
     The option selects the trajectory after the quadrotor's last contact: "none"; "brake", to
-    standstill wherever this costs least; or "home", to the start position.
+    standstill at any position; or "home", to the start position.
     """
     words = f"trajectory after the last contact, within all limits: {', '.join(CHOICES)}"
     return option(usual, "NAME", words)

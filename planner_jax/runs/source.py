@@ -79,7 +79,7 @@ class DrawnSource(Source):
 
 
 def fill_in(settings: SweepSettings, num: int, batch: int) -> Entries:
-    """Return a `Source`'s keyword arguments; `num` and `batch` are defaults of the settings."""
+    """Return a `Source`'s keyword arguments; `num` and `batch` replace settings that are None."""
     num, batch = settings.num or num, settings.batch or batch
     rule = f"at most {_MOST_PARTS * batch:,} with a batch of {batch}, as each batch is a file"
     require(num <= _MOST_PARTS * batch, "num", rule, num)

@@ -67,7 +67,8 @@ class Tally:
     def examples(self, rows: pa.Table, success: np.ndarray) -> list[np.ndarray]:
         """Return masks (B,) over B rows, by which the case in the report's figures is chosen.
 
-        It is the first row in the first mask that is not empty. `success` (B,) are the successes.
+        The case is the first row that the first non-empty mask selects. `success` (B,) is true for
+        rows whose plans the referee accepted.
         """
         return [success, np.ones_like(success)]
 

@@ -116,8 +116,8 @@ def difference_of(first: ComparedRun, other: ComparedRun) -> Difference:
     mine = int((first.success & ~other.success).sum())
     theirs = int((other.success & ~first.success).sum())
     apart, num = mine + theirs, len(first.success)
-    # If no case is solved by exactly one run, k / n is undefined. The bounds are then +- the upper
-    # end of Clopper-Pearson's interval for 0 events in all cases.
+    # If both runs solve the same cases, their difference is 0. Its bounds are then +- the upper end
+    # of Clopper-Pearson's interval for a rate of which no event was seen in all `num` cases.
     if not apart:
         reach = float(binomtest(0, num).proportion_ci(0.95, "exact").high)
         return Difference(change, -reach, reach, mine, theirs, 1.0)

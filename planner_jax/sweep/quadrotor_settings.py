@@ -20,7 +20,7 @@ def robot_option(usual: str) -> Any:
 
 
 def resolve_robot(given: object, tool: str) -> "QuadrotorModel | None":
-    """Return the quadrotor for a name, a file, a model or its fields; None for None.
+    """Return the quadrotor that a name, file, model or dict of fields defines; None if not given.
 
     An `ArgumentError` is raised unless the quadrotor carries `tool`, "net" or "racket".
     """

@@ -99,7 +99,7 @@ def resume_sweep(
     of another run are planned again. The rows equal the rows of an uninterrupted run.
 
     The settings `given` by name must equal the run's settings. `progress` shows a progress bar.
-    `workers` "ray" plans in a Ray cluster, None in this process, whichever the run used.
+    `workers` "ray" plans in a Ray cluster, None in this process, independent of earlier chunks.
 
     Raises:
         ArgumentError: the folder does not hold a sweep of this task, a given setting differs, or

@@ -51,7 +51,7 @@ class Sweep(Generic[AnySettings]):
     # A function that restores a plan from a row. Its arguments are the row and the manifest's entry
     # `setting`, which holds the physics of all cases.
     plan_of_row: Callable[[Row, Entries], Plan] | None = None
-    # Headings and columns of the report's list of failures.
+    # Heading -> name of the shown column of the rows, for the report's list of failed cases.
     failure_words: ClassVar[Mapping[str, str]] = {
         "case": "index",
         "solver's status": "status",
@@ -91,7 +91,7 @@ class Sweep(Generic[AnySettings]):
         require(isinstance(cases, planner.case_type), "planner", rule, settings.planner)
 
     def open_source(self, settings: AnySettings, batch: int) -> Source:
-        """Return the source of a sweep's cases; `batch` is used if the settings have no batch."""
+        """Return the source of a sweep's cases; `batch` is the default batch size."""
         return DrawnSource(**fill_in(settings, settings.DEFAULT_NUM, batch), task=self.task)
 
     def plan(self, planner: Planner, cases: PyTree) -> PyTree:

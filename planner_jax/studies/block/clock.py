@@ -39,7 +39,7 @@ class CountedPlanner(Planner[BlockCase, TimedPlan]):
     allowed: float  # [s] planning time that the delay of every case already contains
 
     def plan_by(self, drive: Drive, cases: BlockCase) -> TimedPlan:
-        """Plan cases one by one; start motions later by the planning time beyond `allowed`."""
+        """Plan cases one by one; delay motions by planning time above `allowed`; ignore `drive`."""
         plans, spent = measure_plans(self.planner, cases)
         late = np.maximum(spent - self.allowed, 0.0).astype(cases.delay.dtype)
         met = delay_motion(cases, plans, late)

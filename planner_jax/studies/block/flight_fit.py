@@ -109,7 +109,7 @@ def fit_flight(times: Array, places: Array, information: ArrayLike, gravity: Arr
             ],
         ]
     )
-    # If there are too few observations, the singular matrix is replaced by the identity.
+    # The normal equations are singular with too few observations: replace their matrix by I.
     normal = jnp.where(enough, normal, jnp.eye(6, dtype=dtype))
 
     def residuals(unknowns: Array) -> Array:

@@ -44,7 +44,7 @@ from planner_jax.task.block.replan import ReplanBlock, WarmBlock
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
 
 _NEAR = 0.02  # [m] A contact within this distance of the shield's centre needs no new motion.
-# Greatest relative excess over the limits of offset, tilt and time with which a motion continues.
+# Greatest relative excess of a contact's offset, tilt or time over its limit without re-planning.
 _EXCESS = 0.05
 _LONG = 100.0  # [s] Duration of the standstill piece after a motion, longer than any flight.
 
@@ -59,7 +59,7 @@ class Aim:
 
 
 # Requirements on a contact, the strictest first: offset from the shield's centre, and length cut
-# from the ball's path [m]. Each one is for balls for which no plan meets the stricter ones.
+# from the ball's path [m]. Each aim is tried for balls that no plan meets under stricter aims.
 AIMS = (Aim(0.005, at_rest=True, edge=0.05), Aim(0.005, edge=0.05), Aim(0.03, edge=0.03), Aim(0.09))
 
 
@@ -77,9 +77,9 @@ class Decided:
     motions: Array  # (B,) int32, number of started motions
 
     def fit_errors(self, place: int) -> tuple[Array, Array]:
-        """Return errors of the balls' positions fitted at moment `place`, and their deviations [m].
+        """Return position errors of the flights fitted at moment number `place`, and their std [m].
 
-        Both (B,) hold halfway between a ball's entries into the outer and into the inner box.
+        Both arrays (B,) are for the time halfway between a ball's entries into outer and inner box.
         """
         return fit_errors(self.cases, take(self.fits, place))
 
@@ -99,7 +99,7 @@ def plan_with_aims(
         some = take(cases, lanes)
         is_again = isinstance(some, Replanning)
         aimed = cautious(some.case if is_again else some, **dataclasses.asdict(aim))
-        # The programs are compiled for NumPy arrays; JAX would compile them again for JAX arrays.
+        # Convert to NumPy: for JAX arrays, JAX would compile the planner's programs once more.
         aimed = jax.tree.map(np.asarray, aimed)
         asked = dataclasses.replace(some, case=aimed) if is_again else aimed
         found = jax.tree.map(np.array, plan(planner, asked))
@@ -204,7 +204,7 @@ class _Arms:
         self.first, self.motions = np.full(num, np.inf, dtype), np.zeros(num, np.int32)
 
     def count_useful(self, known: BlockCase, aims: Sequence[Aim]) -> np.ndarray:
-        """Count for each of B arms the `aims` that would move the contact nearer to the centre."""
+        """Count, for each of B arms, the `aims` that are stricter than its current motion meets."""
         num = np.full(len(self.motions), len(aims))
         if not self.motions.any():
             return num
@@ -220,7 +220,7 @@ class _Arms:
     def decide(
         self, planner: Planner, known: BlockCase, useful: np.ndarray, aims: Sequence[Aim]
     ) -> None:
-        """Plan new motions of arms b for estimated balls, with the first useful[b] `aims` each."""
+        """Plan new motions to block the estimated balls; arm b tries the first useful[b] aims."""
         begun = dataclasses.replace(self.cases, delay=self.since)
         tasks = ReplanBlock().begin(begun, self.plans, known.delay - self.since, ball=known.ball)
         moves, begin = is_solved(self.plans.status), np.asarray(known.delay)
@@ -241,7 +241,7 @@ class _Arms:
         if not good.any():
             return
         lanes, found = lanes[good], take(found, good)
-        # The first plans determine how many polynomial pieces and coefficients all motions have.
+        # The first solved plans determine the shape of the coefficient arrays of all motions.
         if not self.motions.any():
             still = _still(self.cases, found.motion.coeffs.shape[1:3])
             self.plans = dataclasses.replace(self.plans, motion=still)

@@ -52,7 +52,7 @@ class SeeingArms(Planner[BlockCase, SeenPlan]):
     seed: int  # seed of the noise
 
     def plan_by(self, drive: Drive, cases: BlockCase) -> SeenPlan:
-        """Return the executed motions, up to contact with the true balls; `drive` is unused."""
+        """Simulate observing, planning and moving; return executed motions; `drive` is unused."""
         done = self.decide_batch(cases)
         (error, std), (last, _) = (done.fit_errors(place) for place in (0, -1))
         first = take(done.fits, 0)

@@ -1,4 +1,4 @@
-"""Runs over many cases of an arm that blocks a ball, known exactly or observed by a camera."""
+"""Runs over many cases of an arm that blocks a ball, whose flight is known or seen by a camera."""
 
 from collections.abc import Sequence
 
@@ -45,7 +45,7 @@ class BlockSweep(Sweep[BlockSettings]):
         return {} if settings.is_study else super().other_planners(settings)
 
     def require_fit(self, settings: BlockSettings, planner: Planner, cases: PyTree) -> None:
-        """Raise an error if the planner takes other cases or has stored motions of another arm."""
+        """Raise if the planner is for another task, or its stored motions for another arm."""
         if isinstance(planner, SeeingArms | CountedPlanner):
             planner = planner.planner
         super().require_fit(settings, planner, cases)

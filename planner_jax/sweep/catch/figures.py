@@ -122,7 +122,7 @@ def _window(plan: SampledCatch) -> tuple[np.ndarray, np.ndarray]:
     points = np.concatenate([plan.motion.pos, plan.centre, *paths])
     points = np.nan_to_num(points)  # a failed plan may contain NaN
     low, high = points.min(axis=0), points.max(axis=0)
-    # Make all sides at least a quarter of the longest, so that no panel is too low to be read.
+    # Extend short sides of the drawn box to a quarter of its longest side, to keep panels legible.
     middle, half = 0.5 * (low + high), 0.5 * (high - low) + 2.0 * _ROTORS
     half = np.maximum(half, 0.25 * half.max())
     return middle - half, middle + half

@@ -61,9 +61,9 @@ class CatchTally(Tally):
         self._num_ratios += int(known.sum())
 
     def summary(self) -> Entries:
-        """Return success rates, mean time [s] of catches, and mean relative change of their times.
+        """Return success rates, mean time [s] of catches, and the mean optimal time ratio.
 
-        The change is from the time estimated in advance to the optimised one; None: no values.
+        The ratio is |T_o - T_p| / T_o, with T_p the estimated and T_o the planned time of a catch.
         """
         return {
             **super().summary(),
@@ -105,7 +105,7 @@ class CatchSweep(Sweep[CatchSettings]):
         return make_table(manifest)
 
     def findings(self, manifest: Entries) -> list[str]:
-        """Return a sentence on caught targets, times of catches, and how planning changed them."""
+        """Return a sentence on caught targets, times of catches, and changes of estimated times."""
         summary = manifest["summary"]
         text = f"{100.0 * summary['caught']:.2f} % of the targets caught"
         if summary["mean_catch_time"] is not None:

@@ -22,7 +22,7 @@ _TARGET: Look = {"marker": "o", "mfc": "none", "mec": style.INK, "mew": 1.6}
 
 
 def court_figure(figure: Figure, run: RunRows) -> None:
-    """Draw about 60 cases of a run, with failures, on the court: from above and from the side."""
+    """Draw about 60 cases of a run, also rejected plans, on the court in top and side view."""
     rows, setting = run.sample(), run.manifest["setting"]
     drag_after = run.manifest["parameters"]["drag_after_impact"]
     aside, top = court.HALF_WIDTH + 0.3, 6.4

@@ -73,7 +73,7 @@ class HitTally(Tally):
     def examples(self, rows: pa.Table, success: np.ndarray) -> list[np.ndarray]:
         """Return masks (B,) over B rows, by which the case in the report's figures is chosen.
 
-        The first mask has successes with a serve from the left region and a target in the far one.
+        The first mask has successes with a serve from the left to a target in the far region.
         """
         scenario = rows["scenario"].to_numpy()
         left_to_far = success & np.array([name[0] + name[2] == "LF" for name in scenario])

@@ -27,7 +27,7 @@ class InterceptTally(Tally):
     def examples(self, rows: pa.Table, success: np.ndarray) -> list[np.ndarray]:
         """Return masks (B,) over B rows, by which the case in the report's figures is chosen.
 
-        The first mask has successes whose car comes closer than `NEAR` to a moving obstacle.
+        The first mask has successes whose car comes closer than 0.1 m to a moving obstacle.
         """
         is_near = rows["mover_clearance"].to_numpy() < self.NEAR
         return [success & is_near, *super().examples(rows, success)]

@@ -113,8 +113,8 @@ def rank_poses(poses: EndPoses, num: int, most: float) -> Array:
     """Return the indices (num,) of the end poses that need the least effort, in rising order.
 
     In an end pose the shield meets the ball. The effort is the greatest ratio of a joint's rate or
-    acceleration to its limit. Random numbers from 0 to 1 are added, so that the first poses differ
-    more from each other. A pose whose effort exceeds `most` cannot be reached before the ball, and
+    acceleration to its limit. Random numbers from 0 to 1 are added to efforts, so that the first
+    poses differ more. A pose whose effort exceeds `most` cannot be reached before the ball, and
     is ranked far behind.
     """
     rng = np.random.default_rng(0)
@@ -373,8 +373,8 @@ class OnlineBlock(Planner):
         """
         moves, first, duration = self.decode(case, point)
         joints = motion.joint_terms(case, moves, first, duration, self.weights, 1.0 - self.slack)
-        # The start and all samples except the first after it are checked: 96 by default, because
-        # 97 samples would take a third longer on a GPU.
+        # The start and all samples except the first after it are checked: 96 by default, a multiple
+        # of the 32 threads that a GPU runs together.
         shares = (0.0, *(np.arange(min(2, self.checked), self.checked + 1) / self.checked))
         angles = motion.angles_at(case.angles, first, moves, shares)
         gaps = least_clearances(case.arm, case.scene, angles)

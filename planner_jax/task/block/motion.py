@@ -33,7 +33,7 @@ class Weights:
 
 @functools.cache
 def step_weights(pieces: int, shares: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the weights with which a motion's parameters add up to the angle turned by N times.
+    """Return weights of a motion's parameters in sums that are the angles turned up to N times.
 
     The parameters are a joint's rates, multiplied by the duration, at the start and at the ends of
     K = `pieces` pieces. The times are `shares`, from 0 to 1, of the duration.

@@ -53,5 +53,5 @@ def mark_blocked(case: BlockCase, status: Array) -> Array:
         is_blocked = case.clearances(case.angles[None])[0] < 0.0
         return jnp.where(is_blocked, Status.BLOCKED, status).astype(jnp.int32)
 
-    # For a single case, `cond` runs the check only if the case is unsolved.
+    # For a single case, `cond` tests the initial pose for collisions only if the case is unsolved.
     return lax.cond(is_solved(status), lambda: status.astype(jnp.int32), check)

@@ -131,7 +131,7 @@ class ReplanBlock(Planner):
         return Replanning(case=left, previous=previous, elapsed=host_leaf(elapsed))
 
     def plan_by(self, drive: Drive, tasks: Replanning) -> BlockPlan:
-        """Return plans, from scratch where refining fails; planners are called through `drive`."""
+        """Refine motions, or plan from scratch if this fails; `drive` runs compiled planners."""
         plans, _ = drive(self.warm, tasks)
         unsolved, cases = is_unsolved(plans.status), tasks.case
         if not tasks.batch_shape:

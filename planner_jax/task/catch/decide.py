@@ -43,7 +43,7 @@ def _closest_approach(case: CatchCase) -> Array:
     net, limits = case.net, case.limits
     times, states, speed = estimate.sample_targets(case)
     distance = estimate.length(states.pos - case.head_state[0][None, :, None])
-    # `slack` includes the distance that target and quadrotor can move between two of the times.
+    # `slack` includes the distance that target and quadrotor can move between sampled times.
     step = case.horizon[:, None] / estimate.GRID
     slack = net.height + net.radius + (speed + limits.speed) * step
     far = distance - limits.speed * times - slack
@@ -152,7 +152,6 @@ def beam(case: CatchCase, table: Timetable, width: int) -> CatchChoice:
 
 
 def _choice(position: Array, times: Array) -> CatchChoice:
-    """Return the order of N targets whose `position` in it is 0 to N - 1, or N if not caught."""
     num = position.size
     order = jnp.argsort(position, stable=True)
     taken = position < num
@@ -213,7 +212,7 @@ class Best(CatchDecision):
         require(self.width >= self.finalists, "width", f">= {self.finalists} finalists", self.width)
 
     def propose(self, case: CatchCase) -> CatchChoice:
-        """Return the orders of one case that are estimated to end first, (F, N), the best first."""
+        """Return F orders (F, N) of the N targets of a case, with the least ranks, best first."""
         table = timetable(case)
         if case.optional or case.num_targets > MOST_PERMUTED:
             found = beam(case, table, self.width)

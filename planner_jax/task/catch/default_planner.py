@@ -229,8 +229,8 @@ class ExactCatch(ChainPlanner[CatchCase, CatchPlan]):
         """Return N catches as ends of the trajectory's segments, from their variables (N, 12).
 
         The variables are log duration, catch point (2,) in the net, velocity, acceleration and jerk
-        (3,). The excess (2, N) has two rows: relative excess of the net's angle, and of the catch's
-        time over the latest allowed time.
+        (3,). The field `excess` (2, N) of the result has two rows: relative excess of the net's
+        angle over its limit, and of the catch's time over the latest allowed time.
         """
         case, net = context.case, context.case.net
         durations = jnp.exp(natural[:, 0])

@@ -81,7 +81,7 @@ def arrival(
     times, places, penalty = table.times, table.places, table.penalty
     late = jnp.where(times > begin, 0.0, 100.0)
     short = _out_of_reach(places - place[:, None], times - begin, speed) + penalty + late
-    # The first time without a shortfall, or else the time of the least shortfall.
+    # Index of the first time at which a catch is possible, else of the least shortfall.
     first = jnp.argmin(jnp.where(short <= 0.0, np.arange(-short.size, 0.0), short))
     return times[first], places[:, first], short[first]
 
@@ -97,7 +97,7 @@ def _out_of_reach(offset: Array, span: Array, speed: Array) -> Array:
 
 
 def shortfall(case: CatchCase, choice: CatchChoice) -> Array:
-    """Return the sum () [m] of distances by which the quadrotor misses the targets of a choice."""
+    """Return the sum () [m] of distances by which the quadrotor misses the chosen targets."""
     order, times = choice.order, choice.times
     targets = jax.tree.map(lambda leaf: leaf[order], case.targets)
     states = jax.tree.map(lambda leaf: leaf[..., None], targets_at(targets, times))
