@@ -394,7 +394,7 @@ def shift_bits(plane: int, shift: int) -> int:
 
 
 def _spread(row: list[int], turn: int) -> list[int]:
-    # In the loop, spread[h] is the union of the sets of cells row[h], ..., row[h + width - 1].
+    # row[h] is the set of cells with heading h; spread[h] unites row[h] to row[h + width - 1].
     target, width, spread = 2 * turn + 1, 1, row
     while width < target:
         step = min(width, target - width)
