@@ -198,7 +198,7 @@ def _fly_all(flight: FlightTask, cases: Any, shown: int) -> tuple[pa.Table, dict
         "warm_flights": warm_flights,
         "wall_seconds": round(watch.lap(), 3),
     }
-    # Batches of more than 256 flights record nothing, to save memory.
+    # Large batches store no states, to save memory. The recorded flights are then flown again.
     if recorded is None:
         recorded = flight.fly(cases[np.arange(shown)], record=True)
     return pa.concat_tables(parts), times, recorded
@@ -219,7 +219,7 @@ def _summary(flight: FlightTask, rows: pa.Table) -> dict[str, Any]:
 
 
 def headline(manifest: dict[str, Any], flight: FlightTask) -> list[str]:
-    """Return sentences on success, conditions and times of a run, one per line."""
+    """Return sentences on the success rate, sensing errors and wall time of a run of flights."""
     summary, times, device = manifest["summary"], manifest["times"], manifest["device"]
     settings = flight.settings
     rate = percent(summary["successes"], summary["num"])

@@ -121,7 +121,7 @@ def passage(
 def nearest(contact: Contact, passes: Array, later: Contact) -> Contact:
     """Return each ball's contact so far, or a later passage that is nearer to the tool's centre.
 
-    `passes` marks the balls with a later passage. A ball that is already met keeps its contact.
+    `passes` marks the balls with a later passage. A ball that has met the tool keeps its contact.
     """
     take = passes & ~contact.met & (later.offset < contact.offset)
 

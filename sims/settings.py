@@ -102,7 +102,7 @@ class FlySettings:
 
     @property
     def rate(self) -> float:
-        """The rate of replanning [Hz]; by default `RATE`, or 0 if the planner cannot replan."""
+        """The rate of replanning [Hz]; by default `RATE` for the first planner, else 0."""
         if self.replan is not None:
             return self.replan
         return self.RATE if self._is_first else 0.0
@@ -175,7 +175,7 @@ class CatchFly(BallFly):
 
     @property
     def redecide_rate(self) -> float:
-        """The rate [Hz] of new decisions on order and times of catches; by default of new plans."""
+        """The rate [Hz] at which order and times of catches are chosen anew; by default `rate`."""
         return self.rate if self.redecide is None else self.redecide
 
     def flight(self) -> Any:
@@ -190,9 +190,9 @@ class CatchFly(BallFly):
         return super().flight()
 
     def check_rate(self) -> None:
-        """Raise `ValueError` unless throws and new decisions happen only when a plan starts.
+        """Raise `ValueError` unless throws, and new orders of catches, coincide with replanning.
 
-        The loop can change its balls and its order of catches only at those times.
+        The closed loop can add balls and change the order of catches only when it plans anew.
         """
         super().check_rate()
         if self.balls > 1:
@@ -385,7 +385,7 @@ class BlockFly(FlySettings):
         return super().flight()
 
     def check_rate(self) -> None:
-        """Raise `ValueError` if the arm's drives are invalid, or it shall replan without a camera.
+        """Raise `ValueError` for invalid drives of the arm, or for replanning without a camera.
 
         Without a camera (`perception`) the planner knows the ball's true flight, and plans once.
         """

@@ -132,19 +132,19 @@ class FlightTask(abc.ABC):
         return ()
 
     def counts(self, rows: Any) -> dict[str, Any]:
-        """Return the task's own numbers for the summary, from the table with one row per flight."""
+        """Return the task's numbers for a run's summary, from the table with one row per flight."""
         return {}
 
     def findings(self, summary: Mapping[str, Any]) -> list[str]:
-        """Return the task's own sentences for the top of a run's report, from the run's summary."""
+        """Return the task's sentences for the top of a run's report, from the run's summary."""
         return []
 
     def tables(self, rows: Any) -> Sequence[RateTable]:
-        """Return the task's own tables for the report, from the table with one row per flight."""
+        """Return the task's tables for a run's report, from the table with one row per flight."""
         return ()
 
     def draw(self, folder: Path, rows: Any) -> Sequence[str]:
-        """Draw the task's own figures of the report into a folder; return the file names."""
+        """Draw the task's figures for a run's report into a folder; return their file names."""
         return ()
 
     def title(self, recording: Recording, flight: int) -> str:
@@ -172,7 +172,7 @@ class BallFlightTask(FlightTask):
 
     @abc.abstractmethod
     def launches(self, cases: Any, flown: Flown) -> Launches:
-        """Return each ball's state at its start in the simulation, and just after its impact."""
+        """Return each ball's state when its simulation starts, and just after the tool's impact."""
 
     def every_column(self) -> Sequence[Column]:
         """Return columns of the table of flights: ball contacts, then the task's own columns."""
@@ -180,7 +180,7 @@ class BallFlightTask(FlightTask):
 
     @property
     def conditions(self) -> str:
-        """Sensing noise and error of the estimated drag, to begin a sentence of the report."""
+        """Sensing noise and error of the balls' estimated drag, as the beginning of a sentence."""
         settings = self.settings
         return (
             f"Noise {settings.noise}, {100 * settings.drag_error:g} % error of the estimated drag"
@@ -199,7 +199,7 @@ class BallFlightTask(FlightTask):
         return dataclasses.asdict(self.loop(record=False))
 
     def loop(self, record: bool) -> Loop:
-        """Return the closed loop's settings; with `record` it stores states of robot and balls."""
+        """Return the closed loop's settings; `record`: whether robot and ball states are stored."""
         settings = self.settings
         sensing = NOISES[settings.noise]
         return Loop(self.world(), sensing, replan=settings.rate, record=record)

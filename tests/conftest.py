@@ -28,8 +28,8 @@ pytest.register_assert_rewrite("sweeps", "tests.sweeps")
 accept_leaves()
 install_import_hook([f"planner_jax.{name}" for name in PACKAGES], "typecheck.check")
 
-# Number of memory mappings above which compiled programs are released. Each program uses some. If a
-# process exceeds Linux's default limit of 65,530, a compilation aborts it.
+# Number of a process's memory mappings above which compiled programs, which use some mappings each,
+# are released. Above Linux's default limit of 65,530 mappings, a compilation aborts the process.
 MOST_MAPPINGS = 40_000
 
 
@@ -51,10 +51,7 @@ def float64():
 
 @pytest.fixture(scope="module", autouse=True)
 def strict_arrays(request):
-    """Make JAX raise where it would add axes or convert types, unless slow tests run, too.
-
-    Types may be converted in modules of `MIXED` and in simulations, whose dependencies do so.
-    """
+    """Make JAX raise an error at implicit axes or type conversions, unless slow tests run, too."""
     stem = request.path.stem.removeprefix("test_")
     options = {"jax_numpy_rank_promotion": "raise"}
     if not stem.startswith("sims_") and stem not in MIXED:

@@ -15,8 +15,8 @@ def value_and_gradient(function):
 def assert_gradient_matches_differences(function, point, *, step=1e-5, rtol=1e-7, directions=3):
     """Assert that a scalar function's gradient agrees with central differences, in float64.
 
-    Derivatives are compared along random directions d. A step is relative to the size of each array
-    of the pytree `point`, and `rtol` to the sum of |g d| with the gradient g.
+    Derivatives are compared along random directions d. `step` is relative to the size of each array
+    of the pytree `point`, and `rtol` is relative to the sum of |g_i d_i| with the gradient g.
     """
     point = jax.tree.map(lambda x: np.asarray(x, np.float64), point)
     gradient = jax.tree.map(np.asarray, value_and_gradient(function)(point)[1])

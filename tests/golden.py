@@ -3,8 +3,8 @@
     python -m tests.golden write DIR [NAME ...]
     python -m tests.golden compare DIR OTHER
 
-A row is a file with plans and verdicts of one planner on one suite. Unless a change of code affects
-plans, rows stay equal bit for bit on one machine with the same package versions.
+Each file has plans and verdicts of one planner on one suite. Unless a change of code affects plans,
+files stay equal bit for bit on one machine with the same package versions.
 """
 
 import argparse

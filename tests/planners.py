@@ -90,8 +90,7 @@ def library(seed):
 # time: two iterations of the optimiser, or none.
 FEW = {"rounds": (Round(solver=LbfgsConfig(max_steps=2, memory=1, trial_steps=(1.0,))),)}
 NONE = {"rounds": (Round(solver=LbfgsConfig(max_steps=0)),)}
-# These settings are also used in test_block, test_block_peers and test_block_library, so that the
-# compiled programs can be used again.
+# Several test modules plan blocks with these settings, so that they share compiled programs.
 SMALL_SEARCH = {
     "pieces": 6,
     "points": 10,
@@ -155,8 +154,6 @@ def block(name, suite="pole", **options):
 BY_NET = {"of": lambda plan: plan.times[-1], "by": "net"}
 ONE_SEARCH = (Search(1, LevenbergConfig(2), lattice=Lattice(layers=20, headings=16)),)
 ENTRIES = {
-    # The gradient of the cost needs no adjoint solver, which would take three times as long to
-    # compile.
     "hit exact": hit("exact", {"of": "cost", "by": "racket_height", "steps": 0}, **SHORT, **NONE),
     "hit bat": hit("bat", {"of": "cost", "by": ["target", "gravity"]}, nodes=6, **NONE),
     "hit bat-lite": hit("bat-lite", {"of": "stroke.time", "by": "limits"}, nodes=6, **NONE),
@@ -178,7 +175,6 @@ ENTRIES = {
     "block online": block("online", **SMALL_SEARCH),
     "block brisk": block("brisk", **SMALL_SEARCH),
     "block direct": block("direct", points=6),
-    # In the suite `open`, which has no pole, the search finds a spline long before its time limit.
     "block insat": block("insat", "open", points=6, budget=20.0, longest=20.0),
     "block library": Entry(
         LibraryBlock(make_library(regime="R1")),

@@ -55,7 +55,7 @@ def stop_after(monkeypatch, sweep, num_chunks):
 
 
 def write_rows(folder, rows, *, kind="sweep hit", is_finished=True, parameters=()):
-    """Write a run folder with the table `rows`, one plan a row; return the folder."""
+    """Write and return the folder of a run whose table of plans is `rows`, one row per plan."""
     manifest = {"kind": kind, "state": "running", "parameters": dict(parameters), "sessions": []}
     manifest |= {"run": "", "settings": "", "setting": {"gravity": 9.81}}
     manifest |= {"versions": {}, "device": {}}

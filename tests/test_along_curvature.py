@@ -117,13 +117,9 @@ def test_second_derivatives_of_a_plan_are_those_of_its_objective(name):
         for mine, expected in zip(found[2:], (exact[2], hessian @ direction), strict=True):
             greatest = np.abs(expected).max()
             np.testing.assert_allclose(mine, expected, rtol=1e-9, atol=1e-11 * greatest)
-        # The preconditioner inverts this part of the Hessian: the block of all variables at the
-        # ends of segments, and only the diagonal for all other variables.
         kept = np.diag(np.abs(np.diag(hessian)))
         ends = np.arange(size).reshape(segments, -1)[:, -num_own:].ravel()
         kept[np.ix_(ends, ends)] = hessian[np.ix_(ends, ends)]
         kept += damping * np.eye(size)
         assert np.linalg.eigvalsh(kept)[0] > 0.0
-        # The variables of an absent target have zero curvature. The preconditioner uses a millionth
-        # of the greatest curvature for them, hence the tolerance.
         np.testing.assert_allclose(kept @ solved, direction, rtol=2e-6)

@@ -52,7 +52,6 @@ def test_a_derivative_is_the_spline_of_the_hodograph_between_whose_points_it_lie
     for order in range(1, degree + 1):
         of_derivative = hodograph(degree, order, num) @ points
         value = basis(degree - order, num - order, SHARES) @ of_derivative
-        # At the end SciPy's derivative of piecewise linear curves is wrong.
         expected = scipy_curve(degree, points)(SHARES, order)[:-1]
         scale = np.abs(expected).max()
         np.testing.assert_allclose(value[:-1], expected, atol=1e-12 * scale)

@@ -48,11 +48,7 @@ def juggle_plans(cases):
 
 
 def serves_gone_wrong():
-    """Return cases in which a paper's equation divides by zero or has no root, then a usual case.
-
-    The target is straight above or straight below a falling ball; the ball moves straight up, is
-    below the height at which `juggle` hits, lands at once, or is at rest.
-    """
+    """Return cases in which an equation of a published planner divides by zero or has no root."""
     pos = [[-2.0, 0.0, 2.0]] * 3 + [[-2.0, 0.0, 1.0], [-2.0, 0.0, 0.01], [-2.0, 0.0, 3.0]]
     vel = [[0.0, 0.0, 7.0]] * 3 + [[0.0, 0.0, -4.0], [-3.0, 0.0, -8.0], [0.0, 0.0, 0.0]]
     target = [[-2.0, 0.0, 5.0], [-2.0, 0.0, 0.0], [-2.0, 3.0, 0.0]] + [[3.0, 0.0, 0.0]] * 3

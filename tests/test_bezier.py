@@ -13,7 +13,6 @@ float64 = pytest.mark.usefixtures("float64")
 
 
 def of_polynomial(polynomial):
-    """Return control points (K, n + 1) of the K Bezier pieces that equal a polynomial in time."""
     shares = np.linspace(0.0, 1.0, DEGREE + 1)
     starts = np.arange(PIECES)[:, None]
     values = polynomial((starts + shares) * HORIZON / PIECES)

@@ -181,7 +181,6 @@ def test_slopes_of_least_squares_are_those_of_the_cost(regime, float64):
     nearest = rank_poses(poses, 1, 1.0 - SMALL.slack)[0]
     start = SMALL.encode_straight(case, poses, nearest)
     rng = np.random.default_rng(0)
-    # The changes are small, because the model replaces sines of small angles by the angles.
     point = start + jnp.asarray(rng.normal(0.0, 0.02, start.shape)).at[-1].set(0.0)
     point = point.at[-1].set(flight.latest + 0.01)
     model = jax.jit(lambda point: SMALL.model(point, case, flight))

@@ -417,7 +417,6 @@ def test_the_referee_confirms_a_built_library(regime, starts, tmp_path, monkeypa
     planner = pj.block.planner(f"library:{path}")
     plans = pj.plan(planner, found.cases)
     np.testing.assert_array_equal(pj.are_solved(plans), found.claimed)
-    # The pole is moved by 0.1 m, so that some motions collide and the home pose does not.
     shifted: Any = np.array([0.8926, 0.05], np.float32)
     scene = dataclasses.replace(paper_scene(), pole=shifted)
     fixed, touched = building.repair(library, scene, progress=False)

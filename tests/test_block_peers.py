@@ -203,7 +203,7 @@ def test_without_the_extra_the_error_names_it(name, package, monkeypatch):
 
 
 def plan_and_confirm(name, regime, **options):
-    """Plan two throws, check that the referee accepts the plans; return cases, plans, verdicts."""
+    """Plan blocks of two throws; return cases, plans and verdicts, which must be successes."""
     cases = jax.tree.map(np.array, pj.block.draw(2, "open", seed=8, regime=regime))
     plans = pj.plan(pj.block.planner(name, **QUICK, **options), cases)
     verdict: Any = pj.block.judge(cases, plans)

@@ -65,7 +65,6 @@ def test_composed_pieces_are_one_motion_within_rate_limits(cases):
     done = decide(SMALL, cases, eye(std=0.02), [0.15, 0.25, 0.35, 0.45], aims=AIMS)
     verdict, solved = judge(done)
     assert (done.motions[solved] >= 1).all() and done.motions.max() >= 2
-    # An arm that brakes after a missed contact may exceed its position limits.
     of_joints = ("time", "start", "continuity", "velocity", "acceleration", "rest")
     assert not np.isin(verdict.failed_limit[solved], of_joints).any()
     assert verdict.success[done.motions >= 2].any()

@@ -182,7 +182,6 @@ def test_a_round_starts_where_its_last_stage_ended():
     early, late = solve(1, STAND, goals=(5.0,)), solve(1, STAND, goals=(5.0, 3.0))
     np.testing.assert_allclose([early.point[0], late.point[0]], [5.0, 3.0], atol=1e-3)
     assert 0 < early.iterations < late.iterations  # Iterations of stages count, too.
-    # The search used other goals first; the reported costs are for the final goal.
     np.testing.assert_allclose([early.cost, late.cost], [25.0, 9.0], atol=1e-2)
 
 

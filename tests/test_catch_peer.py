@@ -1,4 +1,4 @@
-"""The C++ program, a rewrite of [Yu2023catch] for comparison, reaches its published optima."""
+"""A C++ rewrite of the planner of [Yu2023catch] finds the optima stored in `tests/data`."""
 
 from pathlib import Path
 

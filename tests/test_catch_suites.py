@@ -163,7 +163,6 @@ def test_targets_of_a_rush_are_due_one_after_the_other_in_any_order(name, first,
     middle = first + 0.9 * np.arange(due.shape[1])
     assert (np.abs(in_order - middle) <= 0.5 * spread + 1e-9).all()
     assert np.abs(in_order - middle).max() > 0.45 * spread
-    # Each target is the first to be due with the same probability.
     share = np.bincount(each[:, 0]) / len(due)
     np.testing.assert_allclose(share, 1.0 / due.shape[1], atol=0.08)
     start = states(cases.targets, until_horizon(cases))

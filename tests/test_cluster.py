@@ -1,4 +1,4 @@
-"""Tests of runs on a Ray cluster. Only tests of a "real cluster" start one, others pretend."""
+"""Tests of runs on a Ray cluster, for which most tests substitute an object without processes."""
 
 import dataclasses
 import os

@@ -39,15 +39,12 @@ def entries(*, only=ENTRIES, on_host=True, slow=()):
 
 
 every, pure = entries(slow=LIKE_OTHERS), entries(on_host=False, slow=LIKE_OTHERS)
-# Planners that make some of the checks in slow tests only, because test_exact and test_intercept
-# make them, too.
 OF_THEIR_OWN = ("hit exact", "intercept spacetime")
 
 
 def assert_close(ours, theirs, tolerance=1e-3):
     np.testing.assert_array_equal(ours.status, theirs.status)
     for a, b in zip(jax.tree.leaves(ours), jax.tree.leaves(theirs), strict=True):
-        # NaN and infinity do not count for the tolerance; the assertion requires them to be equal.
         size = np.max(np.abs(b), initial=1e-3, where=np.isfinite(b))
         np.testing.assert_allclose(a, b, rtol=0.0, atol=tolerance * size)
 

@@ -56,7 +56,6 @@ def by(decision, planner=PLANNER):
 
 
 def hanging(places, horizons):
-    """Return cases whose targets rest at positions (B, N, 3) [m], and are due by (B, N) [s]."""
     pos = jnp.asarray(places, jnp.float32)
     ball = BallState(pos, jnp.zeros_like(pos))
     targets = BallPath(ball, jnp.zeros_like(pos), jnp.zeros(pos.shape[:2]))

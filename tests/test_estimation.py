@@ -152,8 +152,6 @@ def test_errors_agree_with_the_covariances():
         return np.mean(np.sum(error * np.linalg.solve(covariance, error[..., None])[..., 0], -1))
 
     error = np.concatenate([path.pos, path.vel], axis=-1) - np.asarray(states.mean)
-    # The mean of 100 normalised squared errors has a standard deviation of sqrt(2 * 6 / 100) =
-    # 0.35.
     assert mean_square(error[:, -1], states.covariance[:, -1]) == pytest.approx(6.0, abs=1.0)
     raw = np.sqrt(np.mean((observations - path.pos)[:, -1] ** 2))
     filtered = np.sqrt(np.mean(error[:, -1, :3] ** 2))

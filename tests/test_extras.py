@@ -17,13 +17,12 @@ from planner_jax.trajectory.polynomial import PiecewisePolynomial, states_at
 from planner_jax.trajectory.proportional_minco import boundary_rows
 from tests.derivatives import assert_gradient_matches_differences
 
-# This planner's first guesses are smooth trajectories; tests place obstacles near their middles.
 FREE = pj.hit.ExactHit(learned=False)
 CATCH = pj.catch.planner("exact", decide="given")
 HIT = FREE.with_settings((("rounds", FREE.rounds[1:2]),))  # One attempt needs one program.
 NUM, AT, FAR = 4, np.zeros(3), np.full((4, 3), 50.0)
 TRACES = []
-# Five added limits and costs without effect. All tests add five, to share a compiled program.
+# Values with which the five limits and costs that `having` adds to cases have no effect.
 PLAIN: dict[str, Any] = {"centre": FAR, "radius": 1.0, "disliked": FAR, "weight": 0.0}
 PLAIN |= {"acceleration": 99.0, "low": FAR, "size": 1.0, "point": -FAR, "normal": (0.0, 0.0, 1.0)}
 
@@ -56,7 +55,6 @@ def having(cases, **changes):
 
 
 def way(plans, k, num=200):
-    """Return positions (num, 3) [m] of plan k at equally spaced times, including both ends."""
     path = pj.take(plans.trajectory, k)
     many = jax.tree.map(lambda leaf: np.repeat(np.asarray(leaf)[None], num, axis=0), path)
     return states_at(many, np.linspace(0.0, path.durations.sum(), num))[:, 0]
@@ -254,13 +252,11 @@ def test_boxes_and_planes_are_planned_around_and_judged(hits, free, middle):
     cases = having(hits, low=low, size=sides, point=point, normal=normal)
     verdict = pj.hit.judge(cases, free)
     assert (verdict.failed_limit == "extra").all() and list(verdict.worst_extra) == [3, 3, 4, 4]
-    # A single attempt sometimes gets stuck at an edge of a box.
     verdict = pj.hit.judge(cases, pj.plan(FREE, cases))
     assert verdict.success.all(), [verdict.sentence(k) for k in range(NUM)]
 
 
 def test_the_referee_accepts_all_solved_plans_past_boxes(hits, middle):
-    """Plans pass close to the boxes' edges, where the distance is hard to sample."""
     random, num_solved = np.random.default_rng(2), 0
     for _ in range(16):  # On some processors only 8 of the first 32 cases are solved.
         half = random.uniform(0.1, 0.3, (NUM, 3))

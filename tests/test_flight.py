@@ -200,8 +200,6 @@ def test_a_ball_falls_through_the_plane_at_the_fall_time(height):
     np.testing.assert_allclose(slopes[1], 1.0 / there.vel[2], rtol=1e-12)
 
 
-# In the four cases the ball is too slow to reach the plane, touches it, falls from a point below
-# the plane, or falls from a point in the plane.
 @pytest.mark.parametrize(("height", "vz"), [(2.25, 1.0), (2.25, 2.0), (2.25, -6.0), (2.0, -6.0)])
 def test_a_plane_that_is_not_reached_is_flagged_with_a_finite_gradient(height, vz):
     start = ball(vel=(0.0, 0.0, vz), dtype=np.float32)

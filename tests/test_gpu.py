@@ -56,7 +56,6 @@ def test_compiled_programs_hold_their_kernels(devices, serves):
     attempt = Round(1, LbfgsConfig(max_steps=2))
     hits = jax.jit(lambda cases: solve_batch(ExactHit(), attempt, cases))
     program = hits.lower(jax.device_put(serves, devices[0])).compile().as_text()
-    # One GPU kernel predicts the ball, one computes L-BFGS directions, three integrate penalties.
     assert program.count('custom_call_target="__gpu$xla.gpu.triton"') >= 5
 
 
@@ -124,7 +123,6 @@ def test_gradients_at_the_same_points_are_those_of_a_cpu(devices, serves):
     def off(found, expected):
         return np.quantile(np.abs(found - expected)[..., all_three], 0.95)
 
-    # Compare with float64: a float32 gradient by drag has errors of 1e-4 on a CPU, too.
     for found, other, expected in zip(*map(jax.tree.leaves, (ours, theirs, exact)), strict=True):
         size = np.abs(expected[..., all_three]).max()
         assert off(found, expected) <= 3.0 * off(other, expected) + 1e-5 * size

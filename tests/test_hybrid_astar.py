@@ -33,7 +33,6 @@ def find_path(meeting, polygons=(), end_heading=None, start=START, **settings):
 
 
 def rear(meeting, heading):
-    """Return the rear axle's pose that puts the body's centre on a point."""
     direction = np.array([np.cos(heading), np.sin(heading)])
     return np.append(meeting - MIDDLE * direction, heading)
 

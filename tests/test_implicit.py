@@ -48,8 +48,6 @@ def test_gradients_match_differences_of_optima(study, name):
             unit = jax.tree.map(lambda a, b: a - b, MOVES[name](case, 1.0), case)
             (value, status), (slope, _) = along(case, unit)
             assert status == Status.CONVERGED
-            # The step must be large, because flat directions of the cost magnify the rounding
-            # errors of an optimum.
             step = 1e-4 if name == "drag" else 1e-3
             ahead = along(MOVES[name](case, step), unit)[0][0]
             behind = along(MOVES[name](case, -step), unit)[0][0]

@@ -119,7 +119,6 @@ def test_the_gradient_of_the_cost_matches_finite_differences(knots, float64, mee
     assert found.cost > 1.0 and found.violation > 0.0
     steps = 1e-6 * jnp.eye(point.size)
     slopes = [(model(point + step).cost - model(point - step).cost) / 2e-6 for step in steps]
-    # `gradient` is half the gradient of the cost, and approximate, hence the tolerances.
     scale = np.abs(found.gradient).max()
     np.testing.assert_allclose(2.0 * found.gradient, slopes, rtol=2e-3, atol=2e-3 * scale)
 
@@ -224,8 +223,6 @@ def test_absent_obstacles_and_repeated_corners_change_no_plan(planned, scenes):
     wide = cases.replace(**{name: widen(group, 16, 8) for name, group in groups.items()})
     found = pj.plan(PLANNER, wide)
     np.testing.assert_array_equal(found.status, plans.status)
-    # More obstacles change the order of sums; the rounding errors lead some searches in float32 to
-    # another optimum.
     assert np.isclose(found.cost, plans.cost, rtol=1e-3).mean() >= 0.8
     ours, theirs = (pj.intercept.judge(each, plans) for each in (wide, cases))
     for name in ("success", "wall_clearance", "mover_clearance"):

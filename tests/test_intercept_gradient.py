@@ -15,12 +15,10 @@ from planner_jax.task.intercept.plan import make_straight_plan
 from planner_jax.task.intercept.searches import Search
 
 BY = ("movers.centre", "walls.centre", "limits.acceleration", "target.vel", "speed")
-# These settings compile quickly: one search from few paths, with few unknowns.
 SMALL = {"pieces": 8, "samples": 3, "searches": (Search(4, lattice=Lattice(layers=22)),)}
 
 
 def crossing(dtype, wall=0.0):
-    """Make a case with a target ahead, an obstacle that comes from the right, and a wall."""
     target = TurningPath(*(jnp.asarray(x, dtype) for x in ([3.5, 4.4], [0.0, -0.2], 0.0)))
     walls = [np.array([(1.6, 4.0), (2.4, 4.0), (2.0, 5.0)]) + [0.0, wall]]
     movers = {"movers": [[(2.5, 3.1), (3.0, 3.1), (3.0, 3.6), (2.5, 3.6)]]}

@@ -20,11 +20,9 @@ from planner_jax.task.catch.default_planner import ExactCatch
 from planner_jax.task.hit.default_planner import ExactHit
 
 LANES = 128
-# Number of GPU kernels in one search: one predicts the ball's path, three integrate penalties,
-# one computes L-BFGS directions, one finds the plan's greatest violations of limits.
+# Number of GPU kernels by name in the compiled program of one search of the planner of hits.
 ROUND = {"flight_table": 1, "integrate_along": 3, "lbfgs_turn": 1, "greatest_along": 1}
-# Number of GPU kernels in a plan's gradient: the ball's path and its derivative, first and second
-# derivatives of the penalties, and the inverse of the preconditioner.
+# Number of GPU kernels by name in the compiled program that differentiates a plan of a hit.
 GRADIENT = {"flight_table": 2, "integrate_along": 2, "positive_inverse": 1}
 
 

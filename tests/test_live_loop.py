@@ -63,7 +63,6 @@ class Throw:
         self.disturb, self.home = disturb, home
         planner._forget()
         self.answers, self.sequence = [], 0
-        # Answers arrive immediately, and the sender's clock advances by STEP [s] with every packet.
         self.now = time.perf_counter()
         planner._arrivals.__init__()
 

@@ -113,7 +113,6 @@ def dense_solution(head, tail, waypoints, durations):
     form, rows = energy_form(order, durations), np.array(rows)
     system = np.block([[form, rows.T], [rows, np.zeros((len(rows),) * 2)]])
     right = np.concatenate([np.zeros((len(form), 3)), values])
-    # The equations differ much in size: divide each by its largest number.
     scale = 1.0 / np.sqrt(np.abs(system).max(axis=1))
     for _ in range(3):
         scale /= np.sqrt(np.abs(scale[:, None] * system * scale).max(axis=1))

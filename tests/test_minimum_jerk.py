@@ -64,7 +64,7 @@ def test_the_cost_is_the_mean_squared_jerk_and_every_change_raises_it():
     axes = axes_of(primitive.coeffs[0])
     np.testing.assert_allclose(cost, jerk_cost(axes), rtol=1e-12)
     assert all(axis.degree() == 5 and not axis.deriv(6).coef.any() for axis in axes)
-    # Multiples of t^3 (T - t)^3 have zero position, velocity and acceleration at both ends.
+    # Added multiples of t^3 (T - t)^3 keep position, velocity and acceleration at both ends.
     polynomial = np.polynomial.Polynomial
     bump = polynomial([0.0, 1.0]) ** 3 * polynomial([DURATION, -1.0]) ** 3
     rng = np.random.default_rng(0)

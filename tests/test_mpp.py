@@ -1,4 +1,4 @@
-"""The baseline `mpp`: the cheapest of the tried trajectories, to a catch at a fixed height."""
+"""The planner `mpp` of catches, which samples trajectories and selects the cheapest of them."""
 
 import dataclasses
 

@@ -72,7 +72,6 @@ def test_an_indefinite_hessian_is_shifted_by_its_least_eigenvalue():
     steps, predicted = steps_of(bent, SLOPE, damping, config)
     shift = -np.linalg.eigvalsh(bent)[0]
     exact = -np.linalg.solve(bent + (shift + 500.0 * damping) * np.eye(3), SLOPE)
-    # Bisection finds the least eigenvalue to some thousandths of its interval.
     np.testing.assert_allclose(steps[0], exact, rtol=5e-3)
     assert predicted > 0.0
 

@@ -1,8 +1,8 @@
-"""The planner of [Yu2023catch] against the published C++ protocol: 240 throws.
+"""The planner of [Yu2023catch] in JAX against stored results of a C++ planner, on 240 throws.
 
-`data/catch_paper.csv` and `data/catch_hard.csv` hold the ball at the time of planning, the time T_p
-of the initial guess, its cost with 4 and with 8 pieces, and the optimum of a C++ implementation of
-the same problem.
+`data/catch_paper.csv` and `data/catch_hard.csv` hold the ball's state when planning starts, the
+catch time T_p of the first guess, the guess's costs for trajectories of 4 and of 8 pieces, and the
+optimal cost and catch time that the C++ implementation found.
 """
 
 import csv
@@ -48,7 +48,6 @@ def run_longer():  # the slowest of the 240 rows takes 181 to 217 steps, dependi
 
 
 def excess(planner):
-    """Return excess costs over the published optima, errors of catch times [s], cases and plans."""
     (easy, published), (hard, of_hard) = map(rows, NAMES)
     cases = jax.tree.map(lambda *leaves: np.concatenate(leaves), easy, hard)
     plans = pj.plan(planner, cases)

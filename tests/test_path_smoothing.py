@@ -98,7 +98,6 @@ def test_terms_have_their_closed_forms(float64):
     excess = np.pi / 2 - CURVATURE * 0.5
     expected = settings.curvature * excess**2 + settings.smoothness * 2.0
     assert cost(corner, 0.5, nothing) == pytest.approx(expected)
-    # The line is 0.2 m from a wall; `cost` measures distances in units of 0.1 m.
     wall = walls_of([[(-9.0, -1.0), (9.0, -1.0), (9.0, 0.0), (-9.0, 0.0)]])
     found = cost(line + [0.0, 0.2], 0.1, wall)
     assert found == pytest.approx(settings.obstacle * 9 * (5.0 - 2.0) ** 2)

@@ -101,8 +101,6 @@ def test_a_square_that_crosses_a_straight_path_blocks_it_just_as_long_as_they_ov
     begin, finish = jax.device_get(overlaps(STRAIGHT, movers))
     x = np.asarray(STRAIGHT.pos)[:, 0]
     meets = (x + 0.35 > 2.8) & (x - 0.05 < 3.2)
-    # The square moves at 0.5 m/s from 2 m beside the path. It touches the car when 0.2 m (half the
-    # square) and 0.125 m (half the car's width) remain.
     np.testing.assert_allclose(begin[0, meets], (2.0 - 0.325) / 0.5, rtol=1e-5)
     np.testing.assert_allclose(finish[0, meets], (2.0 + 0.325) / 0.5, rtol=1e-5)
     assert (begin[0, ~meets] >= finish[0, ~meets]).all()
@@ -126,8 +124,6 @@ def test_speed_is_limited_by_lateral_acceleration_and_by_the_steering_rate():
     arc = along(origin, np.float32(2.0), np.full(129, -1.6, np.float32))
     np.testing.assert_allclose(limits_along(arc), np.sqrt(0.8 / 1.6), rtol=1e-6)
     np.testing.assert_allclose(limits_along(STRAIGHT), 1.5)
-    # The curvature rises from 0 to 0.5 1/m in 0.05 m. The steering angle atan(0.3 curvature)
-    # changes fastest at curvature 0, at 2 rad/s.
     step = along(origin, np.float32(0.05), np.float32([0.0, 0.5]))
     np.testing.assert_allclose(limits_along(step), [2.0 / (0.3 * 10.0)], rtol=1e-5)
 

@@ -89,8 +89,7 @@ def limits():
     return pj.QuadrotorLimits(**{name: np.array(value) for name, value in values.items()})
 
 
-# Functions that return how far a motion, scaled by k, exceeds a limit; at k = 1 it meets the limit.
-# The body rate of 4 rad/s results from a jerk of 4 g across the thrust in hover.
+# Functions that scale a motion by k and return how far it exceeds a limit: 0 at k = 1.
 ACC, JERK = np.array([10.0, -5.0, 10.0]), np.array([0.0, 4.0 * GRAVITY, 0.0])
 AT_LIMIT = {
     "speed": lambda k: quadrotor.speed_excess(k * np.array([3.0, 0.0, 4.0]), limits()),

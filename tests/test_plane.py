@@ -43,7 +43,6 @@ def test_the_distance_of_a_polygon_is_the_distance_to_its_boundary(float64):
     step = 1e-6
     for axis in range(2):
         slope = (measure(points + step * np.eye(2)[axis])[0][0] - distance[0]) / step
-        # Finite differences are wrong where another edge becomes the nearest one.
         assert np.isclose(slope, away[axis][0], atol=1e-4).mean() > 0.99
 
 
@@ -149,8 +148,6 @@ def test_a_mover_blocks_a_goal_while_it_covers_it():
     goal = (4.0, 4.0)
     assert not find_layers(goal, movers=[lid]).any()
     leaving = find_layers(goal, movers=[lid], velocities=(0.0, 0.5))
-    # The obstacle extends 1 m beyond the goal. At 0.5 m/s it frees a car of 0.16 m half width after
-    # (1 + 0.16) / 0.5 s.
     assert leaving.any() and (np.argmax(leaving) + 0.5) * STEP >= 2.0
     coming = find_layers(goal, movers=[np.array(lid) + [0.0, 3.0]], velocities=(0.0, -0.5))
     times = (np.arange(21) + 0.5) * STEP

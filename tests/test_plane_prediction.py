@@ -161,7 +161,6 @@ def test_half_and_nine_tenths_of_the_targets_are_within_the_predicted_radii():
     found = [predict_one(TIMES, seen, truth=truth) for truth, seen in targets]
     nearer = np.array([chances[1] for _, _, chances, _, _ in found])
     for half in np.split(nearer, 2):
-        # Tolerances are three standard errors of a share of 150 targets.
         assert np.mean(half <= 0.5) == pytest.approx(0.5, abs=0.12)
         assert np.mean(half <= 0.9) == pytest.approx(0.9, abs=0.075)
     straight, turning = np.split(np.array([chosen.is_turning for chosen, *_ in found]), 2)

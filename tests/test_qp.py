@@ -49,7 +49,6 @@ def test_solutions_meet_the_optimality_conditions(solved):
     assert (value >= lower - 1e-9).all() and (value <= upper + 1e-9).all()
     np.testing.assert_allclose(value[pressure > 0], lower[pressure > 0], atol=1e-8)
     np.testing.assert_allclose(value[pressure < 0], upper[pressure < 0], atol=1e-8)
-    # The gradient less the multipliers is orthogonal to the null space of the equalities.
     slope = solved.point @ HESSIAN - pressure @ MATRIX
     rest = slope - slope @ np.linalg.pinv(BOTH) @ BOTH
     np.testing.assert_allclose(rest, 0.0, atol=1e-8)

@@ -14,8 +14,6 @@ from planner_jax.runs.timing import CompileClock
 
 GRAVITY = 9.81
 UP = np.array([0.0, 0.0, 1.0])
-# Polynomial coefficients (3 axes, 4) of an acceleration, with which the quadrotor tilts far and
-# turns about its thrust.
 MOTION = np.array([[2.0, -3.0, 1.5, 4.0], [-4.0, 6.0, 2.0, -1.0], [1.0, 2.0, -6.0, 3.0]])
 FIELDS = ("pos", "vel", "acc", "jerk", "quat_wxyz", "body_rate", "thrust")
 
@@ -90,7 +88,6 @@ def test_the_gradient_of_the_body_rate_matches_finite_differences(acc):
     assert_gradient_matches_differences(squared, point, rtol=1e-6)
 
 
-# The thrusts [m/s^2] are: hover, nearly zero, zero (free fall), nearly downward, and downward.
 @pytest.mark.parametrize(
     "thrust", [(0, 0, GRAVITY), (1e-4, 0, 1e-5), (0, 0, 0), (1e-3, 0, -5.0), (0, 0, -5.0)]
 )

@@ -48,7 +48,7 @@ def test_solved_is_read_from_the_status():
     resident = pj.are_solved(jax.tree.map(jnp.asarray, plans))
     assert isinstance(resident, np.ndarray) and resident.tolist() == good.tolist()
     assert pj.are_solved(pj.take(plans, 1)) and not pj.are_solved(pj.take(plans, 4))
-    # `is_unsolved` is true for INFEASIBLE, MAX_STEPS and OUT_OF_REACH: another attempt may help.
+    # `is_unsolved` is true for INFEASIBLE, MAX_STEPS and OUT_OF_REACH, after which `plan` retries.
     assert is_unsolved(status).tolist() == [False, False, True, True, False, True, *5 * [False]]
 
 

@@ -270,7 +270,6 @@ def test_a_car_brakes_on_its_path(here):
     case, plan = driving()
     _, rows = table(pj.export(plan, to="csv", out="a.csv", case=case))
     assert rows[-1, 4] < 0.02 and rows[101, 0] > 1.0
-    # Braking from 1 m/s to standstill takes 1.25 s, at a mean speed of 0.5 m/s.
     assert rows[-1, 1] == pytest.approx(2.0 + 0.5 * 5 * 0.25, abs=0.01)
     assert np.abs(rows[:, 5]).max() <= 1.0 and not rows[:, 6].any()
     assert not is_rested(plan)

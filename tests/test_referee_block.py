@@ -233,8 +233,8 @@ def test_an_arm_may_move_at_the_contact_if_the_case_does_not_require_rest():
         assert_good(leaves, contact_tolerance=1e-7)
     leaves["ends_at_rest"][:] = True
     assert_fails(leaves, "rest", part=STEEP)
-    # An arm that arrives early may wait, whether the limits require standstill at the contact (R3)
-    # or not (R1).
+    # In both regimes of limits, an arm that arrives before the ball may stand still and wait. Only
+    # R3 requires standstill at the contact.
     for regime in ("R1", "R3"):
         assert_good(good(regime=regime, durations=(0.2, 0.4)))
 
@@ -336,8 +336,6 @@ def brute_clearances(angles, scene):
     beams = [segment(*ends, radius) for ends, radius in rods]
     low, high = ARM.base_box
     base = (0.5 * (low + high), list(0.5 * np.diag(high - low)), 0.0)
-    # With a straight wrist the capsule of link 4 would touch the shield, so that the check of the
-    # arm with itself uses a radius at which they just touch.
     wrist, plate = solids_of(np.zeros(6))[5], solids_of(np.zeros(6))[8]
     thin = min(wrist[3], gap((*wrist[1:3], 0.0), plate[1:]))
     found = {

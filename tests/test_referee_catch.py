@@ -13,7 +13,7 @@ from planner_jax.referee.catch import CatchVerdict, referee_catches
 GRAVITY, DRAG, NET_HEIGHT, NET_RADIUS = 9.81, 0.5, 0.2, 0.125
 START, FIRST, SECOND = (0.0, 0.0, 1.2), (0.6, -0.3, 1.4), (-0.4, 0.2, 1.1)
 TIMES = (1.1, 2.4)  # of the two catches
-# [s], durations of trajectory pieces, two up to each catch; zero for the target without a catch.
+# [s], durations of six trajectory pieces: two up to each catch, and two unused pieces.
 DURATIONS = (0.4, 0.7, 0.8, 0.5, 0.0, 0.0)
 STEP = Polynomial([0, 0, 0, 0, 35, -84, 70, -20])  # from 0 to 1, at rest up to jerk at both
 STEEPEST = 35.0 / 16.0  # slope of STEP, at 1/2

@@ -204,8 +204,8 @@ def test_a_narrow_peak_of_the_body_rate_is_found_where_the_thrust_nearly_vanishe
 
 
 def test_a_thrust_that_changes_sign_between_samples_turns_the_quadrotor_over():
-    # The vertical thrust per unit mass is 1 - 4 t, and the horizontal one nearly zero. The body
-    # rate is therefore zero at all samples, and huge between two of them.
+    # The vertical thrust per unit mass is 1 - 4 t, the horizontal thrust nearly zero. The body rate
+    # is therefore zero at all samples, and huge between the two samples near t = 1/4.
     leaves = volley()
     rise = (1.0 - 4.0 * TIME - GRAVITY).integ(2) + 3.0
     path = cut([Polynomial([2e-9]).integ(2), Polynomial([0.0]), rise], [0.33])
@@ -333,7 +333,6 @@ def test_a_racket_is_met_within_its_radius_less_a_margin(radius, off, passes):
     leaves = volley()
     after = leaves["target"][0] - CONTACT
     aside = np.array([-after[1], after[0], 0.0]) / np.hypot(*after[:2])
-    # Ball and target shift sideways by equal amounts, so only the contact error changes.
     edit(leaves, {"ball.pos": add(off * aside), "target": add(off * aside)})
     if radius is not None:
         leaves["racket_radius"] = np.array([radius])

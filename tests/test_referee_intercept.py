@@ -185,8 +185,6 @@ def test_a_mover_is_hit_at_its_position_and_time():
     assert assert_good(passing).mover_clearance[0] == pytest.approx(0.05)
     hit = good(**still, movers=([square(7.0, 1.0, 0.2), square(x, y - 0.05, 0.2)], way * 2))
     verdict = assert_fails(hit, "mover", excess=0.05, says="inside movers[1]")
-    # The depth is the shortest motion out of the overlap. It is 0.05 m to the side, as soon as the
-    # overlap along the car is longer.
     assert verdict.failed_time[0] == pytest.approx(2.0 - 0.35 / 0.5, abs=0.02)
     convoy = good(movers=([square(START[0] + FRONT + 0.3, 4.0, 0.2)], [(SPEED, 0.0)]))
     assert assert_good(convoy).mover_clearance[0] == pytest.approx(0.1)
@@ -195,7 +193,7 @@ def test_a_mover_is_hit_at_its_position_and_time():
 
 
 def random_polygon(random, most=6):
-    """Return the corners (most, 2) of a convex polygon, with the last one repeated."""
+    """Return corners (most, 2) of a convex polygon; copies of the last corner fill the array."""
     num = random.integers(3, most + 1)
     angles = 2.0 * np.pi * (np.arange(num) + random.uniform(0.1, 0.9, num)) / num
     corners = random.uniform(0.1, 0.6) * np.stack([np.cos(angles), np.sin(angles)], axis=1)
@@ -203,7 +201,7 @@ def random_polygon(random, most=6):
 
 
 def test_clearances_are_the_greatest_gap_in_any_direction():
-    """Compare with the greatest gap between the projections on 2,881 directions."""
+    """Compare with the greatest gap between projections of two polygons on 2,881 directions."""
     random = np.random.default_rng(0)
     lanes, samples, num = 40, 5, 3
     half = np.tile([0.2, 0.125], (lanes, 1))

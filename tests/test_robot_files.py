@@ -175,7 +175,6 @@ def test_mjcf_gives_body_and_rotors_about_the_centre_of_mass():
     robot = pj.read_robot(DATA / "quadrotor_of_mjcf.yaml")
     assert (robot.name, robot.tool) == ("quadrotor_of_mjcf", TOOL)
     np.testing.assert_allclose(robot.mass, 0.8)
-    # Frame and battery lie 3 cm apart, one above the other; the battery is a box.
     apart = 0.7 * 0.1 / 0.8 * 0.03**2
     box = 0.1 / 3.0 * (np.array([0.03, 0.015, 0.01]) ** 2 @ (1 - np.eye(3)))
     np.testing.assert_allclose(robot.inertia, [0.003, 0.003, 0.005] + box + [apart, apart, 0.0])

@@ -24,7 +24,7 @@ CURVED = np.array([[3.0, 1.0, 0.2], [1.0, 2.0, 0.0], [0.2, 0.0, 1.0]])
 
 @struct.dataclass
 class Bowl:
-    """A case with the cost u^T A u / 2 - u^T b - k u_0 of a plan u, A = `CURVED`."""
+    """A case (b, k) with the cost u^T A u / 2 - u^T b - k u_0 of a plan u, where A = `CURVED`."""
 
     b: jax.Array  # (3,)
     k: jax.Array  # ()

@@ -158,8 +158,6 @@ def test_the_published_serves_are_read_with_their_rates():
     assert len(serves) == 9000
     np.testing.assert_array_equal(np.bincount(serves.scenario), np.full(36, 250))
     np.testing.assert_allclose(serves.target, court.target_of(serves.scenario))
-    # The serves are a quarter of all trials, so their success rates differ slightly from the rates
-    # of all trials.
     rates = 100.0 * serves.published.mean(axis=0)
     np.testing.assert_allclose(rates, read_published_rates().trials.mean(axis=0), atol=1.0)
 
@@ -261,7 +259,6 @@ def test_generated_serves_are_distributed_as_the_published_ones():
     levels = [0.05, 0.25, 0.5, 0.75, 0.95]
     for name in np.unique(pair):
         a, b = ours[pair[generated.scenario] == name], theirs[pair[published.scenario] == name]
-        # Scenarios with equal regions of serve and landing share their 250 different serves.
         share = np.stack([(b <= q).mean(axis=0) for q in np.quantile(a, levels, axis=0)])
         assert np.abs(share - np.array(levels)[:, None]).max() < 0.1, name
     np.testing.assert_allclose(ours.mean(axis=0), theirs.mean(axis=0), atol=0.035)

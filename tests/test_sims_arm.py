@@ -68,8 +68,6 @@ def plans(*motions, contact, status=None):
 
 
 STILL = motion(0.0 * TURN)
-# The motions are standstill, two motions in opposite directions that end at rest, and one that
-# ends with moving joints.
 MOTIONS = (STILL, motion(TURN), motion(-0.3 * TURN), motion(0.6 * TURN, ends_at_rest=False))
 
 
@@ -171,7 +169,7 @@ def test_a_ball_on_the_shield_is_blocked_and_one_beside_it_is_not():
     assert found.blocked.tolist() == [True, True, False, False]
     assert found.success.tolist() == found.blocked.tolist()
     np.testing.assert_allclose(found.miss, np.linalg.norm(places, axis=1), atol=1e-4)
-    # The ball touches the face when its centre is one radius away.
+    # The ball touches the shield's face when the ball's centre is one radius (5 cm) away.
     np.testing.assert_allclose(found.contact[:2], 0.5 - 0.05 / 8.0, atol=1e-4)
     assert np.isnan(found.contact[2:]).all() and np.isnan(found.contact_pos[2:]).all()
 

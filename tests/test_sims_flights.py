@@ -130,8 +130,6 @@ class Outcome:
 @pytest.mark.parametrize(
     ("pair", "alone", "chosen"),
     [
-        # `pair` and `alone` map limits of the body rate [rad/s] to violations by plans for both
-        # balls, and for one. `chosen` states whether both balls are planned, and the limit.
         ({3.0: 0.02, 4.5: -0.1}, {3.0: -0.1}, (True, 4.5)),
         ({3.0: 0.3, 4.5: 0.2, 5.0: 0.05}, {3.0: -0.1}, (True, 5.0)),
         ({3.0: 0.3, 4.5: 0.2, 5.0: 0.15}, {3.0: -0.1}, (False, 3.0)),

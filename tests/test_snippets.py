@@ -26,7 +26,7 @@ COMMAND = re.compile(r"`((?:planner-jax|(?:taskset -c \d+ )?python -m benchmarks
 
 
 def python_blocks(page: Path) -> list[tuple[str, str | None]]:
-    """Return the Python blocks of a page that run, each with what it prints if the page says so."""
+    """Return the Python blocks of a page that run, each with the output on the page, or None."""
     text = page.read_text()
     blocks: list[tuple[str, str | None]] = []
     follows = False  # the last fence was a block that runs

@@ -109,7 +109,6 @@ def test_an_empty_graph_has_the_straight_line_and_a_full_one_has_none():
     wall = problem([(3.0, 4.0, (-1.0, -1.0), (7.0, 7.0))])
     fast = problem(speed_limit=(9.0, 0.2, 9.0))
     cases = pad(free, wall, fast)
-    # This grid contains the distances of uniform motion; `GRID` is too coarse to contain them.
     straight = jax.jit(lambda p: reference_line(p, StationTimeGrid(10, 5, 3)))(free)
     np.testing.assert_allclose(straight.station, np.linspace(0.0, 6.0, 6), atol=1e-12)
     np.testing.assert_allclose(straight.cost, 0.0, atol=1e-12)

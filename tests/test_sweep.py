@@ -27,7 +27,6 @@ from planner_jax.task.hit.spec import REAL_SCENARIOS
 TASK = pj.task_named("hit")
 open_source = HitSweep(TASK).open_source
 NUM, BATCH = 84, 13  # chunks and single cases are planned by one program, for up to 16
-# Half of these cases fail, because planning starts late and makes only one short search.
 SETTINGS = HitSettings(num=NUM, batch=BATCH, delay=0.8, seed=3)
 FAILED = "failed,failed,failed"
 

@@ -21,7 +21,6 @@ from planner_jax.task.catch.spec import SUITES
 
 TASK = pj.task_named("catch")
 NUM, BATCH = 8, 4
-# Some of these cases fail, because planning makes only one short search.
 SETTINGS = CatchSettings(suite="parabola2", decide="greedy", num=NUM, batch=BATCH, seed=2)
 
 

@@ -1,4 +1,4 @@
-"""Time limits and progress reports of `pj.plan`, with a clock that only reports advance."""
+"""Time limits and progress reports of `pj.plan`; tests replace the clock by their own."""
 
 import dataclasses
 import types

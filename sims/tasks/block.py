@@ -1,4 +1,4 @@
-"""Simulated blocks of the command `planner-jax fly block`: table, recordings and report."""
+"""Simulated blocks, in which an arm moves a shield into balls' paths: table, recordings, report."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -49,7 +49,7 @@ _KEPT = 5  # number of simulated frames from one recorded sample to the next
 
 
 class BlockFlight(FlightTask):
-    """The simulation of blocks with which `sims/run.py` flies, scores and draws a run."""
+    """The simulation of blocks, which `sims/run.py` calls to simulate, score and draw a run."""
 
     settings: BlockFly
 
@@ -204,7 +204,7 @@ class BlockFlight(FlightTask):
         )
 
     def counts(self, rows: Any) -> dict[str, Any]:
-        """Return numbers for the summary on plans, contacts, misses, joint errors and torques."""
+        """Count plans, contacts and blocks, and summarise misses, joint errors and torques."""
         planned, miss = np.asarray(rows["planned"]), np.asarray(rows["miss"])
         blocked = np.asarray(rows["blocked"])
         late = np.asarray(rows["time_plan"]) > self.settings.until_set

@@ -92,8 +92,8 @@ class BlockFlights(Flights):
     clearance_after: np.ndarray  # (B,) [m], least clearance after the contact, while the arm brakes
     planned: np.ndarray  # (B,) bool, whether there was a plan
     motions: np.ndarray  # (B,) int, number of motions that the arm started
-    # (B,) [m], errors of the first and last predicted ball position, midway between its entries
-    # into the outer and the inner box. They are NaN if the ball is known and not observed.
+    # (B,) [m], errors of the ball's position midway between outer and inner box, predicted at the
+    # first and at the last planning. NaN if the planner knows the ball's true flight.
     fit_error: np.ndarray
     last_fit_error: np.ndarray
 
@@ -324,8 +324,8 @@ def _strikes(
 ) -> np.ndarray:
     found = np.zeros(ball.shape[1:], bool)
     for k, link in enumerate(links):
-        # Only the base and links 1 to 3 are tested. The wrist's capsules protrude through the
-        # shield's face, which the real links do not.
+        # Only base and links 1 to 3 are tested for contact with the ball, because the capsules that
+        # model the wrist protrude through the shield's face, unlike the real wrist.
         if link > 2:
             continue
         first, second = case["arm.capsule_ends"][:, k].transpose(1, 2, 0)[..., None]

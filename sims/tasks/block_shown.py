@@ -53,7 +53,7 @@ def scenery(arm: Arm, has_pole: bool) -> tuple[Part, ...]:
 
 
 def budget_table(rows: Any) -> RateTable:
-    """Make the table of times for sensing, planning, waiting, moving [Natarajan2024, eq. 1]."""
+    """Make the table of the parts of the balls' times of flight [Natarajan2024, eq. 1]."""
     planned = np.asarray(rows["planned"])
     parts = {name: 1e3 * np.asarray(rows[f"time_{name}"])[planned] for name in BUDGET}
     parts["flight, the sum"] = np.sum(list(parts.values()), axis=0)
@@ -67,7 +67,7 @@ def budget_table(rows: Any) -> RateTable:
 
 
 def joint_table(rows: Any) -> RateTable:
-    """Make the table of each joint's rms and greatest tracking error and torque, if planned."""
+    """Make the table of each joint's tracking errors and torques, over all arms with a plan."""
     planned = np.asarray(rows["planned"])
 
     def of(name: str) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Catches in closed loop: one or more balls, thrown at equal intervals [Yu2023catch].
+"""Catches in closed loop: a quadrotor's net catches balls, thrown at intervals [Yu2023catch].
 
 When a ball comes into sight, the previous ball is about to be caught. The state of the quadrotor
 after that catch decides whether the next catch is possible. Every plan therefore includes one more
@@ -52,7 +52,7 @@ from planner_jax.task.catch.suites import LAUNCH, draw, earliest_throw
 from planner_jax.task.hit.spec import DRAG  # of hits, since [Yu2023catch] reports none
 
 CATCH_WORLD = World(Quadrotor(PAPER_CATCHER), GRAVITY, mouth=LAUNCH)
-# [s], time of flight before a ball's plan starts; the ball flies over 2 m [Yu2023catch, VII-A].
+# [s], time from a throw to the ball's plan; the ball flies more than 2 m [Yu2023catch, VII-A].
 SEEN = 0.3
 _AFTER = 0.05  # [s], simulated time after the end of the last ball's horizon
 
@@ -227,7 +227,7 @@ def fly_catches(
 
 
 class CatchFlight(BallFlightTask):
-    """The simulation of catches with which `sims/run.py` flies, scores and draws a run."""
+    """The simulation of catches, which `sims/run.py` calls to simulate, score and draw a run."""
 
     settings: CatchFly
 

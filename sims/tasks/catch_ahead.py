@@ -1,4 +1,4 @@
-"""Plans from scratch, when a ball comes into sight, for its catch and the next ball's catch."""
+"""Planning, once a quadrotor sees a ball, of the catches of this ball and the next ball."""
 
 import dataclasses
 import functools
@@ -149,7 +149,7 @@ def with_catch(flights: FlightState, found: CatchPlan, new: Array) -> FlightStat
 
 @dataclasses.dataclass(frozen=True)
 class _EveryAttempt(Driver):
-    """A caller of planners that runs all attempts (settings to try) at once, to compile them."""
+    """A function that runs all attempts (searches) of a planner at once, so that they compile."""
 
     watch: Watch = dataclasses.field(default_factory=lambda: Watch(0.0))
 
@@ -168,9 +168,9 @@ class _EveryAttempt(Driver):
 def compile_attempts(planner: Planner, cases: Any) -> None:
     """Compile the programs of all attempts of a planner concurrently, one thread per attempt.
 
-    An attempt is a search with settings of its own. `plan` compiles it only when the previous
-    attempt has left cases unsolved. Some throws need all attempts, and compiling one after another
-    would take several times as long.
+    An attempt is a search with settings of its own. `plan` compiles an attempt only when the
+    previous attempt has left cases unsolved. Some throws need all attempts, and compiling them one
+    after another would take several times as long.
     """
     _EveryAttempt()(planner, cases)
 

@@ -1,4 +1,4 @@
-"""Replanning of catches during a flight: the part of the closed loop that plans in every period."""
+"""Replanning of a quadrotor's remaining catches in every period of the simulated closed loop."""
 
 import dataclasses
 import functools
@@ -60,7 +60,7 @@ class CatchPilot:
     def pose_problem(
         self, case: CatchCase, plan: CatchPlan, outlook: Outlook
     ) -> Replanning[CatchCase, CatchPlan]:
-        """Return the problem of replanning later catches of `plan` from the predicted `outlook`."""
+        """Return the problem of replanning remaining catches from predicted robot and balls."""
         made = plan.times <= outlook.elapsed
         first = jnp.argsort(made, stable=True)  # indices of catches, the remaining catches first
         order, times = plan.order[first], plan.times[first] - outlook.elapsed
@@ -78,9 +78,9 @@ class CatchPilot:
 
     @property
     def searches(self) -> tuple[Callable[[Replanning[CatchCase, CatchPlan]], CatchPlan], ...]:
-        """Two searches: a short search from the current plan, and a search from scratch.
+        """Two searches: a short one from the current plan, and one with new order and times.
 
-        The search from scratch uses newly decided order and times of catches.
+        The second search, from scratch, is left out if the setting `redecide` is 0.
         """
         from_last = lambda task: self.planner.solve(task, self.planner.rounds[0])  # noqa: E731
         return (from_last, self._decide_again) if self.redecide > 0.0 else (from_last,)
@@ -117,7 +117,7 @@ class CatchPilot:
 
 
 def is_worth_flying(fresh: CatchPlan, warm: CatchPlan) -> Array:
-    """Return whether the plan `fresh`, from scratch, is preferred to the warm-started plan.
+    """Return whether `fresh`, a plan from scratch, is preferred to `warm`, a warm-started plan.
 
     If the warm-started plan is feasible, `fresh` must be feasible at a cost that is 5 % lower.
     Otherwise it is enough that `fresh` violates the limits less.

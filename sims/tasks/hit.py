@@ -47,7 +47,7 @@ from planner_jax.task.hit.replan import ReplanHit
 from planner_jax.task.hit.spec import REAL_SCENARIOS
 from planner_jax.task.hit.suites import DEPTH, SERVE_HEIGHT, generate_serves, to_cases
 
-# [s], time of flight before the first plan starts; a serve flies over 2 m [Yu2023catch, VII-A].
+# [s], time from a serve to the first plan; the ball flies more than 2 m [Yu2023catch, VII-A].
 SEEN = 0.25
 _AFTER = 0.1  # [s], simulated time after the last planned impact
 _LONGEST = 1.9  # [s], duration of the longest flight of a serve
@@ -90,9 +90,9 @@ HIT_WORLD = World(
 
 
 def smooth_planner() -> ExactHit:
-    """Return an `ExactHit` that starts with 60 iterations, not 3, and has drag after the impact.
+    """Return an `ExactHit` whose first search has 60 iterations, with drag of the returned ball.
 
-    Limits do not include angular acceleration. A plan after few iterations may need more torque
+    Plans have no limit on angular acceleration. After few iterations, a plan may need more torque
     than the rotors have, so that the ball misses its target. A longer search avoids such plans.
     """
     planner = ExactHit(drag_after_impact=True)
@@ -102,11 +102,11 @@ def smooth_planner() -> ExactHit:
 
 @dataclasses.dataclass(frozen=True)
 class HitPilot:
-    """The part of the closed loop that replans a hit at fixed intervals from the current plan."""
+    """The part of the closed loop that replans a hit in every period, from the current plan."""
 
     planner: ReplanHit = ReplanHit(ExactHit(drag_after_impact=True))
-    # [s], least time before an impact at which the hit is replanned. After a later change of plan
-    # the tracking error would not decay before the impact.
+    # [s], least time before the impact at which the plan may change. A later change would cause a
+    # tracking error that does not decay before the impact.
     shortest: float = 0.3
     # Greatest relative violation of a limit by a new plan that replaces the current plan.
     excess: float = 0.1
@@ -123,7 +123,7 @@ class HitPilot:
     def pose_problem(
         self, case: HitCase, plan: HitPlan, outlook: Outlook
     ) -> Replanning[HitCase, HitPlan]:
-        """Return the replanning problem for the predicted ball and robot and the current plan."""
+        """Return the problem of replanning the hit `plan` from the predicted robot and ball."""
         return Replanning(
             case=replace_ball(case, outlook.balls, outlook.drag, outlook.head_state),
             previous=plan,
@@ -132,7 +132,7 @@ class HitPilot:
 
     @property
     def searches(self) -> tuple[Callable[[Replanning[HitCase, HitPlan]], HitPlan], ...]:
-        """The only search: a short search of the planner from the current plan."""
+        """The only search of replanning: a short search that starts at the current plan."""
         return (lambda task: self.planner.solve(task, self.planner.rounds[0]),)
 
     def choose(
@@ -278,7 +278,7 @@ def fly_hits(
 
 
 class HitFlight(BallFlightTask):
-    """The simulation of hits with which `sims/run.py` flies, scores and draws a run."""
+    """The simulation of hits, which `sims/run.py` calls to simulate, score and draw a run."""
 
     settings: HitFly
 

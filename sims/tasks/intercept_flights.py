@@ -1,4 +1,4 @@
-"""Simulated drives of the command `planner-jax fly intercept`: table, recordings, report."""
+"""Simulated interceptions, in which a car meets a moving target: table, recordings, report."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -40,7 +40,7 @@ _WALL_HEIGHT, _MOVER_HEIGHT, _TARGET_HEIGHT = 0.25, 0.2, 0.08  # [m], heights in
 
 
 class InterceptFlight(FlightTask):
-    """The simulation of interceptions with which `sims/run.py` drives, scores and draws a run."""
+    """The simulation of interceptions, which `sims/run.py` calls to simulate, score, draw a run."""
 
     settings: InterceptFly
 

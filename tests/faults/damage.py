@@ -39,7 +39,6 @@ def nest(content: bytes, random: Any) -> bytes:
 
 
 def swap(content: bytes, random: Any) -> bytes:
-    """Replace one value, at any depth of a JSON object, by an entry of ODD; or remove an entry."""
     lines = content.decode().splitlines()
     if lines[0] == "{":  # one object in the whole file
         lines = [content.decode()]

@@ -1,4 +1,4 @@
-"""The command `planner-jax` with planners for tests, which try one search and so compile quickly.
+"""The command `planner-jax` for tests: planners make one search, to compile quickly.
 
 python -m tests.faults.quick sweep hit ...
 """

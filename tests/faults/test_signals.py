@@ -38,7 +38,6 @@ NUMBERS = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
 
 
 def stop_script(script, *numbers, ignored=()):
-    # Set every handler, because the script would inherit from `nohup` that SIGHUP is ignored.
     heard = {number: "SIG_IGN" if number in ignored else "SIG_DFL" for number in NUMBERS}
     before = "".join(
         f"import signal; signal.signal({int(n)}, signal.{how})\n" for n, how in heard.items()

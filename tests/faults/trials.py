@@ -24,7 +24,6 @@ QUICK = "tests.faults.quick"
 SWEEPS = {
     "hit": ("hit", "--num", "200", "--batch", "32", "--seed", "5"),
     "catch": ("catch", "--suite", "parabola2", "--num", "96", "--batch", "16", "--seed", "5"),
-    # Ray workers are other processes, so they use the library's planner and not a test's planner.
     "many": ("hit", "--planner", "juggle", "--num", "20000", "--batch", "500", "--seed", "5"),
 }
 Outcome = tuple[bool, str]  # whether a run survived, and a word on how

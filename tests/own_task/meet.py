@@ -39,7 +39,7 @@ class MeetPlan(pj.Plan):
 
 
 def plan_at(point, case: MeetCase) -> tuple:
-    """Return the meeting time and the accelerations (2, 2) at start and meeting, from `point`."""
+    """Return meeting time, and accelerations (2, 2) at both ends, of decision variables `point`."""
     time, first = jnp.exp(point[0]), point[1:]
     way = case.target_pos - case.pos + (case.target_vel - case.vel) * time
     last = 6.0 * way / time**2 - 2.0 * first  # way = (2 first + last) time^2 / 6
