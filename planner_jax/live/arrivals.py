@@ -30,7 +30,7 @@ class Arrivals:
         self._senders: dict[Hashable, tuple[float, int]] = {}
 
     def check(self, packet: Packet, sender: Hashable, now: float) -> tuple[Fault, bool]:
-        """Return the fault of a packet that arrives at `now` [s], and whether its clock is new.
+        """Return why a packet that arrives at `now` [s] is rejected, and whether its clock is new.
 
         All senders share a clock. It is new if `now` minus the sending time jumps by more than 1 s
         after 1 s without a used packet.

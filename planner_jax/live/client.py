@@ -31,7 +31,7 @@ class Client:
 
         Args:
             pos: (3,) [m].
-            measured: [s], time of the observation by `time.monotonic()`, by default of this call.
+            measured: [s], time of the observation by `time.monotonic()`; by default, of the call.
             number: number from 0 to 65535 that identifies the ball.
         """
         return self._send(BALL, measured, pos, number)

@@ -29,7 +29,7 @@ class Course:
 
 
 def without_recovery(path: PiecewisePolynomial, gravity: Array) -> Course:
-    """Make a course of a plan alone; its recovery trajectory has pieces of zero duration."""
+    """Convert a plan's path to a course whose recovery trajectory (to standstill) lasts 0 s."""
     end = state_on(path, np.sum(path.durations))
     return Course(_join(path, _stand_still(_REST.num_pieces, end[0])), gravity)
 
@@ -37,7 +37,7 @@ def without_recovery(path: PiecewisePolynomial, gravity: Array) -> Course:
 def with_recovery(
     path: PiecewisePolynomial, gravity: Array, limits: QuadrotorLimits
 ) -> tuple[Course, bool]:
-    """Append a trajectory to standstill to a plan; return this course, and if it keeps limits."""
+    """Append a trajectory to standstill to a plan's path; return both, and if the limits hold."""
     state: Any = state_on(path, np.sum(path.durations))
     case = RecoveryCase(state, state[0], gravity, limits)
     rest: QuadrotorPlan = solve_one(_REST, case, _REST.rounds[0])
@@ -78,7 +78,7 @@ class Query:
 
 
 def setpoints_of(num: int, _: None, query: Query) -> Float[Array, "K 20"]:
-    """Sample `num` rows: pos, vel, acc, jerk, quat_wxyz, body_rate, thrust; `_` is unused."""
+    """Return K = `num` setpoints: pos, vel, acc, jerk, quat_wxyz, body_rate, thrust."""
     path, gravity = query.course.path, query.course.gravity
     times = query.elapsed + query.period * np.arange(num)
     end = total_duration(path)

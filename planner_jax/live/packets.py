@@ -104,7 +104,7 @@ class Answer:
 def request(
     kind: int, sequence: int, sent: float, measured: float, values: tuple, ball: int = 0
 ) -> bytes:
-    """Encode a measurement of the kind BALL or ROBOT; `sent` and `measured` are times [s]."""
+    """Encode a ball's or the robot's state, `values`, `measured` and `sent` at these times [s]."""
     head = _HEADER.pack(MAGIC, VERSION, kind, ball, sequence, sent)
     return head + _MEASURED.pack(measured) + _VALUES[kind].pack(*values)
 

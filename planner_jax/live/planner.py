@@ -37,8 +37,8 @@ from planner_jax.planning.programs import call_packed
 
 _PATIENCE = 0.2  # fraction of the deadline for which an answer waits for a new plan
 _ASTRAY = 0.5  # [m], distance from the planned position above which the robot is stopped
-# Greatest jump of position [m] and velocity [m/s] with which the robot switches to a plan that was
-# found after the time at which it starts.
+# Greatest jump of position [m] and velocity [m/s] from the current trajectory to a new plan, if the
+# plan is found only after its own starting time.
 _JOIN = (0.02, 0.2)
 _KNOWN = 0.3  # [m/s], standard deviation of a ball's velocity below which planning starts
 _NOTHING = np.zeros((0, WIDTH), np.float32)
@@ -158,7 +158,7 @@ class LivePlanner(Generic[CaseT, PlanT]):
             return self._pack(packet, fault, due)
 
     def record_sent(self, data: bytes, received: float) -> None:
-        """Record the time of a sent answer; only then extend a new plan by a stop at its end."""
+        """Record a sent answer's delay; only then compute the stop after a new plan."""
         taken = time.perf_counter() - received
         self.report.counts["answered"] += 1
         self.report.counts["missed"] += taken > self.deadline
@@ -217,7 +217,6 @@ class LivePlanner(Generic[CaseT, PlanT]):
     def _search(
         self, ball: BallState, flight: _Flight[PlanT], number: int, due: float
     ) -> _Flight[PlanT] | None:
-        """Plan for ball `number` from `due` [s] on: improve its plan in `flight`, or plan anew."""
         elapsed, stages = due - flight.start, self.report.stages
         if flight.plan is not None and flight.ball == number:
             with stages["again"].measure():
@@ -237,7 +236,6 @@ class LivePlanner(Generic[CaseT, PlanT]):
         return _Flight(course, due, plan, due + self.stroke.contact(plan), ball)
 
     def _collect(self, due: float) -> None:
-        """Switch to a plan found by the planning thread, if the robot can join it at `due` [s]."""
         flight, job = self._flight, self._job
         if flight is not None and flight.plan is not None and due >= flight.contact:
             self._done = flight.ball

@@ -26,7 +26,7 @@ _LEAST = 3  # least number of observations from which the velocity counts as kno
 
 @struct.dataclass
 class Observation:
-    """Input of one step of the Kalman filter: a Gaussian belief, and an observation after it."""
+    """Input of a Kalman filter step: a Gaussian estimate of the ball, and a later observation."""
 
     belief: EkfState
     since: Array  # () [s], time from the belief to the observation
@@ -36,7 +36,7 @@ class Observation:
 
 @struct.dataclass
 class Estimate:
-    """Output of a Kalman filter step: belief after an observation, and the ball at a later time."""
+    """Output of a Kalman filter step: updated estimate, and the ball predicted at a later time."""
 
     belief: EkfState
     is_outlier: Array  # () bool, whether the observation was rejected

@@ -1,4 +1,4 @@
-"""The tasks of live planning (`planner-jax serve`): to hit or to catch the observed ball.
+"""A quadrotor's tasks in live planning (`planner-jax serve`): to hit or to catch a ball.
 
 Each class plans from scratch, or improves the previous plan with the newest estimate of the ball.
 To save time, a plan is a single short search of the optimiser, in one compiled call. The next call
@@ -47,7 +47,7 @@ _LONGEST = 4.0  # [s], latest time of a catch
 # Fraction of the robot's limits that a plan may use. From a plan that uses its limits fully there
 # is often no trajectory to standstill within the limits, so it could not be flown.
 _SHARE = 0.97
-# Settings for planning again: two steps of L-BFGS from the previous plan, which is close already.
+# Settings to improve the previous plan by two steps of L-BFGS; it is close to the optimum already.
 _AGAIN = Round(starts=1, solver=LbfgsConfig(max_steps=2, memory=2, trial_steps=(1.0, 0.2, 0.04)))
 
 CaseT = TypeVar("CaseT", HitCase, CatchCase)
@@ -97,7 +97,6 @@ class Stroke(abc.ABC, Generic[CaseT, PlanT]):
 
 
 def _state_in(task: Replanning) -> Array:
-    """Return position, velocity, acceleration, jerk in the previous plan at `task.elapsed` [s]."""
     path, elapsed = task.previous.trajectory, jnp.asarray(task.elapsed)
     return jnp.stack([evaluate(path, elapsed, order) for order in range(4)])
 
@@ -143,10 +142,8 @@ class HitStroke(Stroke[HitCase, HitPlan]):
 
 
 def _time_left(case: CatchCase) -> Array:
-    """Return the last time (1,) [s] with the ball above the net's lowest allowed height, or 0."""
     height = case.limits.min_height + case.net.height
     path = jax.tree.map(lambda leaf: leaf[0], case.targets)
-    # The bisection starts at the ball's highest point, since a rising ball may be low at time 0.
     start = jnp.maximum(path.ball.vel[2], 0.0) / path.gravity
 
     def halve(_: int, bounds: tuple[Array, Array]) -> tuple[Array, Array]:

@@ -91,7 +91,7 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
 
     @abc.abstractmethod
     def meet(self, natural: Float[Array, "N K"], context: PyTree) -> ChainEnds:
-        """Return durations and final states of N segments from the K end variables of each."""
+        """Return durations and final states of N segments from their K end variables, `natural`."""
 
     @abc.abstractmethod
     def guess_ends(self, context: PyTree, num: int) -> Float[Array, "num N K"]:
@@ -109,15 +109,15 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
 
     @property
     def end_weight(self) -> float:
-        """Factor [s] on the penalties at the segments' ends, which are added to time integrals."""
+        """Factor [s] that converts penalties at segments' ends to the unit of time integrals."""
         return 0.0
 
     def active(self, context: PyTree) -> Bool[Array, " N"]:
-        """Return which of the N segments a planning problem uses, (N,) bool; by default N = 1."""
+        """Return which of N segments a case uses, (N,) bool; by default its only one (N = 1)."""
         return jnp.ones(1, bool)
 
     def relative_excess(self, excess: Array) -> Array:
-        """Return relative excesses over limits at a plan's ends; `excess` is relative already."""
+        """Convert excesses at the segments' ends to relative ones; unchanged by default."""
         return excess
 
     def start_network(self, case: PyTree) -> StartNetwork | None:
@@ -181,7 +181,7 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
         return (together / jnp.asarray(self.scale, together.dtype)[None]).ravel()
 
     def along(self, nodes: int, case: QuadrotorCase) -> Along:
-        """Return integrand and quadrature of a segment's penalties; `nodes` intervals a piece."""
+        """Return a segment's penalties, to be integrated with `nodes` intervals in each piece."""
         return flight_along(self.maps, nodes, case, self.margin, self.hinge_width)
 
     def evaluate_ends(
@@ -191,7 +191,7 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
 
         Returns:
             Boundary rows (N, 8, 3), scaled states at both ends of the segments; mean durations of a
-            piece (N,) [s]; the cost () of time, ends, and energy without waypoint offsets; and the
+            piece (N,) [s]; the cost () of time, ends, and energy at waypoint offsets 0; and the
             greatest relative excess over the limits at the ends ().
         """
         ends = self.meet(natural, context)
@@ -208,7 +208,7 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
         return jnp.sum(jnp.where(self.active(context), values, 0.0))
 
     def objective(self, point: Float[Array, " n"], context: PyTree) -> Evaluation:
-        """Return the cost and the violation: the largest excess over a limit at the samples.
+        """Return the cost, and the violation: the largest excess over a limit at sampled times.
 
         For most quantities q the excess is q^2 / limit^2 - 1.
         """
@@ -250,7 +250,7 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
         )
 
     def decode(self, point: Float[Array, " n"], context: PyTree) -> PlanT:
-        """Return the plan at a point (n,); its violation includes peaks between the samples."""
+        """Return the plan at a point (n,); its violation includes peaks between sampled times."""
         offsets, natural = self.split(point)
         ends = self.meet(natural, context)
         durations = ends.durations / self.num_pieces

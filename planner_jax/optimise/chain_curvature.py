@@ -2,7 +2,7 @@
 
 `cost.along_curvature` differentiates the penalties along a segment by its columns (scaled boundary
 states and waypoint offsets) and by its duration. Columns and durations depend on the end variables
-(of a segment's end), and the chain rule gives the derivatives by these variables.
+(of a segment's end), and the chain rule gives the derivatives by end variables.
 """
 
 import functools
@@ -91,8 +91,6 @@ def chain_curvature(
     unit = jnp.asarray(np.eye(natural.size), natural.dtype)
     tangent = lambda unit: jax.jvp(slope, (natural.ravel(),), (unit,))  # noqa: E731
     (by_natural, _), (within, turned) = jax.vmap(tangent, out_axes=((None, None), 0))(unit)
-    # `within` (N k, N k) is the Hessian of the ends' cost, plus the penalties' gradient times the
-    # second derivatives of the boundary states. `turned` is the boundary states' Jacobian.
     dot = functools.partial(jnp.tensordot, precision=lax.Precision.HIGHEST)
     einsum = functools.partial(jnp.einsum, precision=lax.Precision.HIGHEST)
     theta_theta = of.theta_theta + power**2 * energies
@@ -127,7 +125,6 @@ def chain_curvature(
 
     by_natural = by_natural.reshape(num, -1).at[:, 0].add(of.by_theta - power * energies)
     by_offsets = of.by_columns[:, num_rows:] + bend * offsets
-    # The preconditioner inverts the Hessian of the end variables, and a diagonal for the offsets.
     strong = functools.partial(block_and_diagonal, along, num=num_rows, given=given)
     among_rows, alone = jax.vmap(strong)(of.at_samples)
     half = einsum("pnca,ncafb->pnfb", turned, among_rows)

@@ -160,7 +160,7 @@ def _optimum_at(point: Array, evaluation: Evaluation, config: Solver) -> Optimum
 
 
 def solve_round(planner: "OptimisedPlanner", attempt: Round, case: PyTree) -> PyTree:
-    """Plan one case by an attempt (round) of searches, each from the preceding search's end."""
+    """Plan one case by a round (attempt): searches, each of which starts where the last ended."""
     last = planner.with_settings(attempt.settings)
     context = last.prepare(case)
 
@@ -181,7 +181,7 @@ def solve_round(planner: "OptimisedPlanner", attempt: Round, case: PyTree) -> Py
 
 
 def solve_batch(planner: "OptimisedPlanner", attempt: Round, cases: PyTree) -> PyTree:
-    """Plan a batch by an attempt (round) of searches, each from the preceding search's end."""
+    """Plan a batch by a round (attempt): searches, each of which starts where the last ended."""
     last = planner.with_settings(attempt.settings)
     contexts = over_lanes(last.prepare)(_lanes_last(cases))
     first = planner.with_settings(attempt.all_stages[0].settings)

@@ -112,7 +112,7 @@ def is_stationary(numbers: NewtonNumbers, config: NewtonConfig) -> Array:
 
 
 def most_to_gain(numbers: NewtonNumbers, config: NewtonConfig, num: int) -> Array:
-    """Return indices (num,) of problems, unfinished first, by falling predicted decrease."""
+    """Return indices (num,) of problems, unfinished first, by falling predicted cost decrease."""
     expected = jnp.where(jnp.isnan(numbers.expected), jnp.inf, numbers.expected)
     return jnp.argsort(jnp.where(is_unfinished(numbers, config), -expected, 1.0))[:num]
 
@@ -172,7 +172,7 @@ def solve_damped(here: Curvature, damping: Array, config: NewtonConfig) -> tuple
 def _lanczos(
     gradient: Array, turned: Array, size: Array, image: Callable, num: int
 ) -> tuple[Array, list[Array], list[Array]]:
-    """Return directions (m, n) of the subspace, and the damped Hessian in it.
+    """Return directions (m, n) of a Krylov subspace, and the damped Hessian in the subspace.
 
     The subspace has m dimensions, at most `num`. The directions are orthonormal with respect to the
     matrix M whose inverse is the preconditioner. The Hessian is returned as its diagonal, m
@@ -206,7 +206,6 @@ def _lanczos(
 
 
 def _pivots(diagonal: list[Array], beside: list[Array], shift: Array) -> list[Array]:
-    """Return pivots, none near 0, of T + shift I; T has the diagonal and subdiagonal `beside`."""
     scale = functools.reduce(jnp.maximum, [jnp.abs(each) for each in (*diagonal, *beside)])
     least = _LEAST * scale + 1e-30
     found = []
@@ -248,7 +247,6 @@ def _lowest(diagonal: list[Array], beside: list[Array]) -> Array:
 
 
 def _tridiagonal_solve(diagonal: list[Array], beside: list[Array], shift: Array) -> Array:
-    """Solve (T + shift I) x = (1, 0, ..., 0); T has the diagonal and subdiagonal `beside`."""
     pivots = _pivots(diagonal, beside, shift)
     right = [jnp.ones_like(pivots[0])]
     for k in range(1, len(pivots)):
@@ -290,7 +288,7 @@ def _choose(
     damping = numbers.damping * jnp.where(moved, of_chosen(factors), config.tighten)
     predicted = decrease / jnp.maximum(jnp.abs(here.cost), 1e-30)
     # A strongly damped step is short, and predicts a small decrease also far from the optimum. The
-    # greater of this and the last prediction is kept, so that the search does not stop there.
+    # greater of this and the last predicted decrease is kept, so that the search continues.
     is_short = numbers.damping > config.trusted
     expected = jnp.where(is_short, jnp.maximum(predicted, numbers.expected), predicted)
     is_nearer = (there.cost < here.cost - slack) | (moved & (expected < 0.5 * numbers.expected))

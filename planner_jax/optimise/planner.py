@@ -70,7 +70,7 @@ class OptimisedPlanner(Planner[CaseT, PlanT], abc.ABC):
     rounds: tuple[Round, ...]  # attempts, in order
     # Number of Newton's subspace vectors. With 0 the preconditioner counts as inverse Hessian.
     subspace: ClassVar[int] = 4
-    # Default of the argument `curvature` of `pj.gradient`: "products" with the Hessian, or "whole".
+    # Default of `curvature` in `pj.gradient`: "products" with the Hessian, or the "whole" Hessian.
     adjoint: ClassVar[str] = "products"
 
     @abc.abstractmethod

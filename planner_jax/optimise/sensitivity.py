@@ -115,7 +115,7 @@ class Differentiated(OptimisedPlanner):
         return self.planner.held
 
     def divides(self, attempt: Round) -> bool:
-        """Return false: starts are not separate problems, each of which would need a gradient."""
+        """Return false: all starts of a case are one problem, so that one gradient is computed."""
         return False
 
     def objective(self, point: Array, context: _Context) -> Evaluation:

@@ -202,7 +202,7 @@ def load_round(attempt: Round, is_counted: bool) -> Round | Fixed:
 
 @cached_by_precision
 def load_stage(stage: Stage, is_counted: bool) -> Stage | Fixed:
-    """Convert a stage (one search of a round) to an argument of compiled programs."""
+    """Convert a stage (search) for compiled programs; `is_counted` is as in `load_round`."""
     stage = dataclasses.replace(stage, keep=None)
     if stage.solver.max_steps == 0:
         return Fixed(stage)

@@ -1,6 +1,6 @@
 """The set of states that a car can reach among obstacles, on a grid in space and time.
 
-The planner of interceptions takes coarse paths from this reach set as starts of its optimisation.
+Planners of interceptions (a car meets a moving target) start from coarse paths in this reach set.
 The set has one layer for each of several equally spaced times. A layer has one bit for every speed
 level, every heading bin and every cell of a square grid. The bit tells whether the car can be there
 at that time without touching a standing or moving obstacle. At a layer the speed changes by at most

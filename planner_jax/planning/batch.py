@@ -54,7 +54,7 @@ _QUIET = 1.0  # [s] least time between two progress reports of one round
 
 @dataclasses.dataclass(frozen=True)
 class Progress:
-    """Progress of one round, that is of one attempt, of `plan`; `str` formats it as one line."""
+    """Report of `plan` on the progress of an attempt (search); `str` formats it as one line."""
 
     round: int  # number of this round, counted from 1
     rounds: int  # greatest number of rounds that the planner makes
@@ -147,8 +147,8 @@ def plan_batch(
     planner, mesh = on_devices(planner, devices)
     resident, num = is_resident(cases), count_lanes(cases)
     batch = _Batch(planner, chunk, mesh, watch, is_one_cpu(mesh) and num <= FEW)
-    # One CPU shares its memory with the host. There one thread for each core plans parts of the
-    # batch, which NumPy cuts and joins: a JAX program would be compiled for every new size.
+    # On one CPU, one thread for each core plans a part of the batch. NumPy divides the batch and
+    # joins the plans, because JAX would compile a program for every new batch size.
     is_small = is_one_cpu(mesh) and num != batch.sizes(attempts[0]).next(num)
     if resident and not is_small and not planner.divides(attempts[0]):
         return batch.plan_resident(attempts, cases)

@@ -45,7 +45,7 @@ class DecidedPlanner(PlannerAround[CaseT, PlanT]):
         return self.planner.settle(cases.with_choice(choice), plan_of)
 
     def plan_by(self, drive: Drive, cases: PyTree) -> PyTree:
-        """Plan each case by `drive` with every proposed choice; return the plan of least rank."""
+        """Plan cases with each proposed choice by the loop of searches `drive`; return the best."""
         alone = cases.batch_shape == ()
         if not drive.is_pure:
             self.decision.check(cases)

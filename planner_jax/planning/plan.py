@@ -222,7 +222,7 @@ class Driver:
     def plan_again(
         self, plan_of: Callable[[PyTree], PyTree], cases: PyTree, plans: PyTree, left: PyTree
     ) -> PyTree:
-        """Plan cases with a true `left` (B,) again; return the better of a case's two plans."""
+        """Plan the cases in the mask `left` (B,) again by `plan_of`; keep the better plans."""
         if self.is_pure:
             again = lambda plans: select(plan_of(cases), plans, left)  # noqa: E731
             return lax.cond(jnp.any(left), again, lambda plans: plans, plans)

@@ -135,7 +135,7 @@ def run_per_device(mesh: Mesh, function: Callable, *specs: PartitionSpec) -> Cal
     """
     if mesh.size == 1:
         return function
-    # Each device solves its own cases, so that JAX need not check for replicated values.
+    # Each device solves its own cases, so JAX's check for replicated values (`vma`) is off.
     return jax.shard_map(
         function, mesh=mesh, in_specs=specs or LANES, out_specs=LANES, check_vma=False
     )

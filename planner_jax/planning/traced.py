@@ -48,8 +48,8 @@ _read_settings = operator.attrgetter(
     "jax_numpy_dtype_promotion",
     "jax_debug_nans",
 )
-# Calls of kernels that Pallas compiles with Triton. `jax.export` does not promise that another
-# version of JAX can run them; the digest contains the version.
+# `jax.export` by default rejects Triton kernels of Pallas, since another version of JAX may not run
+# them. Here they are allowed, since a stored program is used only by the version that stored it.
 _CHECKS = tuple(
     export.DisabledSafetyCheck.custom_call(name)
     for name in ("__gpu$xla.gpu.triton", "triton_kernel_call", "triton_kernel_call_ffi")
@@ -167,7 +167,7 @@ class _NotStoredError(Exception):
 
 
 def _folder() -> Path | None:
-    """Return the folder of stored traced programs in JAX's cache; None if this is off or remote."""
+    """Return the folder of traced programs in JAX's cache; None if the cache is off or remote."""
     chosen = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
     is_on = os.environ.get(SWITCH) != "off" and jax.config.jax_enable_compilation_cache  # type: ignore[attr-defined]
     return Path(chosen, "traced") if chosen and is_on and "://" not in str(chosen) else None

@@ -43,7 +43,7 @@ class RecoveringPlanner(PlannerAround[CaseT, PlanT]):
         )
 
     def plan_by(self, drive: Drive, cases: PyTree) -> PyTree:
-        """Return the plans of one case or of a batch, each with its recovery trajectory."""
+        """Return plans with recovery trajectories, by the loop over searches `drive`."""
         if cases.batch_shape == ():
             one = self.plan_by(drive, jax.tree.map(lambda leaf: np.asarray(leaf)[None], cases))
             return jax.tree.map(lambda leaf: leaf[0], one)

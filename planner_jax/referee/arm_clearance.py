@@ -270,8 +270,8 @@ def _least(pairs: list[_Pair], sampled: np.ndarray) -> tuple[np.ndarray, np.ndar
 
     lanes = np.arange(num_lanes)
     first = np.zeros(bounds.shape, bool)
-    # The exact distance of the entry with the lowest bound comes first. Entries whose lower bound
-    # is above this distance cannot be the least, and their exact distances are not computed.
+    # An entry is the distance of two solids at a sample. The entry with the least lower bound is
+    # computed first. Entries with a lower bound above its exact distance need no computation.
     first[lanes, bounds.argmin(axis=1)] = True
     compute(first)
     upper = distances.min(axis=1, keepdims=True) + _SLACK

@@ -53,7 +53,7 @@ def clearances(group: dict, half: np.ndarray, times: np.ndarray, poses: np.ndarr
         return hits[np.unique(of[hits], return_index=True)[1]]
 
     # Each exact distance is an upper bound of the least distance. Pairs of a time and a polygon
-    # whose lower bound is above it are excluded, first by circles, then by the polygon's edges.
+    # with a greater lower bound are excluded: by enclosing circles, then by the polygon's edges.
     lanes = np.arange(num_lanes)
     sample, which = np.divmod(apart.reshape(num_lanes, num_samples * num).argmin(axis=1), num)
     upper = exact(lanes, sample, which) + _SLACK

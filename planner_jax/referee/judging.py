@@ -29,7 +29,7 @@ class Verdict:
     # `{time}`, `{excess}` and any field of the verdict. The limits are tested in this order, and
     # `failed_limit` is the first limit whose test fails.
     SENTENCES: ClassVar[dict[str, str]]
-    # For some limits by name, a sentence that describes an infinite excess, instead of the above.
+    # For some limits by name, a sentence that replaces `SENTENCES` if the excess is infinite.
     UNBOUNDED: ClassVar[dict[str, str]] = {}
 
     success: np.ndarray  # (B,) bool, whether the plan keeps every limit

@@ -121,7 +121,7 @@ def check_coeffs(value: ArrayLike) -> np.ndarray:
 
 
 def read_flight(cases, plans) -> dict[str, np.ndarray]:
-    """Read trajectories, limits, gravity and recovery as arrays by name, as "limits.speed"."""
+    """Read trajectories, limits, gravity and recovery as arrays by names like "limits.speed"."""
     coeffs = check_coeffs(plans.trajectory.coeffs)
     num_lanes, num_pieces = coeffs.shape[:2]
     leaves = {"lane": np.arange(num_lanes), "coeffs": coeffs}
@@ -195,12 +195,6 @@ _MEASURES = {
 
 
 def _tops(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Find each trajectory's greatest sample, and the sample nearest to the highest maximum.
-
-    `values` (N, M, S) are S samples of M pieces of N trajectories, and are overwritten. Returns
-    arrays (N,): the index of the greatest of the M * S samples; its value; and the index of the
-    middle sample of the parabola, through three neighbours, with the highest vertex.
-    """
     line, rows = values.ravel(), flat(values)
     top = rows.argmax(axis=1)
     greatest = rows[np.arange(len(rows)), top]

@@ -94,7 +94,7 @@ def _joint_rotations(arm: Arm, angles: Array) -> Array:
     x, y, z = axis[:, 0], axis[:, 1], axis[:, 2]
     none = jnp.zeros_like(x)
     cross = jnp.stack([none, -z, y, z, none, -x, -y, x, none], axis=-1).reshape(6, 3, 3)
-    # These two matrices do not depend on the angles, so `vmap` over angles computes them only once.
+    # `along` and `across` do not depend on the angles: `vmap` over angles computes them only once.
     along = product(turn, axis[:, :, None] * axis[:, None, :])
     across = product(turn, cross)
     cos, sin = jnp.cos(angles)[:, None, None], jnp.sin(angles)[:, None, None]
