@@ -81,8 +81,8 @@ class Settings:
 
 
 # The fastest settings of three kinds of search, among settings whose cost is within 0.1 % of the
-# published cost on at least 98 % of the throws. Tests require only 97 %, because another processor
-# may round differently.
+# published planner's cost on at least 98 % of the throws. Tests require only 97 %, because another
+# processor may round differently.
 SEARCHES = {
     "C++, own L-BFGS, one core, double": Settings(
         memory=48, past=5, delta=8e-7, decrease=0.01, curvature=0.5,

@@ -159,8 +159,10 @@ class Oracle:
         return finding
 
     def _refine(self, case: HitCase, values: dict, coarse: np.ndarray, finding: Finding) -> float:
-        """Divide each piece of the solution `coarse` into two, solve again, and return the excess.
+        """Divide each piece of the solution `coarse` into two, and solve the program again.
 
+        The result is the greatest relative excess of the new solution over a limit; it is infinite
+        if the solver does not converge.
         If the trajectory exceeds limits between samples, the limits on these pieces are tightened,
         and the program is solved again: at most five times, or until the referee (an independent
         check) accepts the hit. The result is stored in `finding`.

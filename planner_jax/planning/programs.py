@@ -144,8 +144,8 @@ def run_per_device(mesh: Mesh, function: Callable, *specs: PartitionSpec) -> Cal
 def place_lanes(tree: PyTree, mesh: Mesh) -> PyTree:
     """Return the tree with its lanes (cases) divided equally among the devices of a mesh.
 
-    The arrays are committed to these devices, as the plans of `Stored` programs are: JAX compiles
-    another program for uncommitted arrays.
+    The arrays are committed to these devices, so that all attempts of a call of `plan` share
+    compiled programs: JAX compiles another program for uncommitted arrays.
     """
     target = lane_sharding(mesh)
 
