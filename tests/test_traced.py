@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import os
+from concurrent.futures import ThreadPoolExecutor
 
 import jax
 import jax.numpy as jnp
@@ -58,6 +59,14 @@ def test_a_stored_program_gives_the_same_results_and_is_not_traced(folder):
     assert first["pair"].name == again["pair"].name == "two"
     np.testing.assert_array_equal(again["sum"], [1.0, 2.0, 3.0])
     np.testing.assert_array_equal(again["pair"].left, first["pair"].left)
+
+
+def test_threads_that_call_at_once_share_one_program(folder):
+    stored = traced.Stored(scale)
+    with ThreadPoolExecutor(4) as pool:
+        found = pool.map(lambda _: stored("cpu", None, NUMBERS, PAIR)["sum"], range(4))
+        np.testing.assert_array_equal(list(found), np.tile([1.0, 2.0, 3.0], (4, 1)))
+    assert len(traces) == 1
 
 
 @pytest.mark.parametrize(

@@ -95,13 +95,14 @@ class Stored:
 
     def __init__(self, function: Callable[..., PyTree], options: Any = None) -> None:
         self._function, self._options = function, options
-        self._load = functools.cache(self._load_once)
+        self._load, self._lock = functools.cache(self._load_once), threading.Lock()
 
     def __call__(self, platform: str, static: Hashable, *trees: PyTree) -> PyTree:
         """Return `function(static, *trees)`; the trees are arrays on a device of the platform."""
         leaves, tree = jax.tree.flatten(trees)
         layout = tuple([jax.typeof(leaf) for leaf in leaves])
-        run, results = self._load(platform, static, tree, layout, settings())
+        with self._lock:  # threads that start together share one program
+            run, results = self._load(platform, static, tree, layout, settings())
         found = run(*leaves)  # the first call may trace, which sets `results`
         return jax.tree.unflatten(results.tree, found)
 
