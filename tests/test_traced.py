@@ -104,6 +104,8 @@ def test_the_digest_of_the_library_changes_with_a_file(monkeypatch, tmp_path):
     (tmp_path / "inner").mkdir()
     file = tmp_path / "inner" / "module.py"
     file.write_text("x = 1\n")
+    os.utime(file, (2, 2))
+    (tmp_path / "link").symlink_to("nowhere")
     before = digest()
     assert digest() == before
     os.utime(file, ns=(1, 1))
@@ -132,6 +134,29 @@ def test_what_another_package_or_a_local_function_makes_is_not_stored(folder, mo
     call(static=Word("a class that may mean anything"))
     monkeypatch.setattr(traced, "_PACKAGE", "planner_jax")
     np.testing.assert_array_equal(call()["sum"], [1.0, 2.0, 3.0])
+    assert files(folder) == []
+
+
+def test_nothing_is_stored_after_a_file_of_the_library_changed(folder, monkeypatch, tmp_path):
+    monkeypatch.setattr(traced, "_FILES", tmp_path)
+    monkeypatch.setattr(traced, "_library_digest", traced._library_digest.__wrapped__)
+    tmp_path.joinpath("module.py").touch()
+    np.testing.assert_array_equal(call()["sum"], [1.0, 2.0, 3.0])
+    assert files(folder) == []
+
+
+class Odd(tuple):
+    """A static value whose `repr` no process can read."""
+
+    __repr__ = object.__repr__
+
+
+def make_odd(static, numbers: jax.Array, pair: Pair):
+    return Pair(numbers, None, Odd())
+
+
+def test_results_that_json_cannot_describe_are_not_stored(folder):
+    assert call(function=make_odd).name == Odd()
     assert files(folder) == []
 
 

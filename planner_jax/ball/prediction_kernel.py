@@ -15,7 +15,7 @@ from jax import Array
 from jax.typing import ArrayLike
 
 from planner_jax.ball.flight import BallState, rk4_step
-from planner_jax.lanes.kernels import Treedef
+from planner_jax.core.compiled import Treedef
 from planner_jax.lanes.pallas import block_width, kernel_by_lanes
 
 _THREADS = 32  # greatest number of threads (balls) in one GPU block

@@ -16,12 +16,14 @@ import numpy as np
 from jax.extend.backend import backends
 
 Settings = TypeVar("Settings")
+Options = dict[str, bool]  # options of XLA with which a program is compiled
+Treedef = Any  # a PyTreeDef, whose class JAX hides from type checkers
 
 _RUN_TIME: set[type] = set()
 # Before version 0.11 of JAX, XLA also has an older code generator for CPUs. It needs 40 % less time
 # to compile. Its programs for a hit or catch are as fast, and steps of an arm in MJX far faster.
 _IS_OLD = jax.__version_info__ < (0, 11)
-QUICK_OPTIONS: Any = {"xla_cpu_use_fusion_emitters": False} if _IS_OLD else {}
+QUICK_OPTIONS: Options = {"xla_cpu_use_fusion_emitters": False} if _IS_OLD else {}
 
 
 def with_run_time_numbers(*names: str) -> Callable[[type[Settings]], type[Settings]]:
@@ -73,7 +75,7 @@ def cached_by_precision(load: Callable[..., Settings]) -> Callable[..., Settings
     The function's arguments must be hashable. Results in float32 and float64 are cached separately.
     """
 
-    def place(leaf: Any) -> jax.Array:
+    def place(leaf: float) -> jax.Array:
         is_whole = isinstance(leaf, int) and not isinstance(leaf, bool)
         return jax.device_put(np.int32(leaf) if is_whole else leaf)
 

@@ -19,9 +19,9 @@ from jax import Array, Ref
 from jaxtyping import PyTree
 
 from planner_jax.core.arithmetic import reciprocal
+from planner_jax.core.compiled import Treedef
 from planner_jax.cost.along import Along
 from planner_jax.cost.penalty import smooth_hinge
-from planner_jax.lanes.kernels import Treedef
 from planner_jax.lanes.pallas import Block, block_width, grid_index, kernel_call
 from planner_jax.trajectory.polynomial import Motion
 

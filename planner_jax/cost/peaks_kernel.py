@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, Ref
 
+from planner_jax.core.compiled import Treedef
 from planner_jax.cost.along import Along
 from planner_jax.cost.along_kernel import (
     Grid,
@@ -23,7 +24,6 @@ from planner_jax.cost.along_kernel import (
     unit_motion,
 )
 from planner_jax.cost.penalty import peak_above
-from planner_jax.lanes.kernels import Treedef
 from planner_jax.lanes.pallas import grid_index
 
 

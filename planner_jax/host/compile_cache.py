@@ -21,6 +21,14 @@ def cache_folder() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser(usual), "planner-jax", "jax")
 
 
+def is_on() -> bool:
+    """Return whether neither PLANNER_JAX_CACHE=off nor an option of JAX disables the cache."""
+    import jax
+
+    enabled = jax.config.jax_enable_compilation_cache  # type: ignore[attr-defined]
+    return os.environ.get(SWITCH) != "off" and enabled
+
+
 @functools.cache
 def keep_compiled_programs() -> Path | None:
     """Let JAX write compiled programs to a folder on the disk and read them from there.
@@ -37,7 +45,7 @@ def keep_compiled_programs() -> Path | None:
     import jax
 
     chosen = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
-    if os.environ.get(SWITCH) != "off" and jax.config.jax_enable_compilation_cache:  # type: ignore[attr-defined]
+    if is_on():
         # If JAX cannot read or write a file of the cache, it compiles the program: not an error.
         warnings.filterwarnings("ignore", "Error (reading|writing) persistent compilation cache")
         if chosen is None:

@@ -21,19 +21,19 @@ from jax import Array
 from jax.extend.core import JaxprEqn
 
 from planner_jax.core.choices import require_one_of
+from planner_jax.core.compiled import Treedef
 
 SWITCH = "PLANNER_JAX_KERNELS"
 
 Results = TypeVar("Results")
 Shape = tuple[int, ...]
-Treedef = Any  # a PyTreeDef, whose class JAX hides from type checkers
 # A kernel takes the leaves of a function's arguments, with the lanes (problems) on the last axis.
 # It returns the leaves of the results, or None if it does not support the leaves' shapes or types.
 Kernel = Callable[[Sequence[Array]], Sequence[Array] | None]
 
 
 class Kernels(enum.Enum):
-    """Whether programs use the library's own CUDA kernels; the values are texts for users."""
+    """State whether programs use the library's own CUDA kernels; users read the values as texts."""
 
     ON = "on"
     OFF = f"off, by {SWITCH}"

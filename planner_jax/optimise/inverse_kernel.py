@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 import jax.numpy as jnp
 from jax import Array
 
-from planner_jax.lanes.kernels import Treedef
+from planner_jax.core.compiled import Treedef
 from planner_jax.lanes.pallas import block_width, kernel_by_lanes
 
 _THREADS = 32  # threads of a block, one for each matrix

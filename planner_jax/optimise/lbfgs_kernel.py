@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array, Ref
 
-from planner_jax.lanes.kernels import Treedef
+from planner_jax.core.compiled import Treedef
 from planner_jax.lanes.pallas import block_width, kernel_by_lanes, load_masked, store_masked
 from planner_jax.optimise.lbfgs import shortening, start_scale, weigh_pair
 

@@ -11,7 +11,6 @@ import dataclasses
 import functools
 import math
 from collections.abc import Callable, Hashable, Iterator, Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -20,11 +19,11 @@ from jax import Array
 from jax.sharding import Mesh, NamedSharding, PartitionSpec, Sharding, SingleDeviceSharding
 from jaxtyping import PyTree
 
-from planner_jax.core.compiled import QUICK_OPTIONS, Fixed, trace_for
+from planner_jax.core.compiled import QUICK_OPTIONS, Fixed, Options, trace_for
 from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import Attempt, is_unsolved, mark_bad_input
 from planner_jax.core.rules import require_shapes
-from planner_jax.planning.traced import Results, Stored, load_or_trace, settings
+from planner_jax.planning.traced import Layout, Results, Stored, load_or_trace, settings
 
 # Numbers of lanes (cases) that a device solves in one call. Each number needs its own program.
 BUCKETS = (16, 128, 1024, 8192, 65536)
@@ -160,7 +159,7 @@ def place_lanes(tree: PyTree, mesh: Mesh) -> PyTree:
 
 # XLA would try its own kernels for every matrix product, which takes a third of the compile time
 # on a GPU, while cuBLAS is as fast for these products. On a CPU the option has no effect.
-COMPILER_OPTIONS: Any = {"xla_gpu_enable_triton_gemm": False}
+COMPILER_OPTIONS: Options = {"xla_gpu_enable_triton_gemm": False}
 # With `QUICK_OPTIONS` programs compile some seconds faster, but batches, and loops over cases, run
 # about 10 % longer. For batches of up to `FEW` cases the options save time.
 FEW = 256
@@ -187,7 +186,7 @@ class PerDevice:
     programs of a single device are stored on the disk.
     """
 
-    def __init__(self, function: Callable[..., PyTree], options: Any) -> None:
+    def __init__(self, function: Callable[..., PyTree], options: Options) -> None:
         self._function = function
         self._alone = Stored(function, options)
         self._together = jax.jit(
@@ -313,7 +312,7 @@ def _program(
     static: Hashable,
     own_tree: PyTree,
     tree: PyTree,
-    own: Sequence[Any],
+    own: Layout,
     layout: Sequence[tuple[tuple[int, ...], np.dtype]],
     compiles_quickly: bool,
     _: tuple,
@@ -334,7 +333,7 @@ def _program(
         return jnp.concatenate([leaf.ravel().astype(dtype) for leaf in results.flatten(found)])
 
     options = QUICK_OPTIONS if compiles_quickly else None
-    shapes = *own, jax.typeof(np.zeros(ends[-1], dtype))
+    shapes = *own, jax.ShapeDtypeStruct((int(ends[-1]),), dtype)
     identity = function, static, own_tree, tree, layout
     platform = jax.default_backend()
     compiled = load_or_trace(run, shapes, identity, results, platform, options)

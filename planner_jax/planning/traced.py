@@ -19,6 +19,8 @@ import operator
 import os
 import sys
 import threading
+import time
+import types
 from collections.abc import Callable, Hashable, Sequence
 from importlib import metadata
 from pathlib import Path
@@ -28,17 +30,19 @@ import jax
 import numpy as np
 from jax import Array, export
 from jax.extend.backend import backends
-from jax.tree_util import default_registry
+from jax.stages import Wrapped
+from jax.tree_util import PyTreeDef, default_registry
 from jaxtyping import PyTree
 
-from planner_jax.core.compiled import trace_for
-from planner_jax.host.compile_cache import SWITCH
+from planner_jax.core.compiled import Options, Treedef, trace_for
+from planner_jax.host.compile_cache import is_on
 
-Treedef = Any  # a PyTreeDef, whose class JAX hides from type checkers
-_TREEDEF: Any = type(jax.tree.structure(0))
+_LEAF, _NONE = map(jax.tree.structure, (0, None))
 MOST = 300  # number of stored programs above which the oldest are deleted; each has about 0.5 MB
 _PACKAGE = __name__.partition(".")[0]
 _FILES = Path(__file__).resolve().parents[1]
+_STARTED = time.time()  # [s], about the time when this process read the library's files
+Layout = Sequence[Any]  # shapes and types of arrays, as `jax.typeof` returns them
 # Settings of JAX that can change the program to which a function is traced.
 _read_settings = operator.attrgetter(
     "jax_enable_x64",
@@ -74,7 +78,11 @@ class Results:
     def to_json(self) -> list:
         """Return a description that JSON can write; raise `_NotStoredError` if there is none."""
         described = _tree_to_json(self.tree)
-        if _tree_from_json(described) != self.tree:
+        try:
+            same = _tree_from_json(described) == self.tree
+        except (ValueError, SyntaxError):  # static values whose `repr` is no literal
+            same = False
+        if not same:
             raise _NotStoredError
         return [described, self.shapes, [dtype.name for dtype in self.dtypes]]
 
@@ -93,7 +101,7 @@ class Stored:
     which is compiled for one device of the kind `platform`, "cpu" for example.
     """
 
-    def __init__(self, function: Callable[..., PyTree], options: Any = None) -> None:
+    def __init__(self, function: Callable[..., PyTree], options: Options | None = None) -> None:
         self._function, self._options = function, options
         self._load, self._lock = functools.cache(self._load_once), threading.Lock()
 
@@ -107,7 +115,7 @@ class Stored:
         return jax.tree.unflatten(results.tree, found)
 
     def _load_once(
-        self, platform: str, static: Hashable, tree: Treedef, layout: Sequence, _: Hashable
+        self, platform: str, static: Hashable, tree: Treedef, layout: Layout, _: Hashable
     ) -> tuple[Callable[..., list[Array]], Results]:
         results = Results()
 
@@ -122,17 +130,17 @@ class Stored:
 
 def load_or_trace(
     run: Callable[..., PyTree],
-    layout: Sequence[Any],
+    layout: Layout,
     identity: tuple,
     results: Results,
     platform: str,
-    options: Any,
+    options: Options | None,
 ) -> Callable[..., PyTree]:
     """Return a compiled function, whose program is read from the disk or stored there.
 
     Args:
         run: pure function of arrays. While it is traced, it calls `results.flatten`.
-        layout: shapes and types of its arguments, as `jax.typeof` returns them.
+        layout: shapes and types of its arguments.
         identity: all that determines the function beside the library's files; any nested tuple.
         results: description of the results; it is complete when the returned function has run.
         platform: the only platform on which the returned function runs.
@@ -170,11 +178,10 @@ class _NotStoredError(Exception):
 def _folder() -> Path | None:
     """Return the folder of traced programs in JAX's cache; None if the cache is off or remote."""
     chosen = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
-    is_on = os.environ.get(SWITCH) != "off" and jax.config.jax_enable_compilation_cache  # type: ignore[attr-defined]
-    return Path(chosen, "traced") if chosen and is_on and "://" not in str(chosen) else None
+    return Path(chosen, "traced") if chosen and is_on() and "://" not in str(chosen) else None
 
 
-def _export(function: Any, layout: Sequence[Any], platform: str) -> bytes:
+def _export(function: Wrapped, layout: Layout, platform: str) -> bytes:
     shapes = [
         jax.ShapeDtypeStruct(each.shape, each.dtype, weak_type=each.weak_type) for each in layout
     ]
@@ -194,14 +201,16 @@ def _read(path: Path, results: Results) -> bytes | None:
         if described["sha256"] != hashlib.sha256(content).hexdigest():
             return None
         results.load_json(described["results"])
-        os.utime(path)  # the programs that were used last are kept
-    except (OSError, ValueError, LookupError, AttributeError, TypeError):
+    except (OSError, ValueError, SyntaxError, LookupError, AttributeError, TypeError):
         return None
+    with contextlib.suppress(OSError):  # a folder that cannot be written
+        os.utime(path)  # the programs that were used last are kept
     return content
 
 
 def _write(path: Path, content: bytes, results: Results) -> None:
     described = {"sha256": hashlib.sha256(content).hexdigest(), "results": results.to_json()}
+    # No flush to the disk, as `host.files` has: a damaged file is traced again.
     with contextlib.suppress(OSError):  # a folder that cannot be written
         path.parent.mkdir(parents=True, exist_ok=True)
         scratch = path.with_name(f"{path.name}.{os.getpid()}.{threading.get_ident()}")
@@ -213,7 +222,7 @@ def _write(path: Path, content: bytes, results: Results) -> None:
             oldest.unlink()
 
 
-def _digest(identity: tuple, layout: Sequence[Any], platform: str) -> str:
+def _digest(identity: tuple, layout: Layout, platform: str) -> str:
     device = jax.devices(platform)[0].device_kind
     versions = jax.__version__, metadata.version("jaxlib"), np.__version__, sys.version_info[:3]
     switches = sorted(pair for pair in os.environ.items() if pair[0].startswith("PLANNER_JAX_"))
@@ -225,12 +234,20 @@ def _digest(identity: tuple, layout: Sequence[Any], platform: str) -> str:
 
 @functools.cache
 def _library_digest() -> str:
-    """Return a digest of the names, sizes and times of change of all files of the library."""
+    """Return a digest of the names, sizes and times of change of all files of the library.
+
+    After a change of a file, this process may still run the old code. It then stores nothing.
+    """
     digest = hashlib.sha256()
     for folder, folders, names in os.walk(_FILES, followlinks=True):
         folders[:] = sorted(each for each in folders if each != "__pycache__")
         for name in sorted(names):
-            found = os.stat(os.path.join(folder, name))
+            path = os.path.join(folder, name)
+            if not os.path.exists(path):
+                continue  # a link to nowhere, as editors make
+            found = os.stat(path)
+            if found.st_mtime > _STARTED:
+                raise _NotStoredError
             digest.update(f"{folder} {name} {found.st_size} {found.st_mtime_ns}\n".encode())
     return digest.hexdigest()
 
@@ -239,11 +256,11 @@ def _describe(value: Any) -> str:
     """Describe a static value as a text that is the same in every process."""
     if value is None or type(value) in (bool, int, float, complex, str, bytes, range):
         return repr(value)
-    if isinstance(value, _TREEDEF):
-        if value.num_nodes == 1 and value.num_leaves == 1:
+    if isinstance(value, PyTreeDef):
+        if value == _LEAF:
             return "leaf"
         return _describe((*value.node_data(), *value.children()))
-    if isinstance(value, type) or (callable(value) and type(value) is type(_describe)):
+    if isinstance(value, type | types.FunctionType):
         return _name_of(value)
     name = _name_of(type(value))
     if isinstance(value, enum.Enum):
@@ -261,7 +278,7 @@ def _describe(value: Any) -> str:
     raise _NotStoredError
 
 
-def _name_of(thing: Any) -> str:
+def _name_of(thing: type | types.FunctionType) -> str:
     module, name = thing.__module__, thing.__qualname__
     if module.partition(".")[0] not in (_PACKAGE, "builtins", "numpy", "jax", "jaxlib"):
         raise _NotStoredError
@@ -277,9 +294,9 @@ def _name_of(thing: Any) -> str:
 
 
 def _tree_to_json(tree: Treedef) -> list | None:
-    if tree == jax.tree.structure(None):
+    if tree == _NONE:
         return None
-    if tree == jax.tree.structure(0):
+    if tree == _LEAF:
         return []
     kind, fixed = tree.node_data()
     _name_of(kind)
@@ -293,8 +310,8 @@ def _tree_to_json(tree: Treedef) -> list | None:
 
 def _tree_from_json(described: list | None) -> Treedef:
     if not described:
-        return jax.tree.structure(0 if described == [] else None)
+        return _LEAF if described == [] else _NONE
     module, name, fixed, children = described
     node = operator.attrgetter(name)(sys.modules[module]), ast.literal_eval(fixed)
     trees = [_tree_from_json(each) for each in children]
-    return _TREEDEF.from_node_data_and_children(default_registry, node, trees)
+    return PyTreeDef.from_node_data_and_children(default_registry, node, trees)
