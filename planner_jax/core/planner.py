@@ -27,7 +27,7 @@ PlanT = TypeVar("PlanT", bound=Plan)
 
 
 class Kind(enum.Enum):
-    """How a planner makes plans: by a compiled function, on the host, or by other planners."""
+    """Name the method by which a planner makes plans; a planner implements one of the three."""
 
     COMPILED = "compiled"  # `solve`, a pure function of one case
     HOST = "host"  # `solve_on_host`, a function of a batch of NumPy arrays

@@ -160,7 +160,11 @@ def _optimum_at(point: Array, evaluation: Evaluation, config: Solver) -> Optimum
 
 
 def solve_round(planner: "OptimisedPlanner", attempt: Round, case: PyTree) -> PyTree:
-    """Plan one case by a round (attempt): searches, each of which starts where the last ended."""
+    """Plan one case by the searches of a round (attempt), one after another.
+
+    The first search starts at the planner's first guess. Each later search starts at the point
+    where the search before it ended.
+    """
     last = planner.with_settings(attempt.settings)
     context = last.prepare(case)
 
@@ -181,7 +185,7 @@ def solve_round(planner: "OptimisedPlanner", attempt: Round, case: PyTree) -> Py
 
 
 def solve_batch(planner: "OptimisedPlanner", attempt: Round, cases: PyTree) -> PyTree:
-    """Plan a batch by a round (attempt): searches, each of which starts where the last ended."""
+    """Plan each case of a batch as `solve_round` does, all cases together."""
     last = planner.with_settings(attempt.settings)
     contexts = over_lanes(last.prepare)(_lanes_last(cases))
     first = planner.with_settings(attempt.all_stages[0].settings)

@@ -168,7 +168,7 @@ class Round(Attempt):
 
     @property
     def is_divided(self) -> bool:
-        """Whether the search from each starting point of a case is a separate problem of the batch.
+        """Return whether each search of a case, from one starting point, is a problem of its own.
 
         This is so for several starting points, for starting points other than the first guess, and
         if `settings` changes fields of the planner. Rounds (attempts) with equal `settings` then

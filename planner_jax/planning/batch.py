@@ -96,7 +96,7 @@ class Watch:
 
     @property
     def waits(self) -> bool:
-        """Whether the host waits for each compiled call, for a time limit or progress reports."""
+        """Return whether the host waits for each call, as a time limit or progress reports need."""
         return self._limit is not None or self._progress is not None
 
     @property

@@ -1,4 +1,6 @@
-"""Quadrotors by name: those of [Yu2023catch] and [Yu2023bat], a Crazyflie, a racer and an X500.
+"""Define the quadrotors that users select by name, such as the robots of [Yu2023catch].
+
+They are the robots of [Yu2023catch] and [Yu2023bat], a Crazyflie, a racer and an X500.
 
 Numbers without a source are assumptions; the field `source` of a robot lists them. All tools are
 massless. All limits, and the tools of Crazyflie, racer and X500, are assumptions.

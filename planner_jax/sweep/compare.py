@@ -116,8 +116,8 @@ def difference_of(first: ComparedRun, other: ComparedRun) -> Difference:
     mine = int((first.success & ~other.success).sum())
     theirs = int((other.success & ~first.success).sum())
     apart, num = mine + theirs, len(first.success)
-    # If both runs solve the same cases, their difference is 0. Its bounds are then +- the upper end
-    # of Clopper-Pearson's interval for a rate of which no event was seen in all `num` cases.
+    # If both runs solve the same cases, their difference is 0. The runs then differ in 0 of `num`
+    # cases. The Clopper-Pearson interval of this rate ends at `reach`, which bounds the difference.
     if not apart:
         reach = float(binomtest(0, num).proportion_ci(0.95, "exact").high)
         return Difference(change, -reach, reach, mine, theirs, 1.0)
