@@ -14,6 +14,7 @@ from typing import Any, TypeVar
 import jax
 import numpy as np
 from jax.extend.backend import backends
+from jax.typing import ArrayLike
 
 Settings = TypeVar("Settings")
 Options = dict[str, bool]  # options of XLA with which a program is compiled
@@ -75,7 +76,7 @@ def cached_by_precision(load: Callable[..., Settings]) -> Callable[..., Settings
     The function's arguments must be hashable. Results in float32 and float64 are cached separately.
     """
 
-    def place(leaf: float) -> jax.Array:
+    def place(leaf: ArrayLike) -> jax.Array:
         is_whole = isinstance(leaf, int) and not isinstance(leaf, bool)
         return jax.device_put(np.int32(leaf) if is_whole else leaf)
 
