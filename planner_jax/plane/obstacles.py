@@ -8,9 +8,10 @@ from flax import struct
 from jax import Array
 from jax.typing import ArrayLike
 
-from planner_jax.core.checks import floating, numeric, shape_of
+from planner_jax.core.checks import floating, shape_of
 from planner_jax.core.choices import require
 from planner_jax.core.errors import ArgumentError, ArgumentTypeError
+from planner_jax.plane.polygons import Geometry, convex_parts
 
 _COUNTS = (16, 32, 64)  # numbers of entries of `obstacles`; then multiples of the last
 _CORNERS = 8  # least number of corners of an entry of `obstacles`; then its doubles
@@ -43,29 +44,35 @@ def obstacles(
     Cases whose arrays have equal sizes share a compiled program.
 
     Args:
-        polygons: a sequence with an array of corners (V, 2) [m] at time 0 for each obstacle. Each
-            obstacle is convex and has its own number V of corners, in either orientation.
+        polygons: a sequence with one polygon for each obstacle, at time 0: an array of corners
+            (V, 2) [m], in either orientation, or a geometry of Shapely of the type Polygon or
+            MultiPolygon, with or without holes. Each has its own number V of corners. A polygon
+            that is not convex becomes several entries, its convex parts, with equal velocities.
+            One geometry alone is one obstacle.
         velocities: (2,) [m/s] for all obstacles, or (N, 2), one for each of N obstacles.
         dtype: floating type of the arrays.
 
     Raises:
         TypeError: an argument has a wrong type.
-        ValueError: a polygon is empty or not convex. The message names the polygon, and proposes
-            to divide it into convex parts.
+        ValueError: a polygon has no area, or its edges cross. The message names the polygon.
     """
     dtype = floating(dtype)
+    if isinstance(polygons, Geometry):
+        polygons = [polygons]
     if isinstance(polygons, str) or not isinstance(polygons, Sequence | np.ndarray):
-        raise ArgumentTypeError("polygons", "a sequence of corners (V, 2)", polygons)
-    checked = [_check_polygon(k, corners) for k, corners in enumerate(polygons)]
+        raise ArgumentTypeError("polygons", "a sequence of polygons", polygons)
+    parts = [convex_parts("polygons", polygon, k) for k, polygon in enumerate(polygons)]
+    checked = [part for each in parts for part in each]
     num, most = len(checked), max((len(each) for each in checked), default=3)
     num = next((count for count in _COUNTS if num <= count), -(-num // _COUNTS[-1]) * _COUNTS[-1])
     size = max(_CORNERS, 1 << (most - 1).bit_length())
     shape = shape_of("velocities", velocities)
-    if shape not in ((), (2,), (len(checked), 2)):
-        rule = f"the shape (2,) or ({len(checked)}, 2)"
+    if shape not in ((), (2,), (len(parts), 2)):
+        rule = f"the shape (2,) or ({len(parts)}, 2)"
         raise ArgumentError("velocities", rule, shape, verb="have")
     require(bool(np.isfinite(np.asarray(velocities)).all()), "velocities", "finite", velocities)
-    speeds = np.broadcast_to(np.asarray(velocities, float), (len(checked), 2))
+    speeds = np.broadcast_to(np.asarray(velocities, float), (len(parts), 2))
+    speeds = speeds.repeat([len(each) for each in parts], axis=0)
     centre, velocity = np.zeros((num, 2)), np.zeros((num, 2))
     corners = np.zeros((num, size, 2))
     for k, polygon in enumerate(checked):
@@ -77,30 +84,6 @@ def obstacles(
         velocity=jnp.asarray(velocity, dtype),
         present=jnp.asarray(np.arange(num) < len(checked)),
     )
-
-
-def _check_polygon(k: int, corners: object) -> np.ndarray:
-    if numeric(corners) is None:
-        raise ArgumentTypeError("polygons", "corners of numbers", corners, k, verb="have")
-    polygon = np.asarray(corners, float)
-    if polygon.ndim != 2 or polygon.shape[1:] != (2,) or len(polygon) < 3:
-        raise ArgumentError("polygons", "corners (V, 2), V >= 3", polygon.shape, k, verb="have")
-    if not np.isfinite(polygon).all():
-        raise ArgumentError("polygons", "finite", polygon, k)
-    edges = np.roll(polygon, -1, axis=0) - polygon
-    after = np.roll(edges, -1, axis=0)
-    turns = edges[:, 0] * after[:, 1] - edges[:, 1] * after[:, 0]
-    area = 0.5 * np.sum(polygon[:, 0] * np.roll(polygon[:, 1], -1))
-    area -= 0.5 * np.sum(polygon[:, 1] * np.roll(polygon[:, 0], -1))
-    if abs(area) < 1e-9:
-        raise ArgumentError("polygons", "an area", 0, k, verb="have")
-    if area < 0.0:
-        polygon, turns = polygon[::-1], -turns
-    if (turns < -1e-9).any():
-        rule = "convex: cut it into convex parts, such as the triangles of scipy.spatial.Delaunay"
-        rule += " whose centres lie inside, and give each as one"
-        raise ArgumentError("polygons", rule, index=k, shown="")
-    return polygon
 
 
 def distances(

@@ -105,7 +105,7 @@ def case(
 
     Raises:
         TypeError: an argument has a wrong type, or `pj.intercept.case` has no such argument.
-        ValueError: a number breaks a rule, a shape is wrong, or an obstacle is not convex.
+        ValueError: a number breaks a rule, a shape is wrong, or edges of an obstacle cross.
     """
     scalars = [settings.get(name, 0.0) for name in ("initial_speed", "tolerance")]
     shapes = [np.shape(time), np.shape(settings.get("start", 0.0))[:-1], *map(np.shape, scalars)]

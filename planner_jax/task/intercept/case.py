@@ -18,6 +18,7 @@ from planner_jax.core.checks import floating, require_path, shape_of
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.rules import Field, Table, require_sound
 from planner_jax.plane.obstacles import Obstacles, obstacles
+from planner_jax.plane.polygons import Geometry, Polygon
 from planner_jax.plane.target import PlanePath
 from planner_jax.robot.car import CarBody, CarLimits
 from planner_jax.task.arguments import array_of, batch_of
@@ -96,8 +97,8 @@ def case(
     start: ArrayLike = (0.8, 4.0, 0.0),
     initial_speed: ArrayLike = 0.5,
     initial_curvature: ArrayLike = 0.0,
-    walls: Sequence[ArrayLike] | Obstacles = (),
-    movers: Sequence[ArrayLike] | Obstacles = (),
+    walls: Sequence[Polygon] | Geometry | Obstacles = (),
+    movers: Sequence[Polygon] | Geometry | Obstacles = (),
     mover_velocities: ArrayLike = 0.0,
     tolerance: ArrayLike = 0.05,
     end_heading: ArrayLike | None = None,
@@ -127,8 +128,9 @@ def case(
         start: (3,) x, y of the rear axle's middle [m], and heading [rad], at time 0.
         initial_speed: [m/s], speed at time 0.
         initial_curvature: [1/m], curvature of the rear axle's path at time 0.
-        walls: static obstacles: convex polygons with V corners (V, 2) [m], which all cases share;
-            or `Obstacles` with the batch's axes on every leaf.
+        walls: static obstacles: polygons with V corners (V, 2) [m], or geometries of Shapely, which
+            all cases share; or `Obstacles` with the batch's axes on every leaf. Polygons need not
+            be convex, since `pj.obstacles` cuts them into convex parts.
         movers: moving obstacles at time 0, as polygons or `Obstacles`, like the walls.
         mover_velocities: (2,) or (N, 2) [m/s], of the N polygons in `movers`.
         tolerance: [m], greatest distance of the body's middle from the target at the meeting.
@@ -148,7 +150,7 @@ def case(
         dtype: type of every floating leaf.
 
     Raises:
-        ValueError: a polygon is not convex, or an array has a wrong shape or an invalid value.
+        ValueError: the edges of a polygon cross, or an array has a wrong shape or an invalid value.
     """
     dtype, shapes = floating(dtype), [batch_of("start", start, 3)]
     scalars = {"time": time, "initial_speed": initial_speed, "tolerance": tolerance}
@@ -183,7 +185,7 @@ def case(
 
 def _make_obstacles(
     name: str,
-    polygons: Sequence[ArrayLike] | Obstacles,
+    polygons: Sequence[Polygon] | Geometry | Obstacles,
     velocities: ArrayLike,
     batch: tuple[int, ...],
     dtype: DTypeLike,
