@@ -30,7 +30,7 @@ class Geometry(Protocol):
 Polygon: TypeAlias = ArrayLike | Geometry
 
 
-def convex_parts(name: str, polygon: Polygon, index: int | None = None) -> list[np.ndarray]:
+def convex_parts(name: str, polygon: object, index: int | None = None) -> list[np.ndarray]:
     """Cut a polygon into few convex parts with the corners (V, 2) [m], counter-clockwise.
 
     Cuts are parallel or normal to the longest edge, whichever makes fewer parts. A polygon with R

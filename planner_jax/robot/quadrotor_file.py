@@ -22,12 +22,13 @@ import re
 from collections.abc import Iterable, Mapping
 from fractions import Fraction
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import yaml
 
 from planner_jax.core.errors import MissingExtra, PlannerJaxError
 from planner_jax.host.files import open_plain
+from planner_jax.host.yaml_files import Value, read_fields
 from planner_jax.robot.quadrotor_model import (
     NET,
     RACKET,
@@ -66,9 +67,7 @@ _NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,3})?"
 _QUANTITY = re.compile(rf"\s*({_NUMBER}(?:(?:\s*,\s*|\s+){_NUMBER})*)\s*(\D.*?)?\s*", re.ASCII)
 _LONGEST = 200  # greatest number of characters in the text of a quantity
 
-Value = Any  # a field's value: text, number, list of texts and numbers, dictionary, or None
 ENDINGS = (".yaml", ".yml", ".xml")
-_LARGEST = 1 << 20  # [B], greatest size of a file
 _PARTS: dict[str, type] = {"rotors": Rotors, "tool": Tool, "limits": FlightLimits}
 
 
@@ -217,24 +216,17 @@ def _read_description(path: Path) -> dict[str, Value]:
     """Return the fields in a YAML or MJCF file, as a dictionary; raise `RobotError` if invalid."""
     if path.suffix.lower() not in ENDINGS:
         raise RobotError(f"path must end in {', '.join(ENDINGS)}, got {str(path)!r}")
-    with open_plain(path) as file:
-        text = file.read(_LARGEST + 1)
-    if len(text) > _LARGEST:
-        raise RobotError(f"{path}: must be at most {_LARGEST} bytes")
     if path.suffix.lower() == ".xml":
+        open_plain(path).close()  # raises an error for a folder or a pipe
         try:  # the function needs MuJoCo, which may not be installed
             describe = pkgutil.resolve_name("planner_jax.sims.robots.quadrotor.mjcf:describe_mjcf")
         except MissingExtra as error:
             raise error.with_names({error.feature: path.name}) from None
         return describe(path)
     try:
-        fields = yaml.load(text, _Loader)
-    except yaml.YAMLError as error:
-        raise RobotError(f"{path}: must be YAML, {' '.join(str(error).split())}") from None
-    except (RecursionError, ValueError) as error:
-        raise RobotError(f"{path}: must be YAML, got {str(error)[:60]}") from None
-    if not isinstance(fields, dict) or not all(isinstance(name, str) for name in fields):
-        raise RobotError(f"{path}: must be fields with values, got {fields!r:.60}")
+        fields = read_fields(path)
+    except ValueError as error:
+        raise RobotError(f"{path}: {error}") from None
     _require_units(fields, str(path))
     model = fields.pop("model", None)
     if model is None:
@@ -242,24 +234,6 @@ def _read_description(path: Path) -> dict[str, Value]:
     if not isinstance(model, str) or not model.lower().endswith(".xml"):
         raise RobotError(f"{path}: model must name an MJCF file, .xml, got {model!r:.60}")
     return _merge(_read_description(path.parent / model), fields)
-
-
-class _Loader(yaml.SafeLoader):
-    """YAML loader that raises an error for repeated fields and for references (`*name`)."""
-
-    def compose_node(self, parent: yaml.Node | None, index: Value) -> yaml.Node | None:
-        """Compose a YAML node; raise an error for references, which can expand to a huge text."""
-        if self.check_event(yaml.AliasEvent):
-            raise yaml.MarkedYAMLError(None, None, "no *reference", self.peek_event().start_mark)
-        return super().compose_node(parent, index)
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> Value:
-        names = [key.value for key, _ in node.value]
-        for key, _ in node.value:
-            if names.count(key.value) > 1:
-                problem = f"{key.value} only once"
-                raise yaml.MarkedYAMLError(None, None, problem, key.start_mark)
-        return super().construct_mapping(node, deep)
 
 
 def _merge(under: Mapping[str, Value], over: Mapping[str, Value]) -> dict[str, Value]:

@@ -1,7 +1,10 @@
+from .api import OccupancyMap as OccupancyMap
 from .api import draw as draw
 from .api import judge as judge
 from .api import observe as observe
 from .api import planner as planner
+from .api import read_map as read_map
+from .api import walls_of_grid as walls_of_grid
 from .case import InterceptCase as InterceptCase
 from .case import case as case
 from .default_planner import SpacetimeIntercept as SpacetimeIntercept

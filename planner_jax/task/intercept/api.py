@@ -14,6 +14,9 @@ from planner_jax.core.checks import require_kind, require_path
 from planner_jax.core.choices import require
 from planner_jax.core.planner import Planner
 from planner_jax.core.registry import suite_named
+from planner_jax.plane.maps import OccupancyMap as OccupancyMap
+from planner_jax.plane.maps import read_map as read_map
+from planner_jax.plane.maps import walls_of_grid as walls_of_grid
 from planner_jax.plane.target import LaterPath, PlanePath, PolynomialPath, TurningPath
 from planner_jax.referee.intercept import InterceptVerdict, referee_intercepts
 from planner_jax.task.arguments import judge_by

@@ -1,0 +1,52 @@
+"""Reading of YAML files from users: fields with values, without references or repetitions."""
+
+import os
+from typing import Any
+
+import yaml
+
+from planner_jax.host.files import open_plain
+
+_LARGEST = 1 << 20  # [B], greatest size of a file
+
+Value = Any  # a field's value: text, number, list of texts and numbers, dictionary, or None
+
+
+def read_fields(path: str | os.PathLike) -> dict[str, Value]:
+    """Return the fields of a YAML file; JSON is a part of YAML.
+
+    Raises:
+        ValueError: the file holds no fields; the message says what it must be.
+        OSError: the file cannot be read.
+    """
+    with open_plain(path) as file:
+        text = file.read(_LARGEST + 1)
+    if len(text) > _LARGEST:
+        raise ValueError(f"must be at most {_LARGEST} bytes")
+    try:
+        fields = yaml.load(text, _Loader)
+    except yaml.YAMLError as error:
+        raise ValueError(f"must be YAML, {' '.join(str(error).split())}") from None
+    except (RecursionError, ValueError) as error:
+        raise ValueError(f"must be YAML, got {str(error)[:60]}") from None
+    if not isinstance(fields, dict) or not all(isinstance(name, str) for name in fields):
+        raise ValueError(f"must be fields with values, got {fields!r:.60}")
+    return fields
+
+
+class _Loader(yaml.SafeLoader):
+    """YAML loader that raises an error for repeated fields and for references (`*name`)."""
+
+    def compose_node(self, parent: yaml.Node | None, index: Value) -> yaml.Node | None:
+        """Compose a YAML node; raise an error for references, which can expand to a huge text."""
+        if self.check_event(yaml.AliasEvent):
+            raise yaml.MarkedYAMLError(None, None, "no *reference", self.peek_event().start_mark)
+        return super().compose_node(parent, index)
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> Value:
+        names = [key.value for key, _ in node.value]
+        for key, _ in node.value:
+            if names.count(key.value) > 1:
+                problem = f"{key.value} only once"
+                raise yaml.MarkedYAMLError(None, None, problem, key.start_mark)
+        return super().construct_mapping(node, deep)
