@@ -17,9 +17,10 @@ from planner_jax.robot.car import CarBody, CarLimits
 from planner_jax.runs.columns import RefereedBatch
 from planner_jax.runs.source import Chunk
 from planner_jax.sweep.intercept.columns import COLUMNS, WAY_POINTS
-from planner_jax.sweep.intercept.figures import instants, sample_drive
+from planner_jax.sweep.intercept.figures import sample_drive
 from planner_jax.sweep.intercept.settings import InterceptSettings
 from planner_jax.sweep.intercept.sweep import InterceptSweep
+from planner_jax.task.intercept.drawing import instants
 from planner_jax.task.intercept.searches import Search
 
 TASK = pj.task_named("intercept")
@@ -102,7 +103,7 @@ def test_a_row_s_drive_ends_where_the_referee_sees_it(finished):
     setting = finished[1]["setting"]
     for row in pq.read_table(finished[0] / "plans").to_pylist():
         drive = sample_drive(row, setting, 41)
-        away = np.linalg.norm(drive.middle[-1] - drive.target[-1])
+        away = np.linalg.norm(drive.middle[-1] - drive.target_at(drive.time[-1]))
         assert away == pytest.approx(row["miss"], abs=1e-4)
         assert drive.time[-1] == pytest.approx(row["meeting_time"])
         sides = np.diff(drive.footprint(drive.pose[-1]), axis=0)

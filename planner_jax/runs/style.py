@@ -1,6 +1,7 @@
 """Style of all figures: fonts, lines, and Okabe and Ito's colours for colour-blind readers."""
 
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -49,9 +50,14 @@ _STYLE: "dict[RcKeyType, object]" = {
 }
 
 
+def context() -> AbstractContextManager[None]:
+    """Return a context in which Matplotlib makes figures in this style."""
+    return matplotlib.rc_context(_STYLE)
+
+
 def draw(path: Path, figure: Callable[..., None], size: tuple[float, float], *data: object) -> None:
     """Draw `figure(canvas, *data)` on a canvas of `size` [inch], and write it as a PNG file."""
-    with matplotlib.rc_context(_STYLE):
+    with context():
         canvas = Figure(figsize=size)
         FigureCanvasAgg(canvas)
         figure(canvas, *data)

@@ -8,5 +8,6 @@ from .api import walls_of_grid as walls_of_grid
 from .case import InterceptCase as InterceptCase
 from .case import case as case
 from .default_planner import SpacetimeIntercept as SpacetimeIntercept
+from .drawing import draw_plan as draw_plan
 from .plan import InterceptPlan as InterceptPlan
 from .suites import draw_with_counts as draw_with_counts

@@ -1,0 +1,79 @@
+"""Drawings of one planned interception."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from matplotlib.collections import PolyCollection
+from matplotlib.figure import Figure
+
+import planner_jax as pj
+from planner_jax.core.errors import ArgumentError
+from planner_jax.task.intercept.drawing import instants
+
+L_SHAPE = [(3, 5), (5, 5), (5, 6), (4, 6), (4, 7), (3, 7)]
+MOVER = [(6.0, 1.0), (6.5, 1.0), (6.5, 1.5), (6.0, 1.5)]
+
+
+@pytest.fixture(scope="module")
+def drive():
+    """A case, and a plan that drives straight to its target at 1 m/s for 4 s."""
+    target = pj.TurningPath(jnp.array([4.95, 1.0]), jnp.zeros(2), jnp.array(0.0))
+    case = pj.intercept.case(
+        target, 4.0, start=(0.8, 1.0, 0.0), initial_speed=1.0, walls=[L_SHAPE], movers=[MOVER]
+    )
+    plan = pj.intercept.InterceptPlan(
+        cost=jnp.array(0.0),
+        violation=jnp.array(0.0),
+        iterations=jnp.array(0),
+        status=jnp.array(0),
+        start=case.start,
+        time=case.time,
+        speed=jnp.ones(9),
+        curvature=jnp.zeros(9),
+        meeting=jnp.array([4.95, 1.0]),
+    )
+    return case, plan
+
+
+def stack(*parts):
+    """Return a batch of cases or plans."""
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *parts)
+
+
+def test_a_plan_is_drawn_with_walls_bodies_and_the_verdict(drive):
+    axes = pj.intercept.draw_plan(*drive)
+    assert axes.get_title(loc="left").startswith("success: the body's middle is ")
+    assert axes.get_xlim() == (0.0, 8.0) and axes.get_ylim() == (0.0, 8.0)
+    found = [c for c in axes.collections if isinstance(c, PolyCollection)]
+    assert [len(c.get_paths()) for c in found[:2]] == [2, 2]  # outline and filling of both parts
+    bodies = [
+        np.asarray(c.get_paths()[0].vertices)[:4].mean(axis=0) for c in found if c.get_zorder() == 5
+    ]
+    expected = [(0.95 + time, 1.0) for time in instants(4.0, 6)]
+    np.testing.assert_allclose(bodies, expected, atol=1e-5)
+    assert axes.figure.axes[1].get_ylabel() == "speed of the car [m/s]"
+
+
+def test_a_case_of_a_batch_is_drawn_by_its_index_and_says_what_fails(drive):
+    case, plan = drive
+    fast = dataclasses.replace(plan, speed=2.0 * plan.speed)
+    cases, plans = (stack(*pair) for pair in ((case, case), (plan, fast)))
+    axes = Figure().subplots()
+    assert pj.intercept.draw_plan(cases, plans, axes, index=1) is axes
+    assert "speed" in axes.get_title(loc="left")
+    assert any(line.get_marker() == "X" for line in axes.lines)
+
+
+def test_a_missing_or_wrong_index_and_other_objects_are_rejected(drive):
+    case, plan = drive
+    cases, plans = (stack(each, each) for each in drive)
+    for index in (None, 2, -1):
+        with pytest.raises(ArgumentError, match="index must be a case of the batch, from 0 to 1"):
+            pj.intercept.draw_plan(cases, plans, index=index)
+    with pytest.raises(ArgumentError, match="index must be None for one case, got 0"):
+        pj.intercept.draw_plan(case, plan, index=0)
+    with pytest.raises(TypeError, match="plans must be a InterceptPlan"):
+        pj.intercept.draw_plan(case, case)
