@@ -59,17 +59,19 @@ def _plan(task: Task, given: Options) -> int:
 
 
 def _write_answer(single: "Single", answer: "Answer", out: Path, rate: float | None) -> None:
-    from planner_jax.cli.plan.answer import write_pictures
     from planner_jax.export.api import export
+    from planner_jax.robot.quadrotor import QuadrotorPlan
 
     out.mkdir()
     written = [out / "plan.npz"]
     answer.plan.save(written[0])
     if answer.success:
         # The file of setpoints ends with the plan's own trajectory to standstill, if it has one.
-        how = {"rate": rate, "recovery": None if answer.plan.recovery is None else "brake"}
+        plan = answer.plan
+        is_rested = isinstance(plan, QuadrotorPlan) and plan.recovery is not None
+        how = {"rate": rate, "recovery": "brake" if is_rested else None}
         written.append(export(answer.plan, to="csv", out=out / "setpoints.csv", **how))
-    written += write_pictures(single.task, str(single.settings.planner), answer, out)
+    written += single.write_pictures(answer, out)
     print("\n" + "\n".join(map(str, written)))
 
 

@@ -1,6 +1,7 @@
 """Reading of YAML files from users: fields with values, without references or repetitions."""
 
 import os
+import re
 from typing import Any
 
 import yaml
@@ -50,3 +51,11 @@ class _Loader(yaml.SafeLoader):
                 problem = f"{key.value} only once"
                 raise yaml.MarkedYAMLError(None, None, problem, key.start_mark)
         return super().construct_mapping(node, deep)
+
+
+# YAML 1.1 reads numbers of JSON such as 1e-3 and 1.5e3 as texts.
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float",
+    re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)[eE][-+]?\d+$"),
+    list("-+.0123456789"),
+)

@@ -178,10 +178,7 @@ def _number(
     place: Path, fields: Mapping, key: object, name: str = "", usual: float | None = None
 ) -> float:
     value = fields.get(key, usual)
-    try:  # YAML reads 5e-2 as a text
-        number = float(value) if isinstance(value, int | float | str) else math.nan
-    except ValueError:
-        number = math.nan
+    number = float(value) if isinstance(value, int | float) else math.nan
     if not math.isfinite(number):
         raise MapError(f"{place}: {name or key} must be a finite number, got {value!r:.60}")
     return number

@@ -55,7 +55,9 @@ def context() -> AbstractContextManager[None]:
     return matplotlib.rc_context(_STYLE)
 
 
-def draw(path: Path, figure: Callable[..., None], size: tuple[float, float], *data: object) -> None:
+def draw(
+    path: Path, figure: Callable[..., object], size: tuple[float, float], *data: object
+) -> None:
     """Draw `figure(canvas, *data)` on a canvas of `size` [inch], and write it as a PNG file."""
     with context():
         canvas = Figure(figsize=size)

@@ -60,6 +60,14 @@ plan hit --vel -3 0.2 4 --target 4 0 0 --pos 4 0 1 --speed inf | --speed must be
 plan hit --vel -3 0.2 4 --target 4 0 0 --pos 4 0 1 --out junk/below | --out must be in a folder
 plan catch --horizon 1 --ball 1 2 3          | --ball
 plan block                                   | block
+plan intercept                               | --map
+plan intercept --map gone                    | --map must be a file that can be read .. got 'gone'
+plan intercept --map folder                  | --map must be a file that can be read
+plan intercept --map pipe                    | --map must be a file that can be read
+plan intercept --map empty                   | empty: must be fields with values, got None
+plan intercept --map junk                    | junk: must be YAML
+plan intercept --map junk --planner nobody   | --planner must be one of spacetime .. got 'nobody'
+plan intercept --map junk --rate 5           | --rate must be left out without --out
 export junk --row 0 --to csv --recovery land   | --recovery must be one of none
 serve hit --port 65536                       | --port must
 serve catch --deadline 0                     | --deadline must
@@ -118,6 +126,7 @@ WORDS = (
     *(("sweep catch", "--net-test"), ("sweep block", "--regime"), ("fly hit", "--noise")),
     *((f"fly {task}", "--planner") for task in TASKS),
     *((f"{HIT} --pos 4 0 1", option) for option in ("--planner", "--recovery")),
+    ("plan intercept --map junk", "--planner"),
     *(("export junk --row 0", "--to"), ("bench throughput", "--task"), ("serve hit", "--robot")),
     *(("library build new", "--layout"), ("train", "--suite"), ("bench throughput", "--planner")),
 )

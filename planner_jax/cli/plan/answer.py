@@ -11,7 +11,7 @@ import jax
 import numpy as np
 from jaxtyping import PyTree
 
-from planner_jax.cli.plan.settings import SingleSettings
+from planner_jax.cli.plan.settings import PlanSettings
 from planner_jax.core.errors import CaseError
 from planner_jax.core.protocol import Status
 from planner_jax.core.registry import Task
@@ -28,7 +28,7 @@ from planner_jax.sweep.figures import PANELS
 from planner_jax.sweep.quadrotor import SampledMotion, sample_motion
 from planner_jax.sweep.sweep import sweep_of
 
-SingleT = TypeVar("SingleT", bound=SingleSettings)
+SingleT = TypeVar("SingleT", bound=PlanSettings)
 
 _SAMPLES = 4001  # number of times at which a plan is compared with the limits
 
@@ -68,6 +68,17 @@ class Answer:
     def success(self) -> bool:
         """Whether the referee accepts the plan."""
         return bool(self.verdict.success)
+
+
+@dataclasses.dataclass(frozen=True)
+class OneRow(RunRows):
+    """One planned case in the form of a finished run of many cases, to draw the same figures."""
+
+    row: Row
+
+    def same_case(self) -> list[tuple[str, Row]]:
+        """Return the name of the planner and the planned case, as a list with one pair."""
+        return [(self.manifest["parameters"]["planner"], self.row)]
 
 
 class Single(abc.ABC, Generic[SingleT]):
@@ -120,6 +131,23 @@ class Single(abc.ABC, Generic[SingleT]):
         """Return how close the plan comes to each limit: of flight, of rotors, and of the task."""
         return [*_of_flight(answer), *_of_rotors(answer), *self.task_margins(answer)]
 
+    def write_pictures(self, answer: Answer, out: Path) -> list[Path]:
+        """Draw the case and its plan into the folder `out`, and return the pictures' paths."""
+        sweep = sweep_of(self.task)
+        case, plan = jax.tree.map(lambda leaf: np.asarray(leaf)[None], (answer.case, answer.plan))
+        fields = {name: np.asarray(value)[None] for name, value in vars(answer.verdict).items()}
+        verdict = dataclasses.replace(answer.verdict, **fields)
+        batch = RefereedBatch(Chunk(np.zeros(1, int), case), plan, verdict)
+        (row,) = rows_of(sweep.single_columns, batch, sweep.frame).to_pylist()
+        manifest = {
+            "parameters": {"planner": self.settings.planner},
+            "setting": sweep.setting(case),
+        }
+        run = OneRow(RunFolder(out), manifest, [], row)
+        for figure in sweep.single_figures:
+            draw(out / figure.name, figure.draw, figure.size, run)
+        return [out / figure.name for figure in sweep.single_figures]
+
 
 def sample_plan(found: QuadrotorPlan) -> SampledMotion:
     """Sample a plan of a quadrotor with its recovery trajectory at evenly spaced times."""
@@ -134,9 +162,10 @@ def _pieces(found: QuadrotorPlan) -> tuple[np.ndarray, np.ndarray]:
     return coeffs[there], durations[there]
 
 
-def _closest(
+def closest_to(
     times: np.ndarray, words: str, values: np.ndarray, allowed: SupportsFloat, least: bool = False
 ) -> Margin:
+    """Return the margin of K values at K times [s] to the limit `allowed`."""
     # Values are NaN where the attitude is undefined; such a plan exceeds the limit infinitely.
     values = np.nan_to_num(values, nan=-np.inf if least else np.inf)
     at = int(np.argmin(values) if least else np.argmax(values))
@@ -147,7 +176,7 @@ def _of_flight(answer: Answer) -> list[Margin]:
     limits, gravity = answer.case.limits, float(answer.case.gravity)
     motion = sample_plan(answer.plan)
     sizes = {name: values(motion, gravity) for name, (_, _, values) in PANELS.items()}
-    closest = functools.partial(_closest, motion.time)
+    closest = functools.partial(closest_to, motion.time)
     found = [
         closest(f"{name.replace('_', ' ')} [{unit}]", sizes[name], vars(limits)[name])
         for name, unit in _ABOVE.items()
@@ -174,8 +203,8 @@ def _of_rotors(answer: Answer) -> list[Margin]:
     at = (starts[:, None] + times).ravel()
     low, high = thrusts.min(axis=-1).ravel(), thrusts.max(axis=-1).ravel()
     return [
-        _closest(at, "rotor thrust, least [N]", low, rotors.min_thrust, least=True),
-        _closest(at, "rotor thrust, greatest [N]", high, rotors.max_thrust),
+        closest_to(at, "rotor thrust, least [N]", low, rotors.min_thrust, least=True),
+        closest_to(at, "rotor thrust, greatest [N]", high, rotors.max_thrust),
     ]
 
 
@@ -186,29 +215,3 @@ def _table(margins: Sequence[Margin]) -> list[str]:
         numbers = (f"{margin.reached:.4g}", f"{margin.allowed:.4g}", share, f"{margin.time:.3f}")
         rows.append((margin.limit, *numbers))
     return align(rows)
-
-
-@dataclasses.dataclass(frozen=True)
-class OneRow(RunRows):
-    """One planned case in the form of a finished run of many cases, to draw the same figures."""
-
-    row: Row
-
-    def same_case(self) -> list[tuple[str, Row]]:
-        """Return the name of the planner and the planned case, as a list with one pair."""
-        return [(self.manifest["parameters"]["planner"], self.row)]
-
-
-def write_pictures(task: Task, planner: str, answer: Answer, out: Path) -> list[Path]:
-    """Draw a case and its plan into the folder `out`, and return the paths of the pictures."""
-    sweep = sweep_of(task)
-    case, plan = jax.tree.map(lambda leaf: np.asarray(leaf)[None], (answer.case, answer.plan))
-    fields = {name: np.asarray(value)[None] for name, value in vars(answer.verdict).items()}
-    verdict = dataclasses.replace(answer.verdict, **fields)
-    batch = RefereedBatch(Chunk(np.zeros(1, int), case), plan, verdict)
-    (row,) = rows_of(sweep.single_columns, batch, sweep.frame).to_pylist()
-    manifest = {"parameters": {"planner": planner}, "setting": sweep.setting(case)}
-    run = OneRow(RunFolder(out), manifest, [], row)
-    for figure in sweep.single_figures:
-        draw(out / figure.name, figure.draw, figure.size, run)
-    return [out / figure.name for figure in sweep.single_figures]

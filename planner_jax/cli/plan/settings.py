@@ -3,7 +3,7 @@
 import dataclasses
 import math
 from dataclasses import MISSING
-from typing import ClassVar
+from typing import ClassVar, Self
 
 from planner_jax.core.choices import CHOICES, require, require_one_of
 from planner_jax.core.registry import Task, split_name
@@ -19,14 +19,44 @@ _MOST_BALLS = 6
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class SingleSettings:
-    """Options of `planner-jax plan` for hits and catches; a subclass adds options of one task.
+class PlanSettings:
+    """Options of `planner-jax plan` for any task; a subclass adds options of one task.
 
     Each field is an option. Its `metavar`, such as "X Y Z", has one word for each number of the
-    option's value. A number that is not finite, or an unknown name, raises `ArgumentError`.
+    option's value.
     """
 
     planner: str | None = option(None, "NAME", "")  # None selects the first planner of the task
+
+    RUN: ClassVar[str]  # subclass of `Single` that runs the command, as "module:Class"
+
+    def of(self, task: Task) -> Self:
+        """Check the planner's name; return a copy with the task's first planner instead of None."""
+        name = next(iter(task.all_planners())) if self.planner is None else self.planner
+        task.split_planner(name)
+        return dataclasses.replace(self, planner=name)
+
+    def planner_options(self) -> Entries:
+        """Return the planner's options that these settings specify, by name."""
+        return {}
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SingleInterceptSettings(PlanSettings):
+    """Options of `planner-jax plan intercept`: the file of a case."""
+
+    map: str = option(MISSING, "FILE", "YAML or JSON file with the arguments of pj.intercept.case")
+
+    RUN: ClassVar[str] = "planner_jax.cli.plan.intercept:SingleIntercept"
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SingleSettings(PlanSettings):
+    """Options of `planner-jax plan` for hits and catches; a subclass adds options of one task.
+
+    A number that is not finite, or an unknown name, raises `ArgumentError`.
+    """
+
     start: tuple[float, ...] | None = option(None, "X Y Z", "where the quadrotor hovers [m]")
     speed: float | None = option(None, "V", f"greatest speed [m/s] {_OWN}")
     body_rate: float | None = option(None, "W", f"greatest body rate [rad/s] {_OWN}")
@@ -37,7 +67,6 @@ class SingleSettings:
     robot: object = robot_option("the task's")
     recovery: str = recovery_option("brake")  # "brake", since controllers need a stop at the end
 
-    RUN: ClassVar[str]  # subclass of `Single` that runs the command, as "module:Class"
     PLANNER: ClassVar[tuple[str, ...]] = ()  # names of fields that are arguments of the planner
     ELSEWHERE: ClassVar[tuple[str, ...]] = ()  # names of fields that are no argument of `task.case`
     TOOL: ClassVar[str]  # tool that the robot must carry, "net" or "racket"
@@ -54,12 +83,6 @@ class SingleSettings:
                 # Only `max_thrust` may be infinite, which means that the thrust has no upper limit.
                 sound = math.isfinite(number) or (field.name == "max_thrust" and number > 0.0)
                 require(sound, field.name, "finite", number)
-
-    def of(self, task: Task) -> "SingleSettings":
-        """Check the planner's name; return a copy with the task's first planner instead of None."""
-        name = next(iter(task.all_planners())) if self.planner is None else self.planner
-        task.split_planner(name)
-        return dataclasses.replace(self, planner=name)
 
     def planner_options(self) -> Entries:
         """Return the planner's options that these settings specify, by name."""

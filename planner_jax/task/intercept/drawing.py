@@ -188,9 +188,9 @@ def draw_drive(
         body = [drive.footprint(drive.pose_at(time))]
         draw_polygons(axes, body, shade, alpha=0.55, zorder=5)
     if by_speed:  # else the colours say which positions are of one time
-        _label_times(axes, times, drive.target_at(times), drive.size[0], -14.0)
+        _label_times(axes, times, drive.target_at(times), drive.size[0], -1.0)
         middles = [drive.footprint(drive.pose_at(time)).mean(axis=0) for time in times]
-        _label_times(axes, times, np.array(middles), drive.size[0], 7.0)
+        _label_times(axes, times, np.array(middles), drive.size[0], 1.0)
     look = {"marker": "o", "markersize": 13, "mfc": "none", "mew": 1.8, "zorder": 7}
     is_met = drive.failed is None
     (meeting,) = drive.target_at(np.array([end]))
@@ -201,18 +201,22 @@ def draw_drive(
 
 
 def _label_times(
-    axes: Axes, times: np.ndarray, places: np.ndarray, gap: float, above: float
+    axes: Axes, times: np.ndarray, places: np.ndarray, gap: float, side: float
 ) -> None:
-    """Write times [s] beside places (T, 2) [m], `above` points higher.
+    """Write times [s] at the left (`side` = 1) or right (-1) of a path through places (T, 2) [m].
 
     Places that are less than `gap` [m] from the last text have none.
     """
     last = np.full(2, np.inf)
-    for time, place in zip(times, places, strict=True):
+    for k, (time, place) in enumerate(zip(times, places, strict=True)):
         if np.linalg.norm(place - last) >= gap:
+            x, y = places[min(k + 1, len(places) - 1)] - places[max(k - 1, 0)]
+            length = float(np.hypot(x, y))
+            offset = (-15.0 * side * y / length, 13.0 * side * x / length) if length else (0, 13)
             look: Look = {"textcoords": "offset points", "fontsize": 8.0, "color": style.INK}
+            look |= {"ha": "center", "va": "center", "zorder": 9}
             halo = [withStroke(linewidth=2.0, foreground="white")]
-            axes.annotate(f"{time:g} s", place, (7.0, above), zorder=9, path_effects=halo, **look)
+            axes.annotate(f"{time:g} s", place, offset, path_effects=halo, **look)
             last = place
 
 

@@ -70,6 +70,7 @@ TASK = Task(
     suites={name: suite.description for name, suite in SUITES.items()},
     sweep="planner_jax.sweep.intercept.settings:InterceptSettings",
     flight="planner_jax.sims.settings:InterceptFly",
+    single="planner_jax.cli.plan.settings:SingleInterceptSettings",
     contact="time",
     yardstick="best",
 )
