@@ -145,5 +145,5 @@ class SingleIntercept(Single[SingleInterceptSettings]):
         """Draw the plan from above into the folder `out`, and return the picture's path."""
         path = out / "plane.png"
         figure = lambda canvas: drawing.draw_plan(answer.case, answer.plan, canvas.subplots())  # noqa: E731
-        draw(path, figure, (8.0, 7.4))
+        draw(path, figure, drawing.figure_size(answer.case))
         return [path]

@@ -17,6 +17,7 @@ from matplotlib.colors import ListedColormap, Normalize, to_rgba
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.patheffects import withStroke
+from matplotlib.transforms import offset_copy
 
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.protocol import take
@@ -146,13 +147,24 @@ def draw_plan(
         if ax is None:
             import matplotlib.pyplot as plt
 
-            ax = plt.subplots(figsize=(8.0, 7.4))[1]
+            ax = plt.subplots(figsize=figure_size(case))[1]
         draw_drive(ax, drive, colours, by_speed=True)
         ax.figure.colorbar(colours, ax=ax, label="speed of the car [m/s]", fraction=0.045, pad=0.02)
-        below = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.08), "ncols": 3}
-        ax.legend(handles=entries(colours, by_speed=True), **below)
-        style.label(ax, "x [m]", "y [m]", verdict.sentence())
+        below = offset_copy(
+            ax.transAxes, ax.get_figure(root=True), y=-0.45
+        )  # [inch], below the label of the axis
+        look: Look = {"loc": "upper center", "bbox_to_anchor": (0.5, 0.0), "ncols": 3}
+        ax.legend(handles=entries(colours, by_speed=True), bbox_transform=below, **look)
+        style.label(ax, "x [m]", "y [m]")
+        ax.set_title(verdict.sentence(), wrap=True)
     return ax
+
+
+def figure_size(case: InterceptCase) -> tuple[float, float]:
+    """Return width and height [inch] of a figure in which `draw_plan` draws one case's map."""
+    wide, tall = np.asarray(case.upper, float) - np.asarray(case.lower, float)
+    scale = 6.4 / max(wide, tall)
+    return max(scale * wide, 3.9) + 1.6, max(scale * tall, 1.2) + 1.3
 
 
 def draw_drive(
