@@ -77,6 +77,41 @@ class LaterPath:
         return self.path.at(self.begin + time)
 
 
+@struct.dataclass
+class FadingPath:
+    """A path whose velocity is a sum of J velocities that turn and decay, such as a predicted path.
+
+    The time t counts from the last observation. For t >= 0 the velocity is the sum of
+    vel_j exp(-rate_j t), turned by the angle turn_rate_j t. For t < 0 the path is straight.
+    """
+
+    pos: Array  # (2,) [m], at the last observation
+    vel: Array  # (J, 2) [m/s]
+    rate: Array  # (J,) [1/s], >= 0
+    turn_rates: Array  # (J,) [rad/s], positive to the left
+    ahead: Array  # () [s], time from the last observation to the path's time 0
+
+    def at(self, time: Array) -> PointState:
+        """Return position [m] and velocity [m/s] at one time () [s]."""
+        passed = self.ahead + time
+        after = jnp.maximum(passed, 0.0)
+        decay, angle = self.rate * after, self.turn_rates * after
+        left = jnp.exp(-decay)
+        cos, sin = left * jnp.cos(angle), left * jnp.sin(angle)
+        # Displacement divided by velocity and time: (1 - exp(-z)) / z with z = decay - i angle.
+        square = decay**2 + angle**2
+        small = square < 1e-4
+        safe = jnp.where(small, 1.0, square)
+        ahead = (decay * (1.0 - cos) + angle * sin) / safe
+        aside = (angle * (1.0 - cos) - decay * sin) / safe
+        ahead = jnp.where(small, 1.0 - decay / 2.0 + (decay**2 - angle**2) / 6.0, ahead)
+        aside = jnp.where(small, angle / 2.0 - decay * angle / 3.0, aside)
+        across = jnp.stack([-self.vel[:, 1], self.vel[:, 0]], axis=-1)
+        way = jnp.sum(ahead[:, None] * self.vel + aside[:, None] * across, axis=0)
+        vel = jnp.sum(cos[:, None] * self.vel + sin[:, None] * across, axis=0)
+        return PointState(pos=self.pos + passed * way, vel=vel)
+
+
 def arc(turn_rate: Array, time: Array) -> tuple[Array, Array]:
     """Return how far a target moves ahead and to its left, both divided by its speed, (...) [s].
 

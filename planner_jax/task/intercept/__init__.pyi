@@ -1,8 +1,10 @@
 from .api import OccupancyMap as OccupancyMap
+from .api import Prediction as Prediction
 from .api import draw as draw
 from .api import judge as judge
 from .api import observe as observe
 from .api import planner as planner
+from .api import predict as predict
 from .api import read_map as read_map
 from .api import walls_of_grid as walls_of_grid
 from .case import InterceptCase as InterceptCase

@@ -17,6 +17,8 @@ from planner_jax.core.registry import suite_named
 from planner_jax.plane.maps import OccupancyMap as OccupancyMap
 from planner_jax.plane.maps import read_map as read_map
 from planner_jax.plane.maps import walls_of_grid as walls_of_grid
+from planner_jax.plane.prediction import Prediction as Prediction
+from planner_jax.plane.prediction import predict as predict
 from planner_jax.plane.target import LaterPath, PlanePath, PolynomialPath, TurningPath
 from planner_jax.referee.intercept import InterceptVerdict, referee_intercepts
 from planner_jax.task.arguments import judge_by
