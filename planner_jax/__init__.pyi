@@ -34,8 +34,8 @@ from .optimise.settings import Evaluation as Evaluation
 from .optimise.settings import LbfgsConfig as LbfgsConfig
 from .optimise.settings import NewtonConfig as NewtonConfig
 from .optimise.settings import Round as Round
+from .plane.make_obstacles import obstacles as obstacles
 from .plane.obstacles import Obstacles as Obstacles
-from .plane.obstacles import obstacles as obstacles
 from .plane.target import PolynomialPath as PolynomialPath
 from .plane.target import TurningPath as TurningPath
 from .planning.batch import Progress as Progress

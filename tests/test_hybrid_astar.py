@@ -7,7 +7,8 @@ import pytest
 from dubins import dubins
 
 from planner_jax.baselines.intercept.hybrid_astar import HybridAstar, hybrid_astar
-from planner_jax.plane.obstacles import distances, obstacles, separation
+from planner_jax.plane.make_obstacles import obstacles
+from planner_jax.plane.obstacles import distances, separation
 
 pytest.importorskip("numba", reason="needs the extra baselines")
 from planner_jax.baselines.intercept import hybrid_astar_kernels as kernels  # noqa: E402

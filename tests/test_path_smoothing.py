@@ -9,7 +9,8 @@ import pytest
 from dubins import dubins, sample_dubins
 
 from planner_jax.baselines.intercept import path_smoothing
-from planner_jax.plane.obstacles import obstacles, separation
+from planner_jax.plane.make_obstacles import obstacles
+from planner_jax.plane.obstacles import separation
 
 CURVATURE, BODY = 2.0, (-0.05, 0.35, 0.125)
 NUM = 65

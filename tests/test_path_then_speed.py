@@ -15,7 +15,8 @@ from planner_jax.baselines.intercept import path_then_speed
 from planner_jax.baselines.intercept import projection as projections
 from planner_jax.baselines.intercept.path import path_along, path_beside, path_of_drive
 from planner_jax.baselines.intercept.static_paths import count_turns
-from planner_jax.plane.obstacles import obstacles, separation
+from planner_jax.plane.make_obstacles import obstacles
+from planner_jax.plane.obstacles import separation
 from planner_jax.plane.reach import Lattice
 from planner_jax.robot.car import pose_at
 from planner_jax.task.intercept.searches import Search

@@ -31,8 +31,8 @@ class PathTable:
 
     rules: ClassVar[Table] = (Field("resolution", None, POSITIVE),)
 
-    pos: Array  # (N, 3) [m]
-    vel: Array  # (N, 3) [m/s]
+    pos: Array  # (N, 3) [m], or (N, 2) in the plane
+    vel: Array  # (N, 3) or (N, 2) [m/s]
     resolution: Array  # () [s], > 0
 
     def at(self, time: Array) -> BallState:

@@ -43,9 +43,10 @@ def table_path(
     Args:
         times: NumPy array of K >= 2 increasing times [s]. Planning starts at time 0, which must be
             within the times. After the last time the target keeps its velocity.
-        positions: (..., K, 3) [m]; leading axes are leading axes of the result, such as (N,) for
-            the targets of one catch. The path is differentiable by positions.
-        velocities: (..., K, 3) [m/s].
+        positions: (..., K, 3) [m], or (..., K, 2) in the plane; leading axes are leading axes of
+            the result, such as (N,) for the targets of one catch. The path is differentiable by
+            positions.
+        velocities: (..., K, 3) or (..., K, 2) [m/s].
         nodes: number of nodes, >= 5. Required if positions are traced by JAX; pass it also if
             several batches of tables should share a compiled program.
         error: [m], > 0, greatest error of the table; used only if `nodes` is not passed.
@@ -89,7 +90,7 @@ def _check_times(times: ArrayLike) -> np.ndarray:
 
 
 def _check_values(name: str, value: ArrayLike, num: int) -> Numbers:
-    if shape_of(name, value)[-2:] != (num, 3):
+    if shape_of(name, value)[-2:] not in ((num, 3), (num, 2)):
         raise ArgumentError(name, f"the shape (..., {num}, 3)", np.shape(value), verb="have")
     if isinstance(value, Tracer):
         return value

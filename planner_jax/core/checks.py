@@ -152,8 +152,10 @@ class _Path(Protocol):
 
 def require_path(
     name: str, path: object, axes: tuple[int, ...], dimensions: int, whose: str = ""
-) -> None:
+) -> bool:
     """Raise unless an argument is a target's path, or an array of paths.
+
+    Return whether the path's method `at(time)` returns the position alone, without velocity.
 
     Args:
         name: name of the argument.
@@ -168,7 +170,7 @@ def require_path(
     arrays = require_beginning(name, path, axes, f"the shape {axes}{of}")
     layout = tuple([(array.shape, array.dtype) for array in arrays])
     try:
-        found = _shape_of_positions(jax.tree.structure(path), layout, axes)
+        found, is_bare = _shape_of_positions(jax.tree.structure(path), layout, axes)
     except (TypeError, ValueError, IndexError, AttributeError) as error:
         rule = f"a path whose at(time) returns a position, with the axes {axes}{of}"
         shown = f"a {type(path).__name__} with {format_shapes(path)}"
@@ -176,13 +178,15 @@ def require_path(
     if found != (*axes, dimensions):
         rule = f"positions of the shape {(*axes, dimensions)}"
         raise ArgumentError(name, rule, found, verb="return")
+    return is_bare
 
 
 @functools.lru_cache(maxsize=256)
-def _shape_of_positions(tree: PyTree, layout: tuple, axes: tuple[int, ...]) -> tuple[int, ...]:
+def _shape_of_positions(
+    tree: PyTree, layout: tuple, axes: tuple[int, ...]
+) -> tuple[tuple[int, ...], bool]:
     def at(path: _Path, time: Numbers) -> PyTree:
-        state = path.at(time)
-        return getattr(state, "pos", state)  # `at` may return the position alone
+        return path.at(time)
 
     for _ in axes:
         at = jax.vmap(at)
@@ -190,4 +194,6 @@ def _shape_of_positions(tree: PyTree, layout: tuple, axes: tuple[int, ...]) -> t
     path = jax.tree.unflatten(tree, [jax.ShapeDtypeStruct(*each) for each in kinds])
     floating = (dtype for _, dtype in kinds if jnp.issubdtype(dtype, np.floating))
     time = jax.ShapeDtypeStruct(axes, next(floating, np.float32))
-    return jax.eval_shape(at, path, time).shape
+    state = jax.eval_shape(at, path, time)
+    pos = getattr(state, "pos", state)  # `at` may return the position alone
+    return pos.shape, pos is state

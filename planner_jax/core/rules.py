@@ -42,6 +42,9 @@ NOT_ZERO = Rule(  # for a vector
 # For limits: an infinite number means that there is no limit.
 POSITIVE_OR_NONE = Rule("> 0", lambda value, part: value > 0.0, infinite=True)
 
+NUMBER = Rule("a number", lambda value, part: value == value, infinite=True)
+NOT_NEGATIVE_OR_NONE = Rule(">= 0", lambda value, part: value >= 0.0, infinite=True)
+
 
 def within(low: float, high: float, words: str) -> Rule:
     """Return the rule that numbers are in the closed interval from `low` to `high`."""
@@ -51,6 +54,11 @@ def within(low: float, high: float, words: str) -> Rule:
 def below(other: str) -> Rule:
     """Return the rule that an array is less than the array `other` in the same part of a case."""
     return Rule("<", lambda value, part: value < part_at(part, other), other=other)
+
+
+def below_or_infinite(other: str) -> Rule:
+    """Return the rule `below(other)` for an array whose numbers may be infinite."""
+    return dataclasses.replace(below(other), infinite=True)
 
 
 def _is_permutation(value: Numbers, part: PyTree) -> Numbers:

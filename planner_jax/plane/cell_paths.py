@@ -90,7 +90,7 @@ def draw_path(
 
     cosine, sine = jnp.cos(grid.heading), jnp.sin(grid.heading)
     along = jnp.stack([jnp.stack([cosine, sine]), jnp.stack([-sine, cosine])])
-    along *= (lattice.levels - 1) / lattice.pace
+    along *= 1.0 / (reach.speeds[-1] - reach.speeds[-2])
 
     def draw(ends: Array, steps: Array) -> CellPath:
         score = ends + jnp.where(jnp.arange(9) == 0, 1.0, 0.0)[None, None]
@@ -104,10 +104,12 @@ def draw_path(
             bits = reach.bits[n]
             is_step = jax.vmap(lambda v, h: bit_at(bits, v, h, before))(from_level, heading - turn)
             is_step &= reach.turns[n, level, turn + SPAN]
+            is_step &= reach.changes[n] | (choices[:, 0] == 0)
             turning, uneven = jnp.abs(turn) + jnp.abs(turn - last), jnp.abs(choices[:, 0])
             rough = _TURNING * turning.astype(dtype)
             rough += _UNEVEN * uneven.astype(dtype)
-            rate = (before - grid.start).astype(dtype) / (n.astype(dtype) + 0.5)
+            moved = (before - grid.start).astype(dtype) * grid.cell
+            rate = moved / ((n.astype(dtype) + 0.5) * grid.step)
             mean = jnp.dot(along, rate, precision=lax.Precision.HIGHEST)
             velocity = _velocity(from_level, heading - turn, grid)
             rough += directness * jnp.sum((velocity - mean[None]) ** 2, axis=-1)

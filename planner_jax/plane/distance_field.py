@@ -15,9 +15,9 @@ _HALF = 4
 class DistanceField:
     """Distances from the nearest wall at equally spaced nodes; negative inside a wall."""
 
-    values: Array  # (F, F) [m], F nodes along each side; the first index is along y
+    values: Array  # (rows, columns) [m]; the first index is along y
     corner: Array  # (2,) [m], position of the entry (0, 0)
-    spacing: Array  # () [m], distance between neighbouring nodes
+    spacing: Array  # (2,) [m], distances between neighbouring nodes along x and y
 
     def near(self, x: Array, y: Array) -> tuple[Array, Array, Array]:
         """Return the distances [m] of points (x, y) from the nearest wall, and derivatives by x, y.
@@ -26,9 +26,9 @@ class DistanceField:
         spacing^2 / (4 distance). A point outside the grid gets the distance of the nearest point of
         the grid. All arrays have the shape of `x`.
         """
-        most = self.values.shape[0] - 2
-        at = [(each - low) / self.spacing for each, low in zip((x, y), self.corner, strict=True)]
-        below = [jnp.clip(jnp.floor(each), 0, most).astype(jnp.int32) for each in at]
+        most = (self.values.shape[1] - 2, self.values.shape[0] - 2)
+        at = [(each - self.corner[k]) / self.spacing[k] for k, each in enumerate((x, y))]
+        below = [jnp.clip(jnp.floor(at[k]), 0, most[k]).astype(jnp.int32) for k in range(2)]
         (u, v) = (
             jnp.clip(each - low.astype(each.dtype), 0.0, 1.0)
             for each, low in zip(at, below, strict=True)
@@ -41,30 +41,34 @@ class DistanceField:
         ]
         low, high = (corners[k] + u * (corners[k + 1] - corners[k]) for k in (0, 2))
         left, right = (corners[k] + v * (corners[k + 2] - corners[k]) for k in (0, 1))
-        return low + v * (high - low), (right - left) / self.spacing, (high - low) / self.spacing
+        return low + v * (high - low), (right - left) / self.spacing[0], (high - low) / self.spacing[1]
 
 
-def distance_field(walls: Obstacles, corner: Array, spacing: Array, size: int) -> DistanceField:
+def distance_field(
+    walls: Obstacles, corner: Array, spacing: Array, size: tuple[int, int]
+) -> DistanceField:
     """Compute the distances from the walls on a grid.
 
     Args:
         walls: obstacles, evaluated at their positions at time 0.
         corner: (2,) [m], position of the grid's first node.
-        spacing: () [m], distance between neighbouring nodes.
-        size: number F of nodes along each side of the grid, a static int.
+        spacing: (2,) [m], distances between neighbouring nodes along x and y.
+        size: numbers of nodes along x and y, static ints.
     """
-    offsets = spacing * jnp.arange(size, dtype=corner.dtype)
-    x, y = jnp.meshgrid(corner[0] + offsets, corner[1] + offsets)
-    vertices = walls.vertices(jnp.zeros_like(spacing))
+    along = [corner[k] + spacing[k] * jnp.arange(size[k], dtype=corner.dtype) for k in range(2)]
+    x, y = jnp.meshgrid(*along)
+    vertices = walls.vertices(jnp.zeros_like(spacing[0]))
     num, half = vertices.shape[0], vertices.shape[1] // 2
 
     def take_nearer(k: Array, nearest: Array) -> Array:
-        corners, present = (
-            lax.dynamic_slice_in_dim(each, k, 1) for each in (vertices, walls.present)
+        corners, present, radius = (
+            lax.dynamic_slice_in_dim(each, k, 1)
+            for each in (vertices, walls.present, walls.radius)
         )
 
         def measure(corners: Array) -> Array:
-            return distances(corners, present, x.reshape(1, -1), y.reshape(1, -1))[0]
+            far = distances(corners, present, x.reshape(1, -1), y.reshape(1, -1))[0]
+            return far - radius[:, None]
 
         if half < _HALF:
             return jnp.minimum(nearest, measure(corners))
@@ -75,7 +79,7 @@ def distance_field(walls: Obstacles, corner: Array, spacing: Array, size: int) -
 
     # The loops take one wall at a time, since a program for all walls takes minutes to compile. On
     # a CPU the loop ends at the last wall that is present, so that padding costs no time.
-    none = jnp.full((1, size * size), 1e3, corner.dtype)
+    none = jnp.full((1, x.size), 1e3, corner.dtype)
 
     def loop(present: Array) -> Array:
         needed = jnp.max(jnp.where(present, jnp.arange(1, num + 1), 0))
@@ -84,4 +88,4 @@ def distance_field(walls: Obstacles, corner: Array, spacing: Array, size: int) -
     nearest = lax.platform_dependent(
         walls.present, cpu=loop, default=lambda _: lax.fori_loop(0, num, take_nearer, none)
     )
-    return DistanceField(values=nearest.reshape(size, size), corner=corner, spacing=spacing)
+    return DistanceField(values=nearest.reshape(x.shape), corner=corner, spacing=spacing)

@@ -1,89 +1,142 @@
-"""Obstacles in the plane: convex polygons at constant velocity, and distances from them."""
+"""Obstacles in the plane: convex polygons and circles that move, and distances from them."""
 
-from collections.abc import Sequence
-
+import dataclasses
+import jax
 import jax.numpy as jnp
-import numpy as np
 from flax import struct
 from jax import Array
 from jax.typing import ArrayLike
 
-from planner_jax.core.checks import floating, shape_of
-from planner_jax.core.choices import require
-from planner_jax.core.errors import ArgumentError, ArgumentTypeError
-from planner_jax.plane.polygons import Geometry, convex_parts
+@struct.dataclass
+class Track:
+    """Poses of N obstacles at K equally spaced times each, between which they change linearly.
 
-_COUNTS = (16, 32, 64)  # numbers of entries of `obstacles`; then multiples of the last
-_CORNERS = 8  # least number of corners of an entry of `obstacles`; then its doubles
+    An obstacle exists only from its first to its last time.
+    """
+
+    poses: Array  # (N, K, 3) x [m], y [m], heading [rad]
+    begin: Array  # (N,) [s], time of the first pose
+    step: Array  # (N,) [s], time between two poses
+    end: Array  # (N,) [s], time of the last pose that is not padding
 
 
 @struct.dataclass
 class Obstacles:
-    """Up to N convex polygons of up to V corners each, which move without turning.
+    """Up to N convex polygons of up to V corners each, enlarged by a radius, which move.
 
-    World frame in the plane, SI units. The velocity of an obstacle is constant ([Qu2022, eq. 5],
-    with constant speeds as in its Section IV-A), and zero for walls.
+    World frame in the plane, SI units. Without a track an obstacle does not turn. Its velocity is
+    constant ([Qu2022, eq. 5], with constant speeds as in its Section IV-A), and zero for walls.
     """
 
     centre: Array  # (N, 2) [m], at time 0
     corners: Array  # (N, V, 2) [m] from the centre, counter-clockwise, padded with the last corner
     velocity: Array  # (N, 2) [m/s]
     present: Array  # (N,) bool, whether the entry is an obstacle or only padding
+    radius: Array  # (N,) [m], distance by which the polygon is enlarged at time 0
+    growth: Array  # (N,) [m/s], rate at which `radius` grows after time 0
+    track: Track | None = None  # poses of the polygons' frames; replaces `centre` and `velocity`
 
     def vertices(self, time: ArrayLike) -> Array:
-        """Return the V corners of the N obstacles at one time () [s], (N, V, 2) [m]."""
+        """Return the V corners of the N obstacles at one time () [s], (N, V, 2) [m].
+
+        The obstacles must not have a track.
+        """
         return (self.centre + self.velocity * time)[..., None, :] + self.corners
 
 
-def obstacles(
-    polygons: object, velocities: object = 0.0, *, dtype: object = jnp.float32
-) -> Obstacles:
-    """Make the obstacles of one case from lists of corners.
+@struct.dataclass
+class Placement:
+    """N obstacles at M times: their frames, in which the corners do not move, and their motion."""
 
-    The arrays are padded to 16, 32, 64, 128, 192, ... obstacles of 8, 16, 32, 64, ... corners.
-    Cases whose arrays have equal sizes share a compiled program.
+    x: Array  # (N, M) [m], origin of the frame
+    y: Array  # (N, M) [m]
+    velocity: tuple[Array, Array]  # (N, M) [m/s] each, of the origin along x and y
+    turn: tuple[Array, Array, Array] | None  # cosine and sine of the heading, turn rate [rad/s]
+    radius: Array  # (N, M) [m], distance by which the polygons are enlarged
+    present: Array  # (N, M) bool
 
-    Args:
-        polygons: a sequence with one polygon for each obstacle, at time 0: an array of corners
-            (V, 2) [m], in either orientation, or a geometry of Shapely of the type Polygon or
-            MultiPolygon, with or without holes. Each has its own number V of corners. A polygon
-            that is not convex becomes several entries, its convex parts, with equal velocities.
-            One geometry alone is one obstacle.
-        velocities: (2,) [m/s] for all obstacles, or (N, 2), one for each of N obstacles.
-        dtype: floating type of the arrays.
+    def enter(self, x: Array, y: Array) -> tuple[Array, Array]:
+        """Return points (N, M) [m] of the world frame in the frames of the obstacles."""
+        x, y = x - self.x, y - self.y
+        if self.turn is None:
+            return x, y
+        cos, sin, _ = self.turn
+        return cos * x + sin * y, cos * y - sin * x
 
-    Raises:
-        TypeError: an argument has a wrong type.
-        ValueError: a polygon has no area, or its edges cross. The message names the polygon.
-    """
-    dtype = floating(dtype)
-    if isinstance(polygons, Geometry):
-        polygons = [polygons]
-    if isinstance(polygons, str) or not isinstance(polygons, Sequence | np.ndarray):
-        raise ArgumentTypeError("polygons", "a sequence of polygons", polygons)
-    parts = [convex_parts("polygons", polygon, k) for k, polygon in enumerate(polygons)]
-    checked = [part for each in parts for part in each]
-    num, most = len(checked), max((len(each) for each in checked), default=3)
-    num = next((count for count in _COUNTS if num <= count), -(-num // _COUNTS[-1]) * _COUNTS[-1])
-    size = max(_CORNERS, 1 << (most - 1).bit_length())
-    shape = shape_of("velocities", velocities)
-    if shape not in ((), (2,), (len(parts), 2)):
-        rule = f"the shape (2,) or ({len(parts)}, 2)"
-        raise ArgumentError("velocities", rule, shape, verb="have")
-    require(bool(np.isfinite(np.asarray(velocities)).all()), "velocities", "finite", velocities)
-    speeds = np.broadcast_to(np.asarray(velocities, float), (len(parts), 2))
-    speeds = speeds.repeat([len(each) for each in parts], axis=0)
-    centre, velocity = np.zeros((num, 2)), np.zeros((num, 2))
-    corners = np.zeros((num, size, 2))
-    for k, polygon in enumerate(checked):
-        centre[k], velocity[k] = polygon.mean(axis=0), speeds[k]
-        corners[k] = polygon[np.minimum(np.arange(size), len(polygon) - 1)] - centre[k]
-    return Obstacles(
-        centre=jnp.asarray(centre, dtype),
-        corners=jnp.asarray(corners, dtype),
-        velocity=jnp.asarray(velocity, dtype),
-        present=jnp.asarray(np.arange(num) < len(checked)),
+    def leave(self, x: Array, y: Array) -> tuple[Array, Array]:
+        """Return directions (N, M) of the frames of the obstacles in the world frame."""
+        if self.turn is None:
+            return x, y
+        cos, sin, _ = self.turn
+        return cos * x - sin * y, sin * x + cos * y
+
+
+def place(group: Obstacles, times: Array) -> Placement:
+    """Return where N obstacles are at M times (M,) [s]."""
+    times = times[None]
+    radius = group.radius[:, None] + group.growth[:, None] * jnp.maximum(times, 0.0)
+    track = group.track
+    if track is None:
+        x, y = (
+            group.centre[:, k, None] + group.velocity[:, k, None] * times for k in range(2)
+        )
+        velocity = (group.velocity[:, :1], group.velocity[:, 1:])
+        return Placement(x, y, velocity, None, radius, group.present[:, None])
+    num = track.poses.shape[1]
+    at = (times - track.begin[:, None]) / track.step[:, None]
+    below = jnp.clip(jnp.floor(at), 0, num - 2).astype(jnp.int32)
+    before, after = (
+        jnp.take_along_axis(track.poses, (below + k)[..., None], axis=1) for k in range(2)
     )
+    is_between = (times >= track.begin[:, None]) & (times <= track.end[:, None])
+    rate = (after - before) / track.step[:, None, None]
+    share = (at - below.astype(at.dtype))[..., None]
+    pose = before + jnp.clip(share, 0.0, 1.0) * (after - before)
+    turn = (jnp.cos(pose[..., 2]), jnp.sin(pose[..., 2]), rate[..., 2])
+    present = group.present[:, None] & is_between
+    return Placement(pose[..., 0], pose[..., 1], (rate[..., 0], rate[..., 1]), turn, radius, present)
+
+
+def move_on(group: Obstacles, elapsed: ArrayLike) -> Obstacles:
+    """Return obstacles whose time 0 is `elapsed` () or (B,) [s] later, as a new observation of them.
+
+    Their growth starts anew.
+    """
+    elapsed = jnp.asarray(elapsed)
+    centre = group.centre + group.velocity * elapsed[..., None, None]
+    track = group.track
+    if track is not None:
+        begin, end = (each - elapsed[..., None] for each in (track.begin, track.end))
+        track = dataclasses.replace(track, begin=begin, end=end)
+    return dataclasses.replace(group, centre=centre, track=track)
+
+
+def join_obstacles(first: Obstacles, second: Obstacles) -> Obstacles:
+    """Join two groups of obstacles; repeat corners and poses for equal numbers per polygon.
+
+    If only the second group has a track, the obstacles of the first group stand still.
+    """
+    size = max(first.corners.shape[-2], second.corners.shape[-2])
+    tracks = [each.track for each in (first, second) if each.track is not None]
+    num = max((track.poses.shape[-2] for track in tracks), default=0)
+
+    def pad(group: Obstacles) -> Obstacles:
+        corners = _repeat_last(group.corners, size)
+        track = group.track
+        if num and track is None:
+            still = jnp.zeros_like(group.radius)
+            far = jnp.full_like(still, 1e6)
+            poses = jnp.concatenate([group.centre, still[..., None]], axis=-1)[..., None, :]
+            track = Track(poses, -far, 2.0 * far, far)
+        if track is not None:
+            track = track.replace(poses=_repeat_last(track.poses, num))
+        return group.replace(corners=corners, track=track)
+
+    return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), pad(first), pad(second))
+
+
+def _repeat_last(rows: Array, num: int) -> Array:
+    return jnp.concatenate([rows, *[rows[..., -1:, :]] * (num - rows.shape[-2])], axis=-2)
 
 
 def distances(
@@ -93,12 +146,13 @@ def distances(
 
     Args:
         corners: (N, V, 2) [m], V corners of N polygons, counter-clockwise; may be repeated.
-        present: (N,) bool; absent polygons get the distance 1000 m.
+        present: (N,) or (N, P) bool; absent polygons get the distance 1000.
         x: (N, P) or (1, P) [m], P points for each polygon, or P points for all polygons.
         y: (N, P) or (1, P) [m].
 
     Returns:
         distance: (N, P) [m]. Inside a polygon it is minus the distance of the nearest edge's line.
+            The distance from a polygon without edges is the distance from its corner.
         away: gradient of the distance, a unit vector: its x and y components, each (N, P).
     """
     before = jnp.roll(corners, 1, axis=1)
@@ -118,7 +172,7 @@ def distances(
         share = jnp.clip((from_x * edge_x + from_y * edge_y) * inverse[:, k, None], 0.0, 1.0)
         to_x, to_y = from_x - share * edge_x, from_y - share * edge_y
         away = to_x**2 + to_y**2
-        closer = exists & (away < nearest)
+        closer = away < nearest
         nearest = jnp.where(closer, away, nearest)
         gap_x, gap_y = jnp.where(closer, to_x, gap_x), jnp.where(closer, to_y, gap_y)
         normal_x, normal_y = edge_y * root[:, k, None], -edge_x * root[:, k, None]
@@ -126,14 +180,15 @@ def distances(
         higher = exists & (height > highest)
         highest = jnp.where(higher, height, highest)
         face_x, face_y = jnp.where(higher, normal_x, face_x), jnp.where(higher, normal_y, face_y)
-    outside = highest > 0.0
+    outside = (highest > 0.0) | ~jnp.any(is_edge, axis=1)[:, None]
     length = jnp.sqrt(jnp.maximum(nearest, 1e-12))
     distance = jnp.where(outside, length, highest)
     direction = (
         jnp.where(outside, gap_x / length, face_x),
         jnp.where(outside, gap_y / length, face_y),
     )
-    return jnp.where(present[:, None], distance, 1e3), direction
+    present = present.reshape(corners.shape[0], -1)
+    return jnp.where(present, distance, 1e3), direction
 
 
 def separation(
@@ -146,15 +201,16 @@ def separation(
 
     Args:
         corners: (N, V, 2) [m], V corners of N polygons, counter-clockwise; may be repeated.
-        present: (N,) bool; absent polygons get the gap 1000 m.
+        present: (N,) or (N, P) bool; absent polygons get the gap 1000.
         x: (N, P) or (1, P) [m], P positions of a reference point on the rectangle's long axis.
         y: (N, P) or (1, P) [m].
-        heading: (P,) [rad], direction of the long axis.
+        heading: (P,) or (N, P) [rad], direction of the long axis.
         body: coordinates [m] along the long axis of the rectangle's rear and front ends, relative
             to the reference point, and half its width [m].
     """
     behind, ahead, half = body
-    cos, sin = jnp.cos(heading)[None], jnp.sin(heading)[None]
+    heading = heading.reshape(-1, x.shape[1])
+    cos, sin = jnp.cos(heading), jnp.sin(heading)
     ends = [(a, b) for a in (behind, ahead) for b in (-half, half)]
     points = [(x + a * cos - b * sin, y + a * sin + b * cos) for a, b in ends]
     before = jnp.roll(corners, 1, axis=1)
@@ -182,4 +238,4 @@ def separation(
     along = jnp.maximum(low[0] - ahead, behind - high[0])
     across = jnp.maximum(low[1] - half, -half - high[1])
     best = jnp.maximum(best, jnp.maximum(along, across))
-    return jnp.where(present[:, None], best, 1e3)
+    return jnp.where(present.reshape(corners.shape[0], -1), best, 1e3)

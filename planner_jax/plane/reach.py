@@ -2,7 +2,7 @@
 
 Planners of interceptions (a car meets a moving target) start from coarse paths in this reach set.
 The set has one layer for each of several equally spaced times. A layer has one bit for every speed
-level, every heading bin and every cell of a square grid. The bit tells whether the car can be there
+level, every heading bin and every cell of a rectangular grid. The bit tells whether the car can be there
 at that time without touching a standing or moving obstacle. At a layer the speed changes by at most
 one level, and the heading by a few bins. Between layers, and for half a step before the first
 layer, the car moves straight on.
@@ -25,10 +25,11 @@ import numpy as np
 from flax import struct
 from jax import Array, lax
 
-from planner_jax.plane.obstacles import Obstacles, distances
+from planner_jax.plane.obstacles import Obstacles, distances, place
 
 _STENCIL = 32  # number of cells along each side of the bitmap of one moving obstacle
 _FARTHEST = 16  # greatest number of cells that the car moves in half a step between layers
+AROUND = np.stack(np.meshgrid([0, -1, 1], [0, -1, 1]), axis=-1).reshape(-1, 2)  # 3 x 3 steps
 SPAN = 3  # greatest number of heading bins by which the car turns at one layer, to either side
 
 
@@ -37,11 +38,11 @@ SPAN = 3  # greatest number of heading bins by which the car turns at one layer,
 class Lattice:
     """The sizes of a reach set: its numbers of cells, time layers, speed levels and headings."""
 
-    cells: int = 64  # number of cells along each side of the grid, a multiple of 32
+    cells: tuple[int, int] = (64, 64)  # numbers of cells along x, a multiple of 32, and y
     layers: int = 30  # greatest number of layers in time
     levels: int = 4  # number of speed levels; level 0 is standstill
     headings: int = 32  # number of heading bins in one revolution
-    pace: float = 6.0  # number of cells between two layers at the car's greatest speed
+    pace: float = 6.0  # number of cells along x between two layers at the greatest speed
 
 
 @struct.dataclass
@@ -49,10 +50,8 @@ class Grid:
     """The grid of a set of reachable states: positions of its cells, and times of its layers."""
 
     lattice: Lattice = struct.field(pytree_node=False)
-    lower: Array  # (2,) [m], corner of the map; the vehicle's middle must not leave the map
-    upper: Array  # (2,) [m], opposite corner
     corner: Array  # (2,) [m], middle of the cell (0, 0)
-    cell: Array  # () [m], side length of a cell
+    cell: Array  # (2,) [m], side lengths of a cell along x and y
     step: Array  # () [s], time between two layers; layer n is at the time (n + 1/2) * step
     num: Array  # () int32, index of the layer at the horizon
     start: Array  # (2,) int32, indices [x, y] of the cell at the start
@@ -65,8 +64,9 @@ class Vehicle:
 
     radius: Array  # () [m], radius of the discs
     ahead: Array  # (2,) [m], distances of the discs' middles ahead of the rear axle
-    speed: Array  # () [m/s], greatest speed
+    speeds: Array  # (levels,) [m/s], speeds of the levels, equally spaced
     turn_rates: Array  # (levels,) [rad/s], greatest turn rate at each level of speed
+    acceleration: Array  # () [m/s^2], greatest acceleration; inf: any change by one level
 
 
 @struct.dataclass
@@ -80,6 +80,8 @@ class ReachSet:
     # that the car moves. The axis before it is the first or second half of the time step.
     moves: Array
     turns: Array  # (layers, levels, 2 SPAN + 1) bool, allowed turns at each level of speed
+    changes: Array  # (layers,) bool, whether the speed may change by one level at this layer
+    speeds: Array  # (levels,) [m/s], speeds of the levels
 
 
 def grid_of(
@@ -94,18 +96,16 @@ def grid_of(
         start: (3,) x, y [m] and heading [rad] of the car at time 0.
         time: () [s], the horizon, the latest time of the plan.
         speed: () [m/s], greatest speed of the car.
-        lower: (2,) [m], corner of the map.
+        lower: (2,) [m], corner of the region that the grid covers.
         upper: (2,) [m], opposite corner.
     """
-    cell = jnp.max(upper - lower) / lattice.cells
-    paces = jnp.floor(time * speed / (lattice.pace * cell) - 0.5 + 1e-3)
+    cell = (upper - lower) / jnp.asarray(lattice.cells, upper.dtype)
+    paces = jnp.floor(time * speed / (lattice.pace * cell[0]) - 0.5 + 1e-3)
     num = jnp.clip(paces, 1, lattice.layers)
     step = time / (num + 0.5)
     offset = jnp.round((start[:2] - lower) / cell - 0.5)
     return Grid(
         lattice=lattice,
-        lower=lower,
-        upper=upper,
         corner=start[:2] - cell * offset,
         cell=cell,
         step=step,
@@ -160,23 +160,34 @@ def _map_needed(body: Callable[[Array], Array], over: Array, needed: Array) -> A
     )
 
 
-def _stencils(grid: Grid, movers: Obstacles, radius: Array) -> Array:
-    offsets = grid.cell * (jnp.arange(_STENCIL, dtype=grid.corner.dtype) - _STENCIL // 2)
-    x, y = jnp.meshgrid(offsets, offsets)
-    far, _ = distances(movers.corners, movers.present, x.reshape(1, -1), y.reshape(1, -1))
-    return _pack((far < radius).reshape(-1, _STENCIL, _STENCIL))[0]
+def _stencils(grid: Grid, movers: Obstacles, radius: Array, time: Array) -> Array:
+    """Return bitmaps of the cells around each mover in which a disc touches it at one time () [s].
+
+    The result (N, 32) has words of 32 cells along x, one for each of 32 cells along y.
+    """
+    steps = jnp.arange(_STENCIL, dtype=grid.corner.dtype) - _STENCIL // 2
+    x, y = (
+        each.reshape(1, -1) for each in jnp.meshgrid(grid.cell[0] * steps, grid.cell[1] * steps)
+    )
+    placed = place(movers, time[None])
+    local = placed.enter(placed.x + x, placed.y + y)
+    far, _ = distances(movers.corners, placed.present, *local)
+    touches = far < radius + placed.radius
+    return _pack(touches.reshape(-1, _STENCIL, _STENCIL))[0]
 
 
 def _draw_movers(grid: Grid, movers: Obstacles, stencils: Array, time: Array) -> Array:
-    cells = grid.lattice.cells
-    middle = (movers.centre + movers.velocity * time - grid.corner[None]) / grid.cell
-    at = jnp.round(jnp.clip(middle, -cells, 2.0 * cells)).astype(jnp.int32) - _STENCIL // 2
+    columns, rows = grid.lattice.cells
+    most = jnp.asarray(grid.lattice.cells, grid.cell.dtype)[None]
+    placed = place(movers, time[None])
+    middle = (jnp.concatenate([placed.x, placed.y], axis=1) - grid.corner[None]) / grid.cell[None]
+    at = jnp.round(jnp.clip(middle, -most, 2.0 * most)).astype(jnp.int32) - _STENCIL // 2
 
     def draw_one(stencil: Array, at: Array) -> Array:
-        y = jnp.arange(cells, dtype=at.dtype) - at[1]
+        y = jnp.arange(rows, dtype=at.dtype) - at[1]
         inside = (y >= 0) & (y < _STENCIL)
         row = jnp.where(inside, stencil[jnp.clip(y, 0, _STENCIL - 1)], jnp.uint32(0))
-        return jnp.stack([_word_of(row, at[0] - 32 * word) for word in range(cells // 32)])
+        return jnp.stack([_word_of(row, at[0] - 32 * word) for word in range(columns // 32)])
 
     drawn = jax.vmap(draw_one)(stencils, at)
     return lax.reduce(drawn, jnp.uint32(0), lax.bitwise_or, dimensions=(0,))
@@ -190,6 +201,7 @@ def _word_of(row: Array, at: Array) -> Array:
 def reach_set(
     grid: Grid,
     field: Array,
+    allowed: Array,
     movers: Obstacles,
     vehicle: Vehicle,
     initial_speed: Array,
@@ -199,24 +211,26 @@ def reach_set(
 
     Args:
         grid: positions of the cells and times of the layers, from `grid_of`.
-        field: (cells, cells) [m], distances of the cells' middles from walls; first index along y.
+        field: (cells along y, cells along x) [m], distances of the cells' middles from walls.
+        allowed: (headings, cells along y, cells along x) bool, whether the rear axle may be there,
+            because the body's middle is then on the map.
         movers: moving obstacles.
         vehicle: sizes and limits of the vehicle.
         initial_speed: () [m/s].
         needed: () int32, number of layers to compute, equal for all cases of a batch.
     """
-    lattice, speed = grid.lattice, vehicle.speed
-    levels, headings, num_cells = lattice.levels, lattice.headings, lattice.cells
+    lattice, speeds = grid.lattice, vehicle.speeds
+    levels, headings, (columns, rows) = lattice.levels, lattice.headings, lattice.cells
     dtype = grid.corner.dtype
     width = 2.0 * np.pi / headings
     angle = grid.heading + width * jnp.arange(headings, dtype=dtype)
     direction = jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=1)
-    pace = speed * grid.step / grid.cell * jnp.arange(levels, dtype=dtype) / (levels - 1)
+    pace = (speeds * grid.step)[None, :, None, None] / grid.cell
     # A move is the difference of two rounded positions, so that the moves of n layers add up to the
     # rounded position. If each move were rounded, a car with a heading of 11 degrees would never
     # change its row of cells.
     half_steps = jnp.arange(2 * lattice.layers + 2, dtype=dtype)[:, None, None, None]
-    cells = jnp.round(0.5 * half_steps * pace[None, :, None, None] * direction[None, None])
+    cells = jnp.round(0.5 * half_steps * pace * direction[None, None])
     halves = jnp.diff(cells.astype(jnp.int32), axis=0)  # (2 layers + 1, levels, headings, 2)
     halves = jnp.clip(halves, -_FARTHEST, _FARTHEST)
     moves = jnp.moveaxis(halves[1:].reshape(-1, 2, levels, headings, 2), 1, 3)
@@ -224,27 +238,31 @@ def reach_set(
     before = jnp.arange(lattice.layers + 1, dtype=dtype)[:, None]
     whole = jnp.diff(jnp.floor(before * most[None] + 0.1), axis=0)  # (layers, levels)
     turns = jnp.abs(jnp.arange(-SPAN, SPAN + 1, dtype=dtype))[None, None] <= whole[..., None]
+    gap = speeds[-1] - speeds[-2]
+    change = vehicle.acceleration * grid.step / jnp.maximum(gap, 1e-6)
+    layer_ends = jnp.arange(lattice.layers + 1, dtype=dtype)
+    changes = jnp.diff(jnp.floor(layer_ends * jnp.minimum(change, 1.0) + 0.1)) >= 1.0
     walls = _pack(field < vehicle.radius)
-    stencils = _stencils(grid, movers, vehicle.radius)
-    discs = jnp.round(-vehicle.ahead[:, None, None] * direction[None] / grid.cell).astype(jnp.int32)
-    middle = jnp.mean(vehicle.ahead) * direction  # from the rear axle to the body's middle
-    position = grid.corner[:, None] + grid.cell * jnp.arange(num_cells, dtype=dtype)[None]
-    on_map = (position[None] + middle[:, :, None] > grid.lower[None, :, None]) & (
-        position[None] + middle[:, :, None] < grid.upper[None, :, None]
-    )
-    allowed = jnp.where(on_map[:, 1], _pack(on_map[:, 0])[..., None], jnp.uint32(0))
+    # Movers without a track do not turn, so that one bitmap serves all times. Their growth is
+    # taken from the middle of the time.
+    still = _stencils(grid, movers, vehicle.radius, 0.5 * grid.step * grid.num.astype(dtype))
+    back = -vehicle.ahead[:, None, None] * direction[None]
+    discs = jnp.round(back / grid.cell[None, None]).astype(jnp.int32)
+    packed = _pack(allowed)
 
     times = 0.5 * grid.step * jnp.arange(2 * lattice.layers + 2, dtype=dtype)
     halves_needed = 2 * needed + 2
 
     def draw_obstacles(time: Array) -> Array:
+        turned = movers.track is not None
+        stencils = _stencils(grid, movers, vehicle.radius, time) if turned else still
         return walls | _draw_movers(grid, movers, stencils, time)
 
     blocked = _map_needed(draw_obstacles, times, halves_needed)
 
     def find_free(blocked: Array) -> Array:
-        each = jnp.broadcast_to(blocked[:, None], (num_cells // 32, headings, num_cells))
-        return allowed & ~(_shift(each, discs[0]) | _shift(each, discs[1]))
+        each = jnp.broadcast_to(blocked[:, None], (columns // 32, headings, rows))
+        return packed & ~(_shift(each, discs[0]) | _shift(each, discs[1]))
 
     free = _map_needed(find_free, blocked, halves_needed)  # for every half step between layers
 
@@ -258,7 +276,7 @@ def reach_set(
         return moved & free[2 * n + half + 2][:, None]
 
     parts = [
-        lambda bits, n: _change_speed(bits),
+        lambda bits, n: jnp.where(changes[n], _change_speed(bits), bits),
         lambda bits, n: _turn(bits, turns[n]),
         *(functools.partial(move, half=half) for half in range(2) for move in (move_y, move_x)),
     ]
@@ -278,19 +296,18 @@ def reach_set(
         bits = lax.platform_dependent(bits, n, cpu=apart, default=at_once)
         return bits, lax.dynamic_update_index_in_dim(layers, bits, n + 1, 0)
 
-    first = _start_bits(grid, initial_speed, speed)
+    first = _start_bits(grid, initial_speed, speeds)
     first = _shift(first & free[0][:, None], halves[0]) & free[1][:, None]
     layers = jnp.zeros((lattice.layers + 1, *first.shape), first.dtype).at[0].set(first)
     _, layers = lax.fori_loop(0, needed, layer, (first, layers))
-    return ReachSet(bits=layers, moves=moves, turns=turns)
+    return ReachSet(bits=layers, moves=moves, turns=turns, changes=changes, speeds=speeds)
 
 
-def _start_bits(grid: Grid, initial_speed: Array, speed: Array) -> Array:
+def _start_bits(grid: Grid, initial_speed: Array, speeds: Array) -> Array:
     lattice, cell = grid.lattice, grid.start
-    level = initial_speed / speed * (lattice.levels - 1)
-    near = jnp.abs(jnp.arange(lattice.levels, dtype=level.dtype) - level) < 1.0
-    indices = jnp.arange(lattice.cells, dtype=cell.dtype)
-    at = (indices[:, None] == cell[1]) & (indices[None] == cell[0])
+    near = jnp.abs(speeds - initial_speed) < jnp.maximum(speeds[-1] - speeds[-2], 1e-6)
+    x, y = (jnp.arange(num, dtype=cell.dtype) for num in lattice.cells)
+    at = (y[:, None] == cell[1]) & (x[None] == cell[0])
     bits = near[:, None, None] & (jnp.arange(lattice.headings) == 0)[None, :, None]
     return jnp.where(bits, _pack(at)[:, None, None], jnp.uint32(0))
 
@@ -312,40 +329,41 @@ def _turn(bits: Array, turns: Array) -> Array:
 def bit_at(bits: Array, level: Array, heading: Array, cell: Array) -> Array:
     """Test whether a state (speed level, heading bin, cell [x, y]) is marked in a bitmap.
 
-    `bits` is (words, levels, headings, cells) uint32. Bit i of word w is the cell 32 w + i along x.
+    `bits` is (words, levels, headings, cells along y) uint32. Bit i of word w is the cell 32 w + i
+    along x.
     """
-    _, levels, headings, cells = bits.shape
-    inside = jnp.all((cell >= 0) & (cell < cells)) & (level >= 0) & (level < levels)
-    x, y = jnp.clip(cell, 0, cells - 1)
+    words, levels, headings, rows = bits.shape
+    x, y = jnp.clip(cell[0], 0, 32 * words - 1), jnp.clip(cell[1], 0, rows - 1)
+    inside = (x == cell[0]) & (y == cell[1]) & (level >= 0) & (level < levels)
     word = bits[x // 32, jnp.clip(level, 0, levels - 1), heading % headings, y]
     return inside & (((word >> (x % 32).astype(jnp.uint32)) & 1) > 0)
 
 
 def goal_cells(
-    grid: Grid, layer: Array, goal: Array, ahead: Array, headings: Array
+    grid: Grid, layer: Array, goals: Array, ahead: Array, headings: Array
 ) -> tuple[Array, Array]:
-    """Return the cells around the position of a goal, and whether the car can be there.
+    """Return the cells at the positions of goals, and whether the car can be there.
 
     Args:
         grid: grid of the reach set.
         layer: (words, levels, headings, cells) uint32, bits of the time layer of the meeting.
-        goal: (2,) [m], position to be met.
+        goals: (9, 2) [m], positions to be met; if all are equal, one position.
         ahead: () [m], distance from the rear axle forward to the point that meets the goal.
         headings: (headings,) bool, allowed headings.
 
     Returns:
-        cells: (headings, 9, 2) int32, indices [x, y] of 3 x 3 cells for the rear axle. The first of
-            the 9 cells is the one whose middle is nearest to the goal.
+        cells: (headings, 9, 2) int32, indices [x, y] of cells for the rear axle: each is nearest to
+            a goal, and displaced by one of 3 x 3 steps. The first of the 9 cells is not displaced.
         is_reached: (levels, headings, 9) bool, whether the car can be in the cell.
     """
     lattice = grid.lattice
     width = 2.0 * np.pi / lattice.headings
     bins = jnp.arange(lattice.headings)
     angle = grid.heading + width * bins.astype(grid.cell.dtype)
-    axle = goal[None] - ahead * jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=1)
-    nearest = jnp.round((axle - grid.corner[None]) / grid.cell).astype(jnp.int32)
-    around = jnp.asarray(np.stack(np.meshgrid([0, -1, 1], [0, -1, 1]), axis=-1).reshape(-1, 2))
-    cells = nearest[:, None].astype(around.dtype) + around[None]
+    back = ahead * jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=1)
+    axle = goals[None] - back[:, None]
+    nearest = jnp.round((axle - grid.corner) / grid.cell).astype(jnp.int32)
+    cells = nearest + jnp.asarray(AROUND, jnp.int32)[None]
     of_level = jax.vmap(jax.vmap(bit_at, (None, None, None, 0)), (None, None, 0, 0))
     of_all = jax.vmap(of_level, (None, 0, None, None))
     return cells, of_all(layer, jnp.arange(lattice.levels), bins, cells) & headings[None, :, None]

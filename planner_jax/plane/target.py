@@ -5,9 +5,12 @@ The classes here cover the targets of [Qu2022], and polynomials fitted to observ
 target. Users may write classes of their own. World frame in the plane, SI units.
 """
 
-from typing import Protocol
+import dataclasses
+from typing import Any, Protocol
 
+import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 from jax import Array
 
@@ -66,6 +69,40 @@ class PolynomialPath:
 
 
 @struct.dataclass
+class PositionPath:
+    """A path whose velocity is the derivative of the positions that another path returns."""
+
+    path: Any  # a pytree whose method `at(time)` returns a position (2,) [m]
+
+    def at(self, time: Array) -> PointState:
+        """Return position [m] and velocity [m/s] at one time () [s]."""
+        return PointState(*jax.jvp(self.path.at, (time,), (jnp.ones_like(time),)))
+
+
+@struct.dataclass
+class ScaledPath:
+    """A path in another frame and in other units of length and time."""
+
+    path: PlanePath
+    frame: Array  # (3,) x [m], y [m] and heading [rad] of the frame in the world of `path`
+    length: Array  # () [m], unit of length
+    time: Array  # () [s], unit of time
+
+    def at(self, time: Array) -> PointState:
+        """Return position and velocity at one time (), all in the units."""
+        state = self.path.at(time * self.time)
+        pos = rotate(state.pos - self.frame[:2], -self.frame[2]) / self.length
+        return PointState(pos, rotate(state.vel, -self.frame[2]) * (self.time / self.length))
+
+
+def rotate(vectors: Array, angle: Array) -> Array:
+    """Rotate vectors (..., 2) counter-clockwise by an angle () [rad]."""
+    cos, sin = jnp.cos(angle), jnp.sin(angle)
+    x, y = vectors[..., 0], vectors[..., 1]
+    return jnp.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
+
+
+@struct.dataclass
 class LaterPath:
     """A path with a later time origin: its time 0 is the time `begin` of another path."""
 
@@ -110,6 +147,26 @@ class FadingPath:
         way = jnp.sum(ahead[:, None] * self.vel + aside[:, None] * across, axis=0)
         vel = jnp.sum(cos[:, None] * self.vel + sin[:, None] * across, axis=0)
         return PointState(pos=self.pos + passed * way, vel=vel)
+
+
+def move_path(path: PlanePath, by: np.ndarray) -> PlanePath:
+    """Return a path of one of the classes above, moved by a vector (2,) float64 [m].
+
+    The vector is added in float64. Paths of other classes are returned unchanged.
+    """
+
+    def add(leaf: Array, index: tuple = ()) -> Array:
+        moved = np.array(leaf, np.float64)
+        moved[(..., *index, slice(None))] += by
+        return jnp.asarray(moved.astype(np.result_type(np.asarray(leaf).dtype, np.float32)))
+
+    if isinstance(path, LaterPath):
+        return dataclasses.replace(path, path=move_path(path.path, by))
+    if isinstance(path, TurningPath | FadingPath):
+        return dataclasses.replace(path, pos=add(path.pos))
+    if isinstance(path, PolynomialPath):
+        return dataclasses.replace(path, coeffs=add(path.coeffs, (0,)))
+    return path
 
 
 def arc(turn_rate: Array, time: Array) -> tuple[Array, Array]:

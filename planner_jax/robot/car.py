@@ -67,15 +67,20 @@ class CarPlan(Plan):
     time: Array  # () [s], end of the plan
     speed: Array  # (K + 1,) [m/s], at the knots, the first at time 0, the last at `time`
     curvature: Array  # (K + 1,) [1/m], at the knots
+    origin: Array  # (2,) [m], world position to which `start` is relative
 
     def sample(self, rate: float) -> CarSetpoints:
         """Sample the plan, or the batch of plans, `rate` times a second from start to end.
+
+        Positions are in the world frame, in float64.
 
         Raises:
             ValueError: the rate is not positive.
         """
         leaves = (self.start, self.time, self.speed, self.curvature)
-        return CarSetpoints(**sample_at_rate(rate, self.time, leaves, _setpoint_at))
+        samples = sample_at_rate(rate, self.time, leaves, _setpoint_at)
+        origin = np.asarray(self.origin, np.float64)[..., None, :]
+        return CarSetpoints(**{**samples, "pos": samples["pos"] + origin})
 
 
 # Nodes and weights of Gauss-Legendre quadrature on (0, 1), exact for polynomials of degree 9.

@@ -148,6 +148,8 @@ def without_movers(case: InterceptCase) -> InterceptCase:
         corners=jnp.zeros((1, 3, 2), goal.dtype),
         velocity=jnp.zeros((1, 2), goal.dtype),
         present=jnp.zeros(1, bool),
+        radius=jnp.zeros(1, goal.dtype),
+        growth=jnp.zeros(1, goal.dtype),
     )
     return dataclasses.replace(case, target=still, movers=none)
 

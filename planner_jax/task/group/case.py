@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from planner_jax.core.checks import require_path
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.rules import PERMUTATION, Field, Table
+from planner_jax.plane.obstacles import move_on
 from planner_jax.plane.target import LaterPath, PlanePath
 from planner_jax.task.intercept.case import InterceptCase
 from planner_jax.task.intercept.case import case as single_case
@@ -84,7 +85,7 @@ class InterceptGroup:
             target=LaterPath(path=path, begin=begin),
             # Remaining time [s]: at least 1 ms, because the time of a case must be positive.
             time=jnp.maximum(shared.time - begin, 1e-3),
-            movers=dataclasses.replace(movers, centre=movers.centre + begin * movers.velocity),
+            movers=move_on(movers, begin),
         )
 
 

@@ -122,6 +122,7 @@ def _clear_unneeded(cases: InterceptCase, plans: InterceptPlan, needed: Array) -
         time=zero,
         speed=jnp.repeat(cases.speed[:, None], num, axis=1),
         curvature=jnp.repeat(cases.curvature[:, None], num, axis=1),
+        origin=cases.origin,
         meeting=plans.meeting,
     )
 

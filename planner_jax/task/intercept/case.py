@@ -13,13 +13,15 @@ from jax import Array
 from jax.typing import DTypeLike
 from numpy.typing import ArrayLike
 
+from planner_jax.ball.prediction import PathTable
 from planner_jax.core import rules
 from planner_jax.core.checks import floating, require_path, shape_of
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.rules import Field, Table, require_sound
-from planner_jax.plane.obstacles import Obstacles, obstacles
+from planner_jax.plane.make_obstacles import Circle, obstacles
+from planner_jax.plane.obstacles import Obstacles
 from planner_jax.plane.polygons import Geometry, Polygon
-from planner_jax.plane.target import PlanePath
+from planner_jax.plane.target import PlanePath, PositionPath, move_path
 from planner_jax.robot.car import CarBody, CarLimits
 from planner_jax.task.arguments import array_of, batch_of
 
@@ -44,8 +46,24 @@ RULES: Table = (
             ("present", (), np.bool_),
         )
     ),
-    Field("lower", (2,), rules.below("upper")),
-    Field("upper", (2,)),
+    *(
+        Field(f"{group}.{name}", (letter,), rules.NOT_NEGATIVE)
+        for group, letter in (("walls", "W"), ("movers", "M"))
+        for name in ("radius", "growth")
+    ),
+    *(
+        Field(f"movers.track.{name}", shape)
+        for name, shape in (("poses", ("M", "K", 3)), ("begin", ("M",)), ("end", ("M",)))
+    ),
+    Field("movers.track.step", ("M",), rules.POSITIVE),
+    Field("region", ("V", 2)),
+    Field("earliest", (), rules.NOT_NEGATIVE),
+    Field("end_speed", (2,), rules.NOT_NEGATIVE_OR_NONE),
+    Field("margin", (), rules.NOT_NEGATIVE),
+    Field("map_heading", ()),
+    Field("origin", (2,)),
+    Field("lower", (2,), rules.below_or_infinite("upper")),
+    Field("upper", (2,), rules.NUMBER),
     *(Field(f"body.{name}", (), rules.POSITIVE) for name in _BODY if name != "rear_overhang"),
     Field("body.rear_overhang", ()),
     *(Field(f"limits.{name}", (), rules.POSITIVE_OR_NONE) for name in _LIMITS),
@@ -54,6 +72,8 @@ RULES: Table = (
 _ARGUMENTS = {
     "speed": "initial_speed",
     "curvature": "initial_curvature",
+    **{f"movers.track.{name}": "mover_paths" for name in ("poses", "begin", "step", "end")},
+    "movers.growth": "mover_growth",
     **{f"body.{name}": name for name in _BODY},
     **{f"limits.{name}": name for name in _LIMITS},
 }
@@ -63,8 +83,9 @@ _ARGUMENTS = {
 class InterceptCase:
     """One interception to plan, or a batch of cases; every number is a leaf of the pytree.
 
-    The middle of the car's body has to come within `tolerance` of the target at the time of the
-    meeting. World frame in the plane, SI units. Time 0 is when the car starts to drive.
+    The middle of the car's body has to come within `tolerance` of the target, or of the region
+    around it, at the time of the meeting. World frame in the plane, SI units, positions relative to
+    `origin`. Time 0 is when the car starts to drive.
     """
 
     rules: ClassVar[Table] = RULES
@@ -83,6 +104,12 @@ class InterceptCase:
     upper: Array  # (2,) [m], the opposite corner
     body: CarBody
     limits: CarLimits
+    region: Array  # (V, 2) [m], convex polygon around the target; all 0: the target itself
+    earliest: Array  # () [s], earliest time of a meeting, for planners that choose the time
+    end_speed: Array  # (2,) [m/s], least and greatest speed of the car at the meeting
+    margin: Array  # () [m], least distance of the body from obstacles
+    map_heading: Array  # () [rad], direction of the axes of `lower` and `upper`
+    origin: Array  # (2,) [m], world position to which all positions of the case are relative
 
     @property
     def batch_shape(self) -> tuple[int, ...]:
@@ -97,14 +124,22 @@ def case(
     start: ArrayLike = (0.8, 4.0, 0.0),
     initial_speed: ArrayLike = 0.5,
     initial_curvature: ArrayLike = 0.0,
-    walls: Sequence[Polygon] | Geometry | Obstacles = (),
-    movers: Sequence[Polygon] | Geometry | Obstacles = (),
+    walls: Sequence[Polygon | Circle] | Geometry | Obstacles = (),
+    movers: Sequence[Polygon | Circle] | Geometry | Obstacles = (),
     mover_velocities: ArrayLike = 0.0,
+    mover_paths: Sequence[object] | None = None,
+    mover_growth: ArrayLike = 0.0,
     tolerance: ArrayLike = 0.05,
+    region: ArrayLike = (),
+    earliest: ArrayLike = 0.0,
     end_heading: ArrayLike | None = None,
     heading_tolerance: ArrayLike = 0.05,
+    end_speed: ArrayLike = (0.0, np.inf),
+    margin: ArrayLike = 0.0,
     lower: ArrayLike = (0.0, 0.0),
     upper: ArrayLike = (8.0, 8.0),
+    map_heading: ArrayLike = 0.0,
+    origin: ArrayLike | None = None,
     length: ArrayLike = 0.4,
     width: ArrayLike = 0.25,
     wheelbase: ArrayLike = 0.3,
@@ -128,16 +163,35 @@ def case(
         start: (3,) x, y of the rear axle's middle [m], and heading [rad], at time 0.
         initial_speed: [m/s], speed at time 0.
         initial_curvature: [1/m], curvature of the rear axle's path at time 0.
-        walls: static obstacles: polygons with V corners (V, 2) [m], or geometries of Shapely, which
-            all cases share; or `Obstacles` with the batch's axes on every leaf. Polygons need not
-            be convex, since `pj.obstacles` cuts them into convex parts.
+        walls: static obstacles: polygons with V corners (V, 2) [m], `Circle`s, or geometries of
+            Shapely, which all cases share; or `Obstacles` with the batch's axes on every leaf.
+            Polygons need not be convex, since `pj.obstacles` cuts them into convex parts.
         movers: moving obstacles at time 0, as polygons or `Obstacles`, like the walls.
         mover_velocities: (2,) or (N, 2) [m/s], of the N polygons in `movers`.
-        tolerance: [m], greatest distance of the body's middle from the target at the meeting.
+        mover_paths: for each polygon in `movers` None, or its recorded motion: increasing times
+            (K,) [s], and its poses (K, 3) at these times: x, y [m] and heading [rad]. The corners
+            of such a polygon are in its own frame, relative to x, y, at heading 0. It exists from
+            its first to its last time only, and its pose is linear in time between two times.
+        mover_growth: () or (N,) [m/s], rate at which each mover grows on all sides after time 0,
+            because its motion is uncertain.
+        tolerance: [m], greatest distance of the body's middle from the target, or from the region,
+            at the meeting.
+        region: (V, 2) [m], corners of a convex polygon relative to the target, counter-clockwise or
+            clockwise. The body's middle has to be in this region at the meeting. By default the
+            region is the target's position.
+        earliest: [s], earliest time of the meeting, for planners that choose the time.
         end_heading: [rad], heading of the car at the meeting; by default any heading.
         heading_tolerance: [rad], greatest deviation from `end_heading`.
-        lower: (2,) [m], corner of the map.
-        upper: (2,) [m], the opposite corner.
+        end_speed: (2,) [m/s], least and greatest speed of the car at the meeting.
+        margin: [m], distance from every obstacle that the car's body has to keep.
+        lower: (2,) [m], corner of the map, in the axes of the map. It may be -inf.
+        upper: (2,) [m], the opposite corner. It may be inf.
+        map_heading: [rad], direction of the map's first axis. The map's axes pass through the
+            world's origin.
+        origin: (2,) [m], world position that is subtracted from every position in float64, before
+            positions are rounded to `dtype`. By default it is 0 if `dtype` can represent the start
+            to 1 % of the tolerance, and else the start itself. The map's axes then pass through
+            this position. Targets of your own classes must return positions relative to it.
         length: [m], of the body.
         width: [m], of the body.
         wheelbase: [m], distance between the axles.
@@ -153,48 +207,103 @@ def case(
         ValueError: the edges of a polygon cross, or an array has a wrong shape or an invalid value.
     """
     dtype, shapes = floating(dtype), [batch_of("start", start, 3)]
+    shift = _find_origin(start, tolerance, origin, dtype)
     scalars = {"time": time, "initial_speed": initial_speed, "tolerance": tolerance}
     shapes += [shape_of(name, value) for name, value in scalars.items()]
     batch = max(shapes, key=len)
 
     leaf = functools.partial(array_of, batch=batch, dtype=dtype)
-    require_path("target", target, batch, 2)
+    is_bare = require_path("target", target, batch, 2)
     is_free = end_heading is None
     around = leaf("heading_tolerance", heading_tolerance)
     body = (length, width, wheelbase, rear_overhang)
     limits = (speed, acceleration, lateral_acceleration, curvature, steering_rate)
+    moved = functools.partial(_make_obstacles, origin=shift, batch=batch, dtype=dtype)
+    movement = {"velocities": mover_velocities, "paths": mover_paths, "growth": mover_growth}
     result = InterceptCase(
-        start=leaf("start", start, 3),
+        start=leaf("start", np.asarray(start, np.float64) - [*shift, 0.0], 3),
         speed=leaf("initial_speed", initial_speed),
         curvature=leaf("initial_curvature", initial_curvature),
-        target=target,
+        target=_move_target(PositionPath(target) if is_bare else target, shift, origin is None),
         time=leaf("time", time),
         tolerance=leaf("tolerance", tolerance),
         end_heading=leaf("end_heading", 0.0 if is_free else end_heading),
         heading_tolerance=jnp.full_like(around, np.pi) if is_free else around,
-        walls=_make_obstacles("walls", walls, 0.0, batch, dtype),
-        movers=_make_obstacles("movers", movers, mover_velocities, batch, dtype),
-        lower=leaf("lower", lower, 2),
-        upper=leaf("upper", upper, 2),
+        walls=moved("walls", walls),
+        movers=moved("movers", movers, **movement),
+        lower=leaf("lower", np.asarray(lower, np.float64) - shift, 2),
+        upper=leaf("upper", np.asarray(upper, np.float64) - shift, 2),
         body=CarBody(*map(leaf, _BODY, body)),
         limits=CarLimits(*map(leaf, _LIMITS, limits)),
+        region=_make_region(region, batch, dtype),
+        earliest=leaf("earliest", earliest),
+        end_speed=leaf("end_speed", end_speed, 2),
+        margin=leaf("margin", margin),
+        map_heading=leaf("map_heading", map_heading),
+        origin=leaf("origin", shift, 2),
     )
     require_sound(result, _ARGUMENTS)
     return result
 
 
+def _find_origin(
+    start: ArrayLike, tolerance: ArrayLike, origin: ArrayLike | None, dtype: DTypeLike
+) -> np.ndarray:
+    """Return the position (2,) float64 to which the positions of a case are relative.
+
+    It is rounded to a number of the type `dtype`, so that the case stores it exactly.
+    """
+    if origin is None:
+        starts = np.asarray(start, np.float64).reshape(-1, 3)[:, :2]
+        rounding = float(np.finfo(dtype).eps) * np.abs(starts).max(initial=0.0)
+        is_exact = rounding <= 0.01 * np.min(np.asarray(tolerance, np.float64))
+        origin = np.zeros(2) if is_exact or not np.isfinite(starts).all() else starts[0]
+    elif shape_of("origin", origin) != (2,):
+        raise ArgumentError("origin", "the shape (2,)", np.shape(origin), verb="have")
+    return np.asarray(origin, np.float64).astype(dtype).astype(np.float64)
+
+
+def _move_target(target: PlanePath, origin: np.ndarray, is_chosen: bool) -> PlanePath:
+    """Return a target's path with positions relative to `origin` (2,) float64 [m]."""
+    if not origin.any():
+        return target
+    if isinstance(target, PathTable):
+        pos = np.asarray(target.pos, np.float64) - origin
+        return dataclasses.replace(target, pos=jnp.asarray(pos, np.asarray(target.vel).dtype))
+    moved = move_path(target, -origin)
+    if moved is target and is_chosen:
+        rule = "relative to the argument origin, which a class of your own needs far from (0, 0)"
+        raise ArgumentError("target", rule, shown=f"a {type(target).__name__}")
+    return moved
+
+
 def _make_obstacles(
     name: str,
-    polygons: Sequence[Polygon] | Geometry | Obstacles,
-    velocities: ArrayLike,
+    polygons: Sequence[Polygon | Circle] | Geometry | Obstacles,
+    *,
+    origin: np.ndarray,
     batch: tuple[int, ...],
     dtype: DTypeLike,
+    **movement: object,
 ) -> Obstacles:
     if isinstance(polygons, Obstacles):
+        if origin.any():
+            raise ArgumentError(name, "polygons if the case has an origin", shown="Obstacles")
         return polygons
     try:
-        one = obstacles(polygons, velocities, dtype=dtype)
+        one = obstacles(polygons, origin=origin, dtype=dtype, **movement)
     except ArgumentError as error:
-        names = {"polygons": name, "velocities": "mover_velocities"}
+        names = {"polygons": name, **{key: f"mover_{key}" for key in movement}}
         raise error.with_names(names) from None
     return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, batch + leaf.shape), one)
+
+
+def _make_region(region: ArrayLike, batch: tuple[int, ...], dtype: DTypeLike) -> Array:
+    if not np.size(region):
+        return jnp.zeros((*batch, 1, 2), dtype)
+    try:
+        one = obstacles([region], dtype=dtype)
+    except ArgumentError as error:
+        raise error.with_names({"polygons": "region"}) from None
+    corners = one.corners[0] + one.centre[0]
+    return jnp.broadcast_to(corners, batch + corners.shape)

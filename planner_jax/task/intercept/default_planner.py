@@ -12,6 +12,7 @@ are the car's speed and curvature at equally spaced times. There are three stage
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import ClassVar, Literal
 
@@ -45,6 +46,7 @@ from planner_jax.task.intercept.searches import (
     make_grid,
     search_reach,
 )
+from planner_jax.task.intercept.units import enter_units, leave_units, units_of
 
 _SPREAD = 2  # early paths end in one of the first two time layers that reach the target
 
@@ -125,7 +127,12 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
 
         With `tries_all`, or if the meeting time is free, all paths are tried for the best plan.
         """
-        problem, search = self.problem, self.load_attempt(attempt, case)
+        units = units_of(case)
+        plan = self._solve(enter_units(case, units), self.load_attempt(attempt, case))
+        return leave_units(plan, case, units, is_early=self.meet == "early")
+
+    def _solve(self, case: InterceptCase, search: LoadedSearch) -> InterceptPlan:
+        problem = self.problem
         found = search_reach(case, search, is_time_free=problem.is_time_free)
         stages = problem.list_stages(search)
         num = jnp.where(found.is_reached, search.paths, 0)
@@ -148,9 +155,14 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
 
     def solve_at_once(self, cases: InterceptCase, attempt: Search) -> InterceptPlan:
         """Plan a batch: try all random paths of cells together, select each case's best plan."""
-        search = self.load_attempt(attempt, cases)
-        layers = jnp.max(jax.vmap(lambda case: make_grid(case, search.lattice).num)(cases))
-        return jax.vmap(lambda case: self._solve_all_paths(case, search, layers))(cases)
+        search, is_free = self.load_attempt(attempt, cases), self.problem.is_time_free
+        units = jax.vmap(units_of)(cases)
+        local = jax.vmap(enter_units)(cases, units)
+        grids = jax.vmap(lambda case: make_grid(case, search.lattice, is_time_free=is_free))(local)
+        layers = jnp.max(grids.num)
+        plans = jax.vmap(lambda case: self._solve_all_paths(case, search, layers))(local)
+        leave = functools.partial(leave_units, is_early=self.meet == "early")
+        return jax.vmap(leave)(plans, cases, units)
 
     def _solve_all_paths(
         self, case: InterceptCase, attempt: LoadedSearch, layers: Array
@@ -193,7 +205,7 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
                 allowed &= jnp.cumsum(found.layers) <= _SPREAD
             layer = jnp.argmax(jnp.where(allowed, noise.layers, -jnp.inf))
         path = draw_cell_path(case, found, layer, noise, attempt.directness)
-        return self.problem.guess_along(case, found.grid, path, layer)
+        return self.problem.guess_along(case, found.grid, found.reach.speeds, path, layer)
 
     def _explain(
         self, case: InterceptCase, attempt: LoadedSearch, found: Reachability, plan: InterceptPlan

@@ -20,7 +20,7 @@ _GRAZING = 5e-3  # [m], required clearance at samples, so that nothing is touche
 class InterceptPlan(CarPlan):
     """A car's plan up to the meeting with its target, or a batch: each leaf has a leading axis."""
 
-    meeting: Array  # (2,) [m], expected position of the target at the end of the plan
+    meeting: Array  # (2,) [m], expected position of the target at the end, relative to `origin`
 
 
 def make_plan(
@@ -56,6 +56,7 @@ def make_plan(
         time=time,
         speed=speed,
         curvature=curvature,
+        origin=case.origin,
         meeting=case.target.at(time).pos,
     )
 
@@ -71,6 +72,7 @@ def make_straight_plan(case: InterceptCase, pieces: int) -> InterceptPlan:
         time=case.time,
         speed=jnp.full(pieces + 1, case.speed),
         curvature=jnp.full(pieces + 1, case.curvature),
+        origin=case.origin,
         meeting=case.target.at(case.time).pos,
     )
 

@@ -26,12 +26,14 @@ from planner_jax.optimise.planner import OptimisedPlanner
 from planner_jax.optimise.settings import Evaluation, LbfgsConfig, NewtonConfig, Round
 from planner_jax.plane.cell_paths import CellPath
 from planner_jax.plane.distance_field import DistanceField
+from planner_jax.plane.obstacles import join_obstacles
 from planner_jax.plane.reach import Grid
 from planner_jax.task.intercept import terms
 from planner_jax.task.intercept.case import InterceptCase
 from planner_jax.task.intercept.motion import Quadratic, by_unknowns, motion
 from planner_jax.task.intercept.plan import InterceptPlan, make_plan
 from planner_jax.task.intercept.searches import Search, Warm
+from planner_jax.task.intercept.units import Units, enter_units, leave_units, units_of
 
 _SOONEST = 0.01  # earliest time of a meeting, divided by the case's time
 
@@ -93,10 +95,17 @@ class MotionProblem:
         parts = [speed, curvature, time[..., None]]
         return jnp.concatenate(parts if self.is_time_free else parts[:2], axis=-1)
 
+    def enter_units(self, point: Array, units: Units) -> Array:
+        """Convert unknowns (n,) in SI units to the units of a case."""
+        num = self.pieces
+        speed, curvature = point[:num] / units.speed, point[num : 2 * num] * units.length
+        return self.pack(speed, curvature, point[-1] / units.time)
+
     def unpack(self, case: InterceptCase, point: Array) -> tuple[Array, Array, Array]:
         """Split the unknowns into speed and curvature at all K + 1 knots, and the meeting time."""
         speed, curvature = point[: self.pieces], point[self.pieces : 2 * self.pieces]
-        time = jnp.clip(point[-1], _SOONEST * case.time, case.time)
+        soonest = jnp.maximum(_SOONEST * case.time, case.earliest)
+        time = jnp.clip(point[-1], jnp.minimum(soonest, case.time), case.time)
         return (
             jnp.concatenate([case.speed[None], speed]),
             jnp.concatenate([case.curvature[None], curvature]),
@@ -113,15 +122,16 @@ class MotionProblem:
         """Return a starting point with given unknowns, for stages without a path of grid cells."""
         return Guess(point=point, positions=jnp.zeros((self.pieces, 2), point.dtype))
 
-    def guess_along(self, case: InterceptCase, grid: Grid, path: CellPath, layer: Array) -> Guess:
+    def guess_along(
+        self, case: InterceptCase, grid: Grid, speeds: Array, path: CellPath, layer: Array
+    ) -> Guess:
         """Return a starting point whose motion follows a path of cells, headings and speeds.
 
         The path has one cell for each of the grid's equally spaced times. It meets the target at
-        the time with the index `layer` () int32.
+        the time with the index `layer` () int32. `speeds` (levels,) are the speeds of its levels.
         """
         width = 2.0 * np.pi / grid.lattice.headings
-        pace = case.limits.speed / (grid.lattice.levels - 1)
-        steps = layer.astype(pace.dtype) + 0.5
+        steps = layer.astype(speeds.dtype) + 0.5
         # Times of the knots 1 to K, in units of the grid's time step.
         at = jnp.arange(1, self.pieces + 1, dtype=steps.dtype) * (steps / self.pieces)
 
@@ -135,7 +145,7 @@ class MotionProblem:
             low = jnp.where(is_first, first, values[jnp.maximum(below, 0)])
             return (1.0 - share) * low + share * values[jnp.minimum(below + 1, layer - 1)]
 
-        speed = interpolate(pace * path.level.astype(grid.cell.dtype), case.speed, at)
+        speed = interpolate(speeds[path.level], case.speed, at)
         bins = width * path.bin.astype(grid.cell.dtype)
         # The path's headings, relative to the car's initial heading, may include full turns.
         # `straight` [rad] is the multiple of 2 pi in the first of these headings.
@@ -150,10 +160,10 @@ class MotionProblem:
         turned = 0.5 * knot * (first + 2.0 * rate[0] + rate[1])
         lag = interpolate(bins, straight, at)[1] - straight - turned
         rate = rate.at[:2].add(0.5 * lag / knot)
-        curvature = rate / jnp.maximum(speed, 0.3 * case.limits.speed)
+        curvature = rate / jnp.maximum(speed, 0.3 * speeds[-1])
         limit = case.limits.curvature
         point = self.pack(speed, jnp.clip(curvature, -limit, limit), time)
-        cells = grid.corner[None] + grid.cell * path.cell.astype(grid.cell.dtype)
+        cells = grid.corner[None] + grid.cell[None] * path.cell.astype(grid.cell.dtype)
         return Guess(point=point, positions=interpolate(cells, case.start[:2], at - 0.5))
 
     def build_model(
@@ -290,7 +300,8 @@ class StartedCase(InterceptCase):
 @struct.dataclass
 class _Context:
     case: StartedCase
-    moving: StartedCase  # the case with its walls added to the movers, at speed 0
+    units: Units
+    moving: StartedCase  # the case in its units, with its walls added to the movers, at speed 0
     field: DistanceField  # distances of a map without walls
 
 
@@ -312,11 +323,16 @@ class SmoothIntercept(OptimisedPlanner):
         Distances from moving obstacles are computed exactly. Distances from walls are usually
         interpolated on a grid, so that their derivatives are discontinuous.
         """
-        nowhere = jnp.full((2, 2), 1e3, case.lower.dtype)
+        units = units_of(case)
+        local = enter_units(case, units)
+        none = jnp.zeros_like(local.start[:2])
         return _Context(
             case=case,
-            moving=dataclasses.replace(case, movers=terms.join_obstacles(case.walls, case.movers)),
-            field=DistanceField(values=nowhere, corner=case.lower, spacing=case.time),
+            units=units,
+            moving=dataclasses.replace(local, movers=join_obstacles(local.walls, local.movers)),
+            field=DistanceField(
+                values=jnp.full((2, 2), 1e3, none.dtype), corner=none, spacing=none + 1.0
+            ),
         )
 
     def guesses(self, context: _Context, num: int) -> Array:
@@ -325,7 +341,7 @@ class SmoothIntercept(OptimisedPlanner):
         All rows are equal, because there is only one stored plan.
         """
         fixed = lax.stop_gradient(context)
-        start = fixed.case.start_point
+        start = self.problem.enter_units(fixed.case.start_point, fixed.units)
         end = least_squares(lambda x: self._exact_model(x, fixed), start, self.solver)
         return jnp.broadcast_to(end.point, (num, *end.point.shape))
 
@@ -349,7 +365,9 @@ class SmoothIntercept(OptimisedPlanner):
 
     def decode(self, point: Array, context: _Context) -> InterceptPlan:
         """Return the plan of the unknowns `point`: speeds, curvatures and, if free, the time."""
-        return self.problem.decode(context.case, point, jnp.zeros((), jnp.int32))
+        problem = self.problem
+        plan = problem.decode(context.moving, point, jnp.zeros((), jnp.int32))
+        return leave_units(plan, context.case, context.units, is_early=problem.meet == "early")
 
     def with_polish(self, solver: NewtonConfig | None = None) -> "SmoothIntercept":
         """Return this planner unchanged: its plans are minima already and need no Newton steps."""

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from planner_jax.core.checks import require_beginning, require_kind, require_path
 from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import Attempt
-from planner_jax.plane.obstacles import Obstacles
+from planner_jax.plane.obstacles import Obstacles, move_on
 from planner_jax.plane.target import PlanePath
 from planner_jax.planning.replan import Replanning, check_elapsed, resolve_argument
 from planner_jax.robot.car import pose_at
@@ -26,6 +26,7 @@ from planner_jax.task.intercept.case import InterceptCase
 from planner_jax.task.intercept.plan import InterceptPlan
 from planner_jax.task.intercept.problem import MotionProblem
 from planner_jax.task.intercept.searches import Search, Warm, make_field, make_grid
+from planner_jax.task.intercept.units import enter_units, leave_units, units_of
 
 
 @jax.tree_util.register_static
@@ -95,8 +96,7 @@ class ReplanIntercept(Planner[Replanning, InterceptPlan]):
         speed = np.clip(speed, 0.0, limits.speed)
         curvature = np.clip(curvature, -np.asarray(limits.curvature), limits.curvature)
         if movers is None:
-            moved = cases.movers.velocity * elapsed[..., None, None]
-            movers = dataclasses.replace(cases.movers, centre=cases.movers.centre + moved)
+            movers = move_on(cases.movers, elapsed)
         # If the meeting time is free, the new plan may meet the target later than the old plan.
         until = cases.time if self.problem.is_time_free else previous.time
         remainder = dataclasses.replace(
@@ -124,15 +124,18 @@ class ReplanIntercept(Planner[Replanning, InterceptPlan]):
         """Plan one case: by `Warm` from the previous plan, or by `Search` without that plan."""
         if isinstance(attempt, Search):
             return self.planner.solve(task.case, attempt)
-        case, problem = task.case, self.problem
+        problem, units = self.problem, units_of(task.case)
+        case = enter_units(task.case, units)
         time = jnp.maximum(task.previous.time - task.elapsed, 0.5 * self.shortest)
-        guess = problem.guess_at(problem.pack(*self._sample_previous(task, time), time))
-        grid = make_grid(case, self.search.lattice)
+        point = problem.pack(*self._sample_previous(task, time), time)
+        guess = problem.guess_at(problem.enter_units(point, units))
+        grid = make_grid(case, self.search.lattice, is_time_free=problem.is_time_free)
         stages = [
             dataclasses.replace(stage, steps=jnp.where(time < self.shortest, 0, stage.steps))
             for stage in problem.list_last_stages(attempt)
         ]
-        return problem.refine(case, make_field(case, grid), guess, attempt, stages)
+        plan = problem.refine(case, make_field(case, grid), guess, attempt, stages)
+        return leave_units(plan, task.case, units, is_early=problem.meet == "early")
 
     def solve_at_once(self, tasks: Replanning, attempt: Search | Warm) -> InterceptPlan:
         """Plan all cases of a batch together; a `Search` also tries all its paths together."""

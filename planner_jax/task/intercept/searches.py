@@ -19,14 +19,15 @@ from planner_jax.optimise.levenberg import LevenbergConfig
 from planner_jax.plane import cell_paths, reach
 from planner_jax.plane.distance_field import DistanceField, distance_field
 from planner_jax.task.intercept.case import InterceptCase
-from planner_jax.task.intercept.terms import discs_of, wrap
+from planner_jax.plane.target import rotate
+from planner_jax.task.intercept.terms import discs_of, inside_map, nearest_in_region, wrap
 
 # Estimated memory of a search for each path, and for each 32-bit word of the bits that mark the
 # reachable cells. The unit is the memory of one starting point of the library's other planners.
 _PATH_STARTS = 8
 _WORD_STARTS = 1 / 32768
 _PADDED = ("paths", "candidates")
-_FIELD = 128  # number of nodes of the grid of distances from walls, along each side of the map
+_NODES = 2  # nodes of the grid of distances from walls for each cell, along both axes
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,7 +54,8 @@ class Search(Attempt):
     def __post_init__(self) -> None:
         require(self.paths >= 1, "paths", ">= 1", self.paths)
         lattice = self.lattice
-        words = lattice.cells**2 // 32 * lattice.levels * lattice.headings * lattice.layers
+        columns, rows = lattice.cells
+        words = columns // 32 * rows * lattice.levels * lattice.headings * lattice.layers
         starts = max(_PATH_STARTS * self.paths, round(_WORD_STARTS * words))
         object.__setattr__(self, "starts", starts)
 
@@ -159,18 +161,62 @@ class Reachability:
         return jnp.any(self.layers)
 
 
-def make_grid(case: InterceptCase, lattice: reach.Lattice) -> reach.Grid:
-    """Return the grid of a case: cells that cover its map, at times up to the case's time.
+def make_grid(
+    case: InterceptCase, lattice: reach.Lattice, *, is_time_free: bool
+) -> reach.Grid:
+    """Return the grid of a case: cells that cover the part of its map that the car can use.
 
-    `lattice` has the numbers of the grid's cells, times, speeds and headings.
+    The part is bounded by ellipses: a car whose path has the length L visits only points whose
+    distances from the start and from the target add up to at most L. The case is in the units of
+    `units.enter_units`, so that it starts at the origin.
+
+    Args:
+        case: the case.
+        lattice: numbers of the grid's cells, times, speeds and headings.
+        is_time_free: whether the target may be met before the case's time.
     """
-    return reach.grid_of(lattice, case.start, case.time, case.limits.speed, case.lower, case.upper)
+    speed = _top_speed(case)
+    share = jnp.linspace(0.125, 1.0, 8) if is_time_free else jnp.ones(1)
+    times = share.astype(speed.dtype) * case.time
+    goals = jax.vmap(lambda time: case.target.at(time).pos)(times) - case.start[None, :2]
+    around = jnp.sqrt(jnp.max(jnp.sum(case.region**2, axis=1))) + case.body.length
+    apart = jnp.sqrt(jnp.sum(goals**2, axis=1))
+    length = jnp.maximum(speed * times, apart) + 2.0 * around
+    half = 0.5 * jnp.sqrt(length[:, None] ** 2 - goals[:, ::-1] ** 2)
+    lowest = case.start[:2] + jnp.min(0.5 * goals - half, axis=0)
+    highest = case.start[:2] + jnp.max(0.5 * goals + half, axis=0)
+    corners = _map_corners(case, jnp.max(length))
+    lower, upper = (edge(corners, axis=0) for edge in (jnp.min, jnp.max))
+    lower, upper = jnp.maximum(lower, lowest), jnp.minimum(upper, highest)
+    size = jnp.maximum(upper - lower, 4.0 * case.body.length)
+    middle = 0.5 * (lower + upper)
+    lower, upper = middle - 0.5 * size, middle + 0.5 * size
+    return reach.grid_of(lattice, case.start, case.time, speed, lower, upper)
+
+
+def _top_speed(case: InterceptCase) -> Array:
+    """Return the greatest speed () that the car can reach by the case's time."""
+    gained = case.speed + jnp.minimum(case.limits.acceleration, 1e6) * case.time
+    return jnp.minimum(case.limits.speed, jnp.maximum(gained, 1e-3))
+
+
+def _map_corners(case: InterceptCase, reach: Array) -> Array:
+    """Return the corners (4, 2) of the map; the map is cut at the distance `reach` of the start."""
+    start = rotate(case.start[:2], -case.map_heading)
+    lower = jnp.maximum(case.lower, start - reach)
+    upper = jnp.minimum(case.upper, start + reach)
+    x, y = (jnp.stack([lower[k], upper[k]]) for k in range(2))
+    corners = jnp.stack([jnp.repeat(x, 2), jnp.tile(y, 2)], axis=1)
+    return rotate(corners, case.map_heading)
 
 
 def make_field(case: InterceptCase, grid: reach.Grid) -> DistanceField:
-    """Compute the distances [m] from the walls at 128 x 128 nodes of a grid over the map."""
-    spacing = grid.cell * (grid.lattice.cells / _FIELD)
-    return distance_field(case.walls, grid.corner, spacing, _FIELD)
+    """Compute the distances [m] from the walls at two nodes for each cell along both axes."""
+    columns, rows = grid.lattice.cells
+    half = 1.0 / _NODES
+    return distance_field(
+        case.walls, grid.corner, half * grid.cell, (_NODES * columns, _NODES * rows)
+    )
 
 
 def search_reach(
@@ -178,29 +224,59 @@ def search_reach(
 ) -> Reachability:
     """Compute which cells the car can reach at which times, and when it can meet the target.
 
-    `layers` is the number of equally spaced times; by default they extend to the case's time.
-    `is_time_free` is true if the target may be met before the case's time.
+    The case is in the units of `units.enter_units`. `layers` is the number of equally spaced times;
+    by default they extend to the case's time. `is_time_free` is true if the target may be met
+    before the case's time.
     """
-    grid = make_grid(case, search.lattice)
-    field = make_field(case, grid)
+    grid = make_grid(case, search.lattice, is_time_free=is_time_free)
+    speed, most = _top_speed(case), case.limits.acceleration
+    return _search_grid(case, search, grid, speed, most, is_time_free, layers)
+
+
+def _search_grid(
+    case: InterceptCase,
+    search: Search,
+    grid: reach.Grid,
+    speed: Array,
+    acceleration: Array,
+    is_time_free: bool,
+    layers: Array | None = None,
+) -> Reachability:
+    field, lattice = make_field(case, grid), search.lattice
     radius, ahead = discs_of(case.body, 2)
     limits = case.limits
-    level = limits.speed * jnp.linspace(0.0, 1.0, search.lattice.levels)
-    quickest = limits.lateral_acceleration / jnp.maximum(level, 0.1 * limits.speed)
+    level = speed * jnp.linspace(0.0, 1.0, lattice.levels)
+    quickest = limits.lateral_acceleration / jnp.maximum(level, 0.1 * speed)
     turn_rates = jnp.minimum(limits.curvature * level, quickest)
-    vehicle = reach.Vehicle(search.body_scale * radius, ahead, limits.speed, turn_rates)
+    vehicle = reach.Vehicle(
+        search.body_scale * radius + case.margin, ahead, level, turn_rates, acceleration
+    )
     needed = grid.num if layers is None else layers
-    by = _FIELD // search.lattice.cells
-    coarse = field.values[::by, ::by]
-    found = reach.reach_set(grid, coarse, case.movers, vehicle, case.speed, needed)
-    numbers = jnp.arange(search.lattice.layers + 1)
+    coarse = field.values[::_NODES, ::_NODES]
+    allowed = _allowed_cells(case, grid)
+    found = reach.reach_set(grid, coarse, allowed, case.movers, vehicle, case.speed, needed)
+    numbers = jnp.arange(lattice.layers + 1)
     num = grid.num.astype(numbers.dtype)
     is_met = jax.vmap(lambda n: jnp.any(_meeting_cells(case, grid, found, n)[1]))
     if is_time_free:
-        reached = is_met(numbers) & (numbers >= 1) & (numbers <= num)
+        times = (numbers.astype(grid.step.dtype) + 0.5) * grid.step
+        reached = is_met(numbers) & (numbers >= 1) & (numbers <= num) & (times >= case.earliest)
     else:
         reached = is_met(grid.num[None])[0] & (numbers == num)
     return Reachability(grid=grid, field=field, reach=found, layers=reached)
+
+
+def _allowed_cells(case: InterceptCase, grid: reach.Grid) -> Array:
+    """Return the cells in which the body's middle is on the map, (headings, rows, columns) bool."""
+    lattice = grid.lattice
+    angle = grid.heading + (2.0 * np.pi / lattice.headings) * jnp.arange(lattice.headings)
+    middle = case.body.middle * jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=1)
+    x, y = (
+        grid.corner[k] + grid.cell[k] * jnp.arange(lattice.cells[k], dtype=grid.cell.dtype)
+        for k in range(2)
+    )
+    cells = jnp.stack(jnp.meshgrid(x, y), axis=-1)
+    return inside_map(case, cells[None] + middle[:, None, None]) > 0.0
 
 
 def _meeting_cells(
@@ -211,7 +287,17 @@ def _meeting_cells(
     width = 2.0 * np.pi / num
     angle = grid.heading + width * jnp.arange(num, dtype=grid.heading.dtype)
     headings = jnp.abs(wrap(angle - case.end_heading)) <= case.heading_tolerance + width
-    return reach.goal_cells(grid, found.bits[layer], goal, case.body.middle, headings)
+    # Of a region around the target, 9 points are tried: those nearest to a grid of 3 x 3 points.
+    extent = jnp.max(jnp.abs(case.region), axis=0)
+    grid_points = reach.AROUND * extent[None]
+    away, _ = jax.vmap(nearest_in_region, (None, 0))(case.region, grid_points)
+    points = goal[None] + grid_points - away
+    cells, is_reached = reach.goal_cells(
+        grid, found.bits[layer], points, case.body.middle, headings
+    )
+    gap = found.speeds[-1] - found.speeds[-2]
+    levels = (found.speeds > case.end_speed[0] - gap) & (found.speeds < case.end_speed[1] + gap)
+    return cells, is_reached & levels[:, None, None]
 
 
 def draw_cell_path(
@@ -233,7 +319,7 @@ def draw_cell_path(
 
 # Settings of `earliest_arrival`. They do not use the defaults of `Search`, because the cases of the
 # suite `rush` depend on these values and must not change if a default changes.
-_ARRIVAL = Search(paths=1, lattice=reach.Lattice(64, 30, 4, 32, 6.0), body_scale=1.0)
+_ARRIVAL = Search(paths=1, lattice=reach.Lattice((64, 64), 30, 4, 32, 6.0), body_scale=1.0)
 
 
 def earliest_arrival(case: InterceptCase) -> Array:
@@ -242,6 +328,10 @@ def earliest_arrival(case: InterceptCase) -> Array:
     The estimate is the first time in the reach set (about 20 times up to 10 s) at which the car can
     be at the target; infinite if there is none up to the case's time. Nothing is optimised.
     """
-    found = search_reach(case, _ARRIVAL, is_time_free=True)
+    grid = reach.grid_of(
+        _ARRIVAL.lattice, case.start, case.time, case.limits.speed, case.lower, case.upper
+    )
+    speed, unlimited = case.limits.speed, jnp.full_like(case.time, jnp.inf)
+    found = _search_grid(case, _ARRIVAL, grid, speed, unlimited, True)
     first = jnp.argmax(found.layers).astype(case.time.dtype)
     return jnp.where(found.is_reached, (first + 0.5) * found.grid.step, jnp.inf)

@@ -251,11 +251,14 @@ def cases_of(draws: Draws, dtype: DTypeLike) -> InterceptCase:
         present = draws[f"{kind} present"]
         corners = np.where(present[..., None, None], draws[kind], 0.0)
         centre = corners.mean(axis=2)
+        none = jnp.asarray(np.zeros(present.shape, dtype))
         return Obstacles(
             centre=jnp.asarray(centre.astype(dtype)),
             corners=jnp.asarray((corners - centre[:, :, None]).astype(dtype)),
             velocity=jnp.asarray(np.where(present[..., None], velocity, 0.0).astype(dtype)),
             present=jnp.asarray(present),
+            radius=none,
+            growth=none,
         )
 
     start = np.concatenate([draws["start"], np.zeros((len(draws["start"]), 1))], axis=1)

@@ -14,10 +14,11 @@ from flax import struct
 from jax import Array, lax
 
 from planner_jax.plane.distance_field import DistanceField
-from planner_jax.plane.obstacles import Obstacles, distances, separation
+from planner_jax.plane.obstacles import distances, join_obstacles, place, separation
+from planner_jax.plane.target import rotate
 from planner_jax.robot.car import CarBody
 from planner_jax.task.intercept.case import InterceptCase
-from planner_jax.task.intercept.motion import Motion
+from planner_jax.task.intercept.motion import V_RIGHT, Motion
 
 _HIGHEST = lax.Precision.HIGHEST
 
@@ -61,7 +62,8 @@ def limit_terms(
         squares: (K, 6, 6), for every piece the sum of w g g^T over its residuals r with weights w.
             The vector g holds the derivatives of r by five variables, and last r itself: speed at
             the piece's start and end, curvature there, and the end time of the motion.
-        violation: (), largest relative excess over a limit.
+        violation: (), largest relative excess over a limit, and excess over the bounds of the
+            speed at the end.
     """
     limits, dtype = case.limits, speed.dtype
     rate = (speed.shape[0] - 1) / time
@@ -99,6 +101,18 @@ def limit_terms(
     inside = jnp.maximum(excess + weights.slack, 0.0)
     sign = jnp.where(inside > 0.0, jnp.sign(values), 0.0) / bounds
     hinges = jnp.concatenate([sign[None] * slopes, inside[None]])
+    squares = _sum_squares(hinges, weights.limit)
+    # The speed at the end has bounds of its own, in units of speed.
+    low, high = case.end_speed[0], case.end_speed[1]
+    over, under = v[0, -1] - high, low - v[0, -1]
+    is_over, is_under = over + weights.slack > 0.0, under + weights.slack > 0.0
+    is_under &= low > 0.0
+    at_end = jnp.where(is_over, over + weights.slack, 0.0)
+    at_end -= jnp.where(is_under, under + weights.slack, 0.0)
+    slope_at_end = jnp.where(is_over, 1.0, 0.0) + jnp.where(is_under, 1.0, 0.0)
+    end = jnp.zeros((6, 1), dtype).at[V_RIGHT].set(slope_at_end).at[5].set(at_end)
+    squares = squares.at[..., -1].add(_sum_squares(end, weights.limit))
+    wrong_end = jnp.maximum(over, jnp.where(low > 0.0, under, -1.0))
     smooth = jnp.stack(  # residuals of acceleration and rate of curvature
         [
             jnp.concatenate([-rates, none]),
@@ -110,8 +124,8 @@ def limit_terms(
         ]
     )
     factors = jnp.stack([weights.effort / rate, weights.turning / rate])[None, :, None]
-    squares = _sum_squares(hinges, weights.limit) + _sum_squares(smooth, factors)
-    return jnp.moveaxis(squares, -1, 0), jnp.max(excess)
+    squares += _sum_squares(smooth, factors)
+    return jnp.moveaxis(squares, -1, 0), jnp.maximum(jnp.max(excess), wrong_end)
 
 
 def _sum_squares(rows: Array, weight: Array | float) -> Array:
@@ -160,18 +174,21 @@ def meeting_terms(
     Returns:
         squares: (5, 5), the sum of w g g^T over the residuals r with weights w. The vector g holds
             the derivatives of r by x, y, heading and time of the last sample, and last r itself.
+            The distance is measured from the region around the target.
         violation: (), largest relative excess over the tolerances of distance and heading.
     """
     pos, heading, direction = drive.pos[-1, -1], drive.heading[-1, -1], drive.direction[-1, -1]
     target = case.target.at(time)
     aside = jnp.stack([-direction[1], direction[0]])
-    miss = pos + case.body.middle * direction - target.pos
+    offset = pos + case.body.middle * direction - target.pos
+    miss, slope = nearest_in_region(case.region, offset)
     off = wrap(heading - case.end_heading)
     turned = jnp.abs(off) / case.heading_tolerance - 1.0
     over = jnp.where(case.heading_tolerance < np.pi, jnp.maximum(turned + 0.1, 0.0), 0.0)
     sign = jnp.where(over > 0.0, jnp.sign(off), 0.0) / case.heading_tolerance
-    columns = [jnp.eye(2), case.body.middle * aside[:, None], -target.vel[:, None], miss[:, None]]
-    rows = jnp.concatenate(columns, axis=1)
+    columns = [jnp.eye(2), case.body.middle * aside[:, None], -target.vel[:, None]]
+    moved = jnp.matmul(slope, jnp.concatenate(columns, axis=1), precision=_HIGHEST)
+    rows = jnp.concatenate([moved, miss[:, None]], axis=1)
     none = jnp.zeros_like(sign)
     turn = jnp.stack([none, none, sign, none, over])
     squares = (
@@ -213,31 +230,32 @@ def obstacle_terms(
     x, y = (drive.pos[..., k].reshape(-1) for k in range(2))  # (M,)
     cos, sin = (drive.direction[..., k].reshape(-1) for k in range(2))
     weight = weights.obstacle * (100.0 / x.size)
-    movers, times = case.movers, drive.time.reshape(-1)
-    velocity = movers.velocity[..., None]  # (N, 2, 1)
+    movers = place(case.movers, drive.time.reshape(-1))
 
-    def measure(offset: Array) -> tuple[Array, Array, Array]:
+    def measure(offset: Array) -> tuple[Array, ...]:
         at_x, at_y = x + offset * cos, y + offset * sin
         still, still_x, still_y = (each[None] for each in field.near(at_x, at_y))
-        moved = movers.centre[..., None] + velocity * times[None, None]  # (N, 2, M)
-        far, (away_x, away_y) = distances(
-            movers.corners, movers.present, at_x[None] - moved[:, 0], at_y[None] - moved[:, 1]
-        )
+        local = movers.enter(at_x[None], at_y[None])
+        far, away = distances(case.movers.corners, movers.present, *local)
+        away_x, away_y = movers.leave(*away)
+        speed_x, speed_y = movers.velocity
+        passing = -(away_x * speed_x + away_y * speed_y)
+        if movers.turn is not None:  # a turning obstacle moves the nearest point of its edge
+            to_x, to_y = at_x[None] - movers.x, at_y[None] - movers.y
+            passing -= movers.turn[2] * (away_y * to_x - away_x * to_y)
         return (
-            jnp.concatenate([still, far]),
+            jnp.concatenate([still, far - movers.radius]),
             jnp.concatenate([still_x, away_x]),
             jnp.concatenate([still_y, away_y]),
+            jnp.concatenate([jnp.zeros_like(still), passing - case.movers.growth[:, None]]),
         )
 
     # Without the loop `lax.map`, XLA would compute the obstacles' distances anew for every use.
-    far, away_x, away_y = lax.map(measure, ahead)  # (discs, 1 + N, M)
-    inside = jnp.maximum(radius + weights.margin - far, 0.0)
+    far, away_x, away_y, passing = lax.map(measure, ahead)  # (discs, 1 + N, M)
+    wanted = radius + case.margin
+    inside = jnp.maximum(wanted + weights.margin - far, 0.0)
     is_inside = inside > 0.0
-    speed_x, speed_y = (
-        jnp.concatenate([jnp.zeros((1, 1), x.dtype), velocity[:, k]])[None] for k in range(2)
-    )
     turn = ahead[:, None, None] * (away_y * cos[None, None] - away_x * sin[None, None])
-    passing = -(away_x * speed_x + away_y * speed_y)
     slopes = [jnp.where(is_inside, -each, 0.0) for each in (away_x, away_y, turn, passing)]
     rows = [*slopes, inside]
     squares = SumOfSquares(
@@ -245,26 +263,23 @@ def obstacle_terms(
     )
     middle = case.body.middle
     off_map = []
-    for axis, (at, slope) in enumerate(((x + middle * cos, -sin), (y + middle * sin, cos))):
+    for axis, (across, along) in enumerate(_map_axes(case)):
+        at = (x + middle * cos) * across + (y + middle * sin) * along
+        slope = middle * (cos * along - sin * across)
         above, below = at - case.upper[axis], case.lower[axis] - at
         off_map += [above, below]
         over, under = (jnp.maximum(each + weights.margin, 0.0) for each in (above, below))
         beyond = over - under
         is_beyond = jnp.where(beyond != 0.0, 1.0, 0.0)
-        squares.add({axis: is_beyond, 2: middle * slope * is_beyond, 4: beyond})
-    close = jnp.maximum(jnp.max(radius - far), jnp.max(jnp.stack(off_map)))
+        squares.add({0: across * is_beyond, 1: along * is_beyond, 2: slope * is_beyond, 4: beyond})
+    close = jnp.maximum(jnp.max(wanted - far), jnp.max(jnp.stack(off_map)))
     return weight * squares.matrix(x).reshape(*shape, 5, 5), close / case.body.width
 
 
-def join_obstacles(walls: Obstacles, movers: Obstacles) -> Obstacles:
-    """Join walls and moving obstacles; repeat corners for equal numbers per polygon."""
-    size = max(walls.corners.shape[1], movers.corners.shape[1])
-
-    def pad(corners: Array) -> Array:
-        return jnp.concatenate([corners, *[corners[:, -1:]] * (size - corners.shape[1])], axis=1)
-
-    walls, movers = (dataclasses.replace(x, corners=pad(x.corners)) for x in (walls, movers))
-    return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), walls, movers)
+def _map_axes(case: InterceptCase) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+    """Return the directions (x, y) of the map's two axes."""
+    cos, sin = jnp.cos(case.map_heading), jnp.sin(case.map_heading)
+    return (cos, sin), (-sin, cos)
 
 
 def ends_of(body: CarBody) -> tuple[Array, Array, Array]:
@@ -273,30 +288,89 @@ def ends_of(body: CarBody) -> tuple[Array, Array, Array]:
 
 
 def clearance(case: InterceptCase, drive: Motion) -> Array:
-    """Return the body's clearance (M,) [m] from obstacles and map's edge at M samples."""
+    """Return the body's clearance (M,) [m] at M samples, from obstacles and the map's edge.
+
+    The clearance from obstacles is reduced by the margin of the case.
+    """
     pos, heading = drive.pos.reshape(-1, 2), drive.heading.reshape(-1)
-    times = drive.time.reshape(-1)
     middle = pos + case.body.middle * drive.direction.reshape(-1, 2)
-    free = jnp.min(jnp.minimum(middle - case.lower[None], case.upper[None] - middle), axis=1)
+    apart = gaps(case, pos, heading, drive.time.reshape(-1)) - case.margin
+    return jnp.minimum(inside_map(case, middle), jnp.min(apart, axis=0))
+
+
+def gaps(case: InterceptCase, pos: Array, heading: Array, times: Array) -> Array:
+    """Return the gaps (N, M) [m] between N obstacles and the body at M poses.
+
+    Args:
+        case: the case, with its walls and moving obstacles.
+        pos: (M, 2) [m], positions of the rear axle.
+        heading: (M,) [rad].
+        times: (M,) [s].
+    """
     both = join_obstacles(case.walls, case.movers)
-    moved = both.centre[:, None] + both.velocity[:, None] * times[None, :, None]
-    x, y = (pos[None, :, axis] - moved[..., axis] for axis in range(2))
-    apart = separation(both.corners, both.present, x, y, heading, ends_of(case.body))
-    return jnp.minimum(free, jnp.min(apart, axis=0))
+    placed = place(both, times)
+    x, y = placed.enter(pos[None, :, 0], pos[None, :, 1])
+    angle = heading[None] - (0.0 if placed.turn is None else jnp.arctan2(*placed.turn[1::-1]))
+    apart = separation(both.corners, placed.present, x, y, angle, ends_of(case.body))
+    return apart - placed.radius
+
+
+def inside_map(case: InterceptCase, points: Array) -> Array:
+    """Return the distances (...) [m] of points (..., 2) from the map's edge, negative off the map.
+
+    They are infinite if the map is unbounded.
+    """
+    at = rotate(points, -case.map_heading)
+    return jnp.min(jnp.minimum(at - case.lower, case.upper - at), axis=-1)
 
 
 def is_blocked(case: InterceptCase) -> tuple[Array, Array]:
     """Return whether the car overlaps an obstacle at the start, and whether the target is blocked.
 
-    The target is blocked if at the meeting time it is off the map, or nearer to an obstacle than
-    half the car's width.
+    The car is also blocked if it starts off the map. The target is blocked if at the meeting time
+    it is off the map, or nearer to an obstacle than half the car's width.
     """
     goal = case.target.at(case.time).pos
+    first = jnp.zeros_like(case.time)[None]
+    at_start = gaps(case, case.start[None, :2], case.start[2:], first)
+    direction = jnp.stack([jnp.cos(case.start[2]), jnp.sin(case.start[2])])
+    is_off = inside_map(case, case.start[:2] + case.body.middle * direction) < 0.0
     both = join_obstacles(case.walls, case.movers)
-    x, y = (-(both.centre - case.start[None, :2])[:, axis, None] for axis in range(2))
-    heading, body = case.start[2:], ends_of(case.body)
-    at_start = separation(both.corners, both.present, x, y, heading, body)
-    apart = goal[None] - (both.centre + both.velocity * case.time)
-    at_goal, _ = distances(both.corners, both.present, apart[:, :1], apart[:, 1:])
-    on_map = jnp.all((goal > case.lower) & (goal < case.upper))
-    return jnp.min(at_start) < 0.0, (jnp.min(at_goal) < 0.5 * case.body.width) | ~on_map
+    placed = place(both, case.time[None])
+    local = placed.enter(goal[None, None, 0], goal[None, None, 1])
+    at_goal = distances(both.corners, placed.present, *local)[0] - placed.radius
+    # A part of a region around the target may be free even if the target itself is blocked.
+    is_point = jnp.all(case.region == 0.0)
+    is_near = jnp.min(at_goal) < 0.5 * case.body.width
+    is_goal_blocked = is_point & (is_near | (inside_map(case, goal) <= 0.0))
+    return (jnp.min(at_start) < 0.0) | is_off, is_goal_blocked
+
+
+def nearest_in_region(region: Array, point: Array) -> tuple[Array, Array]:
+    """Return the vector to a point () from the nearest point of a convex region, and its slope.
+
+    Args:
+        region: (V, 2) [m], corners of the region, counter-clockwise; all equal: a point.
+        point: (2,) [m].
+
+    Returns:
+        away: (2,) [m], zero if the point is in the region.
+        slope: (2, 2), derivative of `away` by the point.
+    """
+    before = jnp.roll(region, 1, axis=0)
+    edge = region - before
+    square = jnp.sum(edge**2, axis=1)
+    is_edge = square > 1e-10
+    from_corner = point[None] - before
+    along = jnp.sum(from_corner * edge, axis=1) / jnp.where(is_edge, square, 1.0)
+    share = jnp.clip(jnp.where(is_edge, along, 0.0), 0.0, 1.0)
+    away = from_corner - share[:, None] * edge
+    nearest = jnp.argmin(jnp.sum(away**2, axis=1))
+    outward = edge[:, 1] * from_corner[:, 0] - edge[:, 0] * from_corner[:, 1]
+    is_outside = jnp.any(is_edge & (outward > 0.0)) | ~jnp.any(is_edge)
+    is_on_edge = is_edge[nearest] & (along[nearest] > 0.0) & (along[nearest] < 1.0)
+    normal = jnp.stack([edge[nearest, 1], -edge[nearest, 0]])
+    normal = normal / jnp.sqrt(jnp.where(is_edge[nearest], square[nearest], 1.0))
+    eye = jnp.eye(2, dtype=point.dtype)
+    slope = jnp.where(is_on_edge, normal[:, None] * normal[None], eye)
+    return jnp.where(is_outside, away[nearest], 0.0), jnp.where(is_outside, slope, 0.0)
