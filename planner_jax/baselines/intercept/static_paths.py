@@ -23,7 +23,14 @@ from planner_jax.plane.target import TurningPath
 from planner_jax.task.intercept.case import InterceptCase
 from planner_jax.task.intercept.motion import motion
 from planner_jax.task.intercept.problem import Guess, MotionProblem
-from planner_jax.task.intercept.searches import Reachability, Search, draw_cell_path, search_reach
+from planner_jax.task.intercept.searches import (
+    Reachability,
+    Search,
+    draw_cell_path,
+    make_field,
+    make_grid,
+    search_reach,
+)
 from planner_jax.task.intercept.terms import wrap
 
 _SHARES = 8  # number of points of a path at which it is compared with other paths
@@ -58,7 +65,9 @@ class PathSource:
         `layers` () is the number of equal time steps of the search, by default chosen for the case.
         """
         still = without_movers(case)
-        found = search_reach(still, attempt, is_time_free=True, layers=layers)
+        grid = make_grid(still, attempt.lattice, is_time_free=True)
+        field = make_field(still, grid)
+        found = search_reach(still, attempt, grid, field, is_time_free=True, layers=layers)
         arrivals, is_reached = found.layers, found.is_reached
         first = jnp.argmax(arrivals)
         num = self.drawn * attempt.paths
@@ -72,7 +81,7 @@ class PathSource:
             time, guess = start
             drive = dataclasses.replace(still, time=time)
             stages = self.problem.list_stages(attempt)
-            plan = self.problem.refine(drive, found.field, guess, attempt, stages)
+            plan = self.problem.refine(drive, field, guess, attempt, stages)
             speed = jnp.maximum(plan.speed, 0.0)
             driven = path_of_drive(plan.start, time, speed, plan.curvature, self.points)
             return driven, plan.violation, plan.iterations

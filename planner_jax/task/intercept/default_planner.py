@@ -43,6 +43,7 @@ from planner_jax.task.intercept.searches import (
     Search,
     draw_cell_path,
     load_search,
+    make_field,
     make_grid,
     search_reach,
 )
@@ -133,25 +134,37 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
 
     def _solve(self, case: InterceptCase, search: LoadedSearch) -> InterceptPlan:
         problem = self.problem
-        found = search_reach(case, search, is_time_free=problem.is_time_free)
-        stages = problem.list_stages(search)
-        num = jnp.where(found.is_reached, search.paths, 0)
+        grid = make_grid(case, search.lattice, is_time_free=problem.is_time_free)
+        field, stages = make_field(case, grid), problem.list_stages(search)
+        tries_all = self.tries_all or problem.is_time_free
 
-        def try_path(state: tuple) -> tuple:
-            k, best = state
-            noise = jax.tree.map(lambda leaf: leaf[k], search.noise)
-            guess = self._guess(case, found, noise, search)
-            return k + 1, protocol.select(
-                problem.refine(case, found.field, guess, search, stages), best
+        def refine(guess: Guess) -> InterceptPlan:
+            return problem.refine(case, field, guess, search, stages)
+
+        def is_enough(plan: InterceptPlan) -> Array:
+            return ~jnp.asarray(tries_all) & protocol.is_solved(plan.status)
+
+        def follow_cells(direct: InterceptPlan) -> InterceptPlan:
+            found = search_reach(case, search, grid, field, is_time_free=problem.is_time_free)
+            num = jnp.where(found.is_reached, search.paths, 0)
+
+            def try_path(state: tuple) -> tuple:
+                k, best = state
+                noise = jax.tree.map(lambda leaf: leaf[k], search.noise)
+                plan = refine(self._guess(case, found, noise, search))
+                return k + 1, protocol.select(plan, best)
+
+            _, best = lax.while_loop(
+                lambda state: (state[0] < num) & ~is_enough(state[1]), try_path, (0, direct)
             )
+            return self._explain(case, search, found, best)
 
-        def is_open(state: tuple) -> Array:
-            k, best = state
-            tries_all = self.tries_all or problem.is_time_free
-            return (k < num) & (tries_all | ~protocol.is_solved(best.status))
-
-        _, best = lax.while_loop(is_open, try_path, (0, make_straight_plan(case, self.pieces)))
-        return self._explain(case, search, found, best)
+        direct = lax.cond(
+            search.is_direct,
+            lambda: refine(problem.guess_directly(case)),
+            lambda: make_straight_plan(case, self.pieces),
+        )
+        return lax.cond(is_enough(direct), lambda: direct, lambda: follow_cells(direct))
 
     def solve_at_once(self, cases: InterceptCase, attempt: Search) -> InterceptPlan:
         """Plan a batch: try all random paths of cells together, select each case's best plan."""
@@ -168,20 +181,25 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
         self, case: InterceptCase, attempt: LoadedSearch, layers: Array
     ) -> InterceptPlan:
         problem = self.problem
-        found = search_reach(case, attempt, is_time_free=problem.is_time_free, layers=layers)
+        is_free = problem.is_time_free
+        grid = make_grid(case, attempt.lattice, is_time_free=is_free)
+        field, stages = make_field(case, grid), problem.list_stages(attempt)
+        found = search_reach(case, attempt, grid, field, is_time_free=is_free, layers=layers)
 
-        def solve_along(noise: PathNoise) -> InterceptPlan:
-            guess, stages = self._guess(case, found, noise, attempt), problem.list_stages(attempt)
+        def solve_from(guess: Guess) -> InterceptPlan:
             if self.tries_all:
-                return problem.refine(case, found.field, guess, attempt, stages)
-            points, steps = problem.run_stages(case, found.field, guess, attempt, stages[:-1])
+                return problem.refine(case, field, guess, attempt, stages)
+            points, steps = problem.run_stages(case, field, guess, attempt, stages[:-1])
             return problem.decode(case, points[-1], steps)
 
-        plans = jax.vmap(solve_along)(attempt.noise)
+        guesses = jax.vmap(lambda noise: self._guess(case, found, noise, attempt))(attempt.noise)
+        direct = problem.guess_directly(case)
+        guesses = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), direct, guesses)
+        plans = jax.vmap(solve_from)(guesses)
         best = protocol.index_of_best(plans)
         plan = jax.tree.map(lambda leaf: leaf[best], plans)
         if not self.tries_all:
-            plan = problem.refine_solved(case, found.field, plan, attempt)
+            plan = problem.refine_solved(case, field, plan, attempt)
         return self._explain(case, attempt, found, plan)
 
     def load_attempt(self, attempt: Search, cases: InterceptCase) -> LoadedSearch:

@@ -35,18 +35,19 @@ def make_plan(
 ) -> InterceptPlan:
     """Make a plan from speed and curvature at knots, and check it against every limit of the case.
 
-    The cost of the plan is the integral of the squared acceleration [m^2/s^3] [Qu2022, eq. 8a].
+    The cost of the plan is its discomfort [m^2/s^3], as `terms.limit_terms` defines it. It extends
+    the integral of the squared acceleration of [Qu2022, eq. 8a].
     Speed [m/s] and curvature [1/m] are the values at K + 1 equally spaced knots from time 0 to
     `time` () [s]. On each piece between two knots the distance from obstacles is checked at
     `samples` positions, and the lateral acceleration at `points` positions. `steps` () int32 is the
     number of iterations that the plan reports.
     """
     drive = motion(case.start, time, speed, curvature, samples)
-    _, violation = terms.limit_terms(case, time, speed, curvature, terms.Weights(), points)
-    _, missed = terms.meeting_terms(case, drive, time, terms.Weights())
+    weights = terms.Weights()
+    _, violation, effort = terms.limit_terms(case, time, speed, curvature, weights, points)
+    _, missed = terms.meeting_terms(case, drive, time, weights)
     too_close = (_GRAZING - jnp.min(terms.clearance(case, drive))) / case.body.width
     worst = jnp.maximum(jnp.maximum(violation, missed), too_close)
-    effort = jnp.sum((speed[1:] - speed[:-1]) ** 2) * (speed.shape[0] - 1) / time
     return InterceptPlan(
         cost=effort,
         violation=worst,

@@ -35,6 +35,8 @@ from planner_jax.task.intercept.plan import InterceptPlan, make_plan
 from planner_jax.task.intercept.searches import Search, Warm
 from planner_jax.task.intercept.units import Units, enter_units, leave_units, units_of
 
+_LITTLE = 1e-3  # the last stage ends if four steps each lower the cost by less than this share
+_HIGHEST = lax.Precision.HIGHEST
 _SOONEST = 0.01  # earliest time of a meeting, divided by the case's time
 
 # Weights of the cost in the three stages: follow the path of grid cells, keep all limits, and
@@ -166,6 +168,57 @@ class MotionProblem:
         cells = grid.corner[None] + grid.cell[None] * path.cell.astype(grid.cell.dtype)
         return Guess(point=point, positions=interpolate(cells, case.start[:2], at - 0.5))
 
+    def guess_directly(self, case: InterceptCase) -> Guess:
+        """Return a starting point whose motion has the least squared acceleration of a point.
+
+        Obstacles and limits are ignored. The point starts as the car does, and is at the target at
+        the case's time, or at an earlier time if the meeting shall be early. Its position is a
+        cubic polynomial in time. The case is in the units of `units.enter_units`.
+        """
+        time = self._direct_time(case)
+        is_heading_free = case.heading_tolerance >= np.pi
+        first = case.speed * jnp.asarray([1.0, 0.0], time.dtype)
+
+        def solve(heading: Array) -> tuple[Array, Array]:
+            ahead = jnp.stack([jnp.cos(heading), jnp.sin(heading)])
+            goal = case.target.at(time).pos - case.body.middle * ahead
+            offset = goal - first * time
+            free = first + 1.5 * offset / time  # velocity at the end that needs least effort
+            along = jnp.clip(jnp.dot(free, ahead, precision=_HIGHEST), 0.1, case.limits.speed)
+            low, high = case.end_speed[0], case.end_speed[1]
+            end = ahead * jnp.clip(along, low, jnp.maximum(high, low))
+            is_free = is_heading_free & (low <= 0.0) & jnp.isinf(high)
+            end = jnp.where(is_free, free, end)
+            # Coefficients of t^2 and t^3 for the given position and velocity at the end.
+            change = end - first
+            return 3.0 * offset / time**2 - change / time, change / time**2 - 2.0 * offset / time**3
+
+        square, cube = solve(case.end_heading)
+        leaving = first + time * (2.0 * square + 3.0 * time * cube)
+        heading = jnp.where(is_heading_free, jnp.arctan2(leaving[1], leaving[0]), case.end_heading)
+        square, cube = solve(heading)
+        at = time * (jnp.arange(1, self.pieces + 1, dtype=time.dtype) / self.pieces)[:, None]
+        pos = at * (first + at * (square + at * cube))
+        vel = first + at * (2.0 * square + 3.0 * at * cube)
+        bend = 2.0 * square + 6.0 * at * cube
+        speed = jnp.sqrt(jnp.sum(vel**2, axis=1) + 1e-6)
+        curvature = (vel[:, 0] * bend[:, 1] - vel[:, 1] * bend[:, 0]) / speed**3
+        limit = case.limits.curvature
+        speed = jnp.minimum(speed, case.limits.speed)
+        return Guess(self.pack(speed, jnp.clip(curvature, -limit, limit), time), pos)
+
+    def _direct_time(self, case: InterceptCase) -> Array:
+        """Return the time () of a direct motion to the target."""
+        if self.meet != "early":
+            return case.time
+        times = case.time * jnp.linspace(1.0 / 16.0, 1.0, 16, dtype=case.time.dtype)
+        away = jax.vmap(lambda time: case.target.at(time).pos)(times)
+        apart = jnp.sqrt(jnp.sum(away**2, axis=1))
+        gained = jnp.minimum(case.limits.acceleration, 1e6) * times
+        most = jnp.minimum(case.speed + 0.5 * gained, case.limits.speed) * times
+        is_open = (most >= apart) & (times >= case.earliest)
+        return jnp.where(jnp.any(is_open), times[jnp.argmax(is_open)], case.time)
+
     def build_model(
         self,
         point: Array,
@@ -182,7 +235,7 @@ class MotionProblem:
         """
         speed, curvature, time = self.unpack(case, point)
         drive = motion(case.start, time, speed, curvature, self.samples)
-        limits, violation = terms.limit_terms(case, time, speed, curvature, weights, 4)
+        limits, violation, _ = terms.limit_terms(case, time, speed, curvature, weights, 4)
         end, missed = terms.meeting_terms(case, drive, time, weights)
         squares, close = terms.obstacle_terms(case, field, drive, weights, discs)
         squares = squares.at[:, -1].add(terms.following_terms(drive, positions, weights))
@@ -229,7 +282,8 @@ class MotionProblem:
             until = {"tolerance": solver.tolerance, "settled": solver.settled}
             keeping = dataclasses.replace(keeping, **until)
         weights = dataclasses.replace(self.weights, **margins)
-        return [keeping, Stage(weights, steps, settled=steps, only_feasible=True)]
+        last = Stage(weights, steps, tolerance=_LITTLE, settled=4, only_feasible=True)
+        return [keeping, last]
 
     def run_stages(
         self,

@@ -50,6 +50,8 @@ class Search(Attempt):
     # The set is conservative, as obstacles are rounded to whole cells. A factor below 1 admits
     # narrow passages that are open in truth.
     body_scale: float = 1.0
+    # Whether least squares also start from the direct motion to the target (`guess_directly`).
+    is_direct: bool = False
 
     def __post_init__(self) -> None:
         require(self.paths >= 1, "paths", ">= 1", self.paths)
@@ -62,7 +64,7 @@ class Search(Attempt):
 
 @with_run_time_numbers(
     *("paths", "following", "settling", "margin", "slack", "directness", "body_scale"),
-    *("noise", "is_last"),
+    *("noise", "is_last", "is_direct"),
 )
 @dataclasses.dataclass(frozen=True)
 class LoadedSearch(Search):
@@ -112,7 +114,7 @@ class Warm(Attempt):
 
 
 _GIVEN = (
-    Search(2, LevenbergConfig(10), following=3),
+    Search(2, LevenbergConfig(10), following=3, settling=40, is_direct=True),
     Search(4, LevenbergConfig(16), seed=1, body_scale=0.9),
     Search(16, LevenbergConfig(24), seed=2, body_scale=0.75, candidates=1, directness=0.0),
 )
@@ -137,8 +139,9 @@ _EARLY = Search(
     body_scale=0.85,
     candidates=1,
     directness=0.0,
+    is_direct=True,
 )
-_LEAST = Search(16, LevenbergConfig(60, tolerance=5e-4))
+_LEAST = Search(16, LevenbergConfig(60, tolerance=5e-4), is_direct=True)
 _LATER = (
     Search(8, seed=1, body_scale=0.9),
     dataclasses.replace(_GIVEN[2], solver=LevenbergConfig(30)),
@@ -148,10 +151,9 @@ SEARCHES = {"given": _GIVEN, "early": (_EARLY, *_LATER), "least": (_LEAST, *_LAT
 
 @struct.dataclass
 class Reachability:
-    """Grid, distances from walls, and reachable cells (reach set): the data to draw paths from."""
+    """Grid and reachable cells (reach set): the data to draw paths from."""
 
     grid: reach.Grid
-    field: DistanceField  # distances from the walls
     reach: reach.ReachSet
     layers: Array  # (layers + 1,) bool, whether the car can meet the target at each layer in time
 
@@ -220,29 +222,35 @@ def make_field(case: InterceptCase, grid: reach.Grid) -> DistanceField:
 
 
 def search_reach(
-    case: InterceptCase, search: Search, *, is_time_free: bool, layers: Array | None = None
+    case: InterceptCase,
+    search: Search,
+    grid: reach.Grid,
+    field: DistanceField,
+    *,
+    is_time_free: bool,
+    layers: Array | None = None,
 ) -> Reachability:
     """Compute which cells the car can reach at which times, and when it can meet the target.
 
-    The case is in the units of `units.enter_units`. `layers` is the number of equally spaced times;
-    by default they extend to the case's time. `is_time_free` is true if the target may be met
-    before the case's time.
+    `grid` and `field` are the results of `make_grid` and `make_field`. `layers` is the number of
+    equally spaced times; by default they extend to the case's time. `is_time_free` is true if the
+    target may be met before the case's time.
     """
-    grid = make_grid(case, search.lattice, is_time_free=is_time_free)
     speed, most = _top_speed(case), case.limits.acceleration
-    return _search_grid(case, search, grid, speed, most, is_time_free, layers)
+    return _search_grid(case, search, grid, field, speed, most, is_time_free, layers)
 
 
 def _search_grid(
     case: InterceptCase,
     search: Search,
     grid: reach.Grid,
+    field: DistanceField,
     speed: Array,
     acceleration: Array,
     is_time_free: bool,
     layers: Array | None = None,
 ) -> Reachability:
-    field, lattice = make_field(case, grid), search.lattice
+    lattice = search.lattice
     radius, ahead = discs_of(case.body, 2)
     limits = case.limits
     level = speed * jnp.linspace(0.0, 1.0, lattice.levels)
@@ -263,7 +271,7 @@ def _search_grid(
         reached = is_met(numbers) & (numbers >= 1) & (numbers <= num) & (times >= case.earliest)
     else:
         reached = is_met(grid.num[None])[0] & (numbers == num)
-    return Reachability(grid=grid, field=field, reach=found, layers=reached)
+    return Reachability(grid=grid, reach=found, layers=reached)
 
 
 def _allowed_cells(case: InterceptCase, grid: reach.Grid) -> Array:
@@ -332,6 +340,7 @@ def earliest_arrival(case: InterceptCase) -> Array:
         _ARRIVAL.lattice, case.start, case.time, case.limits.speed, case.lower, case.upper
     )
     speed, unlimited = case.limits.speed, jnp.full_like(case.time, jnp.inf)
-    found = _search_grid(case, _ARRIVAL, grid, speed, unlimited, True)
+    field = make_field(case, grid)
+    found = _search_grid(case, _ARRIVAL, grid, field, speed, unlimited, True)
     first = jnp.argmax(found.layers).astype(case.time.dtype)
     return jnp.where(found.is_reached, (first + 0.5) * found.grid.step, jnp.inf)

@@ -30,12 +30,17 @@ class Weights:
     miss: float = 300.0  # [1/m^2], of the distance from the target at the end
     obstacle: float = 1e3  # [1/m^2], of the distance by which a body comes too close to an obstacle
     limit: float = 1e3  # of the relative excess of a value over its limit
-    effort: float = 0.064  # [s^3/m^2], of the integral of the squared acceleration
+    effort: float = 0.064  # [s^3/m^2], of the discomfort
     early: float = 300.0  # of the meeting time divided by the case's time, if the time is free
-    turning: float = 3e-3  # [m^2 s], of the integral of the squared rate of curvature
     follow: float = 0.0  # [1/m^2], of the distance at knots from a path of cells
     margin: float = 0.03  # [m], distance from obstacles below which they are penalised
     slack: float = 0.015  # a value is penalised above (1 - slack) times its limit
+
+
+# Factors of the discomfort, in the units of `units.enter_units`: of the lateral jerk, a time; and of
+# the steering angle's rate, an acceleration times a time.
+JERK = 0.5
+STEERING = 0.5
 
 
 def wrap(angle: Array) -> Array:
@@ -53,8 +58,12 @@ def discs_of(body: CarBody, num: int) -> tuple[Array, Array]:
 
 def limit_terms(
     case: InterceptCase, time: Array, speed: Array, curvature: Array, weights: Weights, points: int
-) -> tuple[Array, Array]:
-    """Compute the penalties on the car's limits and on acceleration, for a motion of K pieces.
+) -> tuple[Array, Array, Array]:
+    """Compute the penalties on the car's limits and the discomfort, for a motion of K pieces.
+
+    The discomfort is the integral over time of  a^2 + a_n^2 + (JERK j_n)^2 + (STEERING w)^2.  Here
+    a is the acceleration along the path, a_n the lateral acceleration v^2 kappa, j_n its time
+    derivative, and w the rate of the steering angle.
 
     `points` is the number of points of a piece at which the lateral acceleration is checked.
 
@@ -64,6 +73,7 @@ def limit_terms(
             the piece's start and end, curvature there, and the end time of the motion.
         violation: (), largest relative excess over a limit, and excess over the bounds of the
             speed at the end.
+        discomfort: () [m^2/s^3], the integral above.
     """
     limits, dtype = case.limits, speed.dtype
     rate = (speed.shape[0] - 1) / time
@@ -113,19 +123,26 @@ def limit_terms(
     end = jnp.zeros((6, 1), dtype).at[V_RIGHT].set(slope_at_end).at[5].set(at_end)
     squares = squares.at[..., -1].add(_sum_squares(end, weights.limit))
     wrong_end = jnp.maximum(over, jnp.where(low > 0.0, under, -1.0))
-    smooth = jnp.stack(  # residuals of acceleration and rate of curvature
+    # Residuals of the discomfort, whose integral over a piece is a square times the duration.
+    sideways, sideways0 = v**2 * c, v0**2 * c0
+    rough = jnp.concatenate(
+        [acceleration, sideways, JERK * (sideways - sideways0) * rate, STEERING * steering]
+    )
+    by_jerk, by_steering = JERK * rate, STEERING * gain * rate
+    of_duration = jnp.asarray([-0.5, 0.5, -0.5, -0.5], dtype)[:, None] / time
+    smooth = jnp.stack(
         [
-            jnp.concatenate([-rates, none]),
-            jnp.concatenate([rates, none]),
-            jnp.concatenate([none, -rates]),
-            jnp.concatenate([none, rates]),
-            jnp.concatenate([acceleration, bending]) * (-0.5 / time),
-            jnp.concatenate([acceleration, bending]),
+            jnp.concatenate([-rates, none, -2.0 * by_jerk * v0 * c0, none]),
+            jnp.concatenate([rates, 2.0 * v * c, 2.0 * by_jerk * v * c, none]),
+            jnp.concatenate([none, none, -by_jerk * v0**2, -by_steering]),
+            jnp.concatenate([none, v**2, by_jerk * v**2, by_steering]),
+            of_duration * rough,
+            rough,
         ]
     )
-    factors = jnp.stack([weights.effort / rate, weights.turning / rate])[None, :, None]
-    squares += _sum_squares(smooth, factors)
-    return jnp.moveaxis(squares, -1, 0), jnp.maximum(jnp.max(excess), wrong_end)
+    squares += _sum_squares(smooth, weights.effort / rate)
+    discomfort = jnp.sum(rough**2) / rate
+    return jnp.moveaxis(squares, -1, 0), jnp.maximum(jnp.max(excess), wrong_end), discomfort
 
 
 def _sum_squares(rows: Array, weight: Array | float) -> Array:
