@@ -51,7 +51,8 @@ def leaves_of(found, setting):
         centre = corners.mean(axis=2)
         group = {"centre": centre, "corners": corners - centre[:, :, None], "present": present}
         speeds = found["mover_velocity"].reshape(centre.shape) if kind == "mover" else 0.0 * centre
-        leaves |= {f"{kind}s.{name}": leaf for name, leaf in (group | {"velocity": speeds}).items()}
+        group |= {"velocity": speeds, **{name: 0.0 * present for name in ("radius", "growth")}}
+        leaves |= {f"{kind}s.{name}": leaf for name, leaf in group.items()}
     plan = {name: found[name] for name in ("start", "speed", "curvature")}
     plan["time"] = found["meeting_time"]
     return leaves | {f"plan.{name}": leaf for name, leaf in plan.items()}

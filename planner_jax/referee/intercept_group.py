@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from planner_jax.referee.drive import final_poses
 from planner_jax.referee.intercept import (
     InterceptVerdict,
-    final_poses,
     referee_intercepts,
     target_positions_of,
 )
@@ -90,12 +90,22 @@ def referee_groups(
 
 
 def _leg(shared: Any, target: Any, begin: np.ndarray, car: tuple) -> SimpleNamespace:
-    movers, (start, speed, curvature) = shared.movers, car
-    centre = movers.centre + begin[:, None, None] * np.asarray(movers.velocity, np.float64)
+    (start, speed, curvature), time = car, np.asarray(shared.time, np.float64)
     own = {"start": start, "speed": speed, "curvature": curvature, "target": target}
-    own |= {"time": np.asarray(shared.time, np.float64) - begin}
-    own |= {"movers": SimpleNamespace(**{**vars(movers), "centre": centre})}
+    own |= {"time": time - begin, "earliest": np.asarray(shared.earliest, np.float64) - begin}
+    own |= {name: _delay_obstacles(vars(shared)[name], begin) for name in ("walls", "movers")}
     return SimpleNamespace(**{**vars(shared), **own})
+
+
+def _delay_obstacles(group: Any, begin: np.ndarray) -> SimpleNamespace:
+    """Return obstacles whose time 0 is `begin` (B,) [s] later; they keep what they have grown."""
+    fields, later = dict(vars(group)), begin[:, None]
+    fields["centre"] = group.centre + later[..., None] * np.asarray(group.velocity, np.float64)
+    fields["radius"] = group.radius + later * np.asarray(group.growth, np.float64)
+    if (track := fields.get("track")) is not None:
+        ends = {name: np.asarray(vars(track)[name]) - later for name in ("begin", "end")}
+        fields["track"] = SimpleNamespace(**{**vars(track), **ends})
+    return SimpleNamespace(**fields)
 
 
 def _delay(where: Callable, begin: np.ndarray) -> Callable:

@@ -216,9 +216,18 @@ def clear_where(invalid: np.ndarray, tests: dict) -> dict:
     }
 
 
-def above(value: np.ndarray, limit: np.ndarray, tolerance: float, time: np.ndarray) -> tuple:
-    """Test value <= limit up to a relative tolerance; return (failed, relative excess, time)."""
-    scale = np.where(np.isinf(limit), 1.0, np.maximum(np.abs(limit), SMALLEST_LIMIT))
+def above(
+    value: np.ndarray,
+    limit: np.ndarray,
+    tolerance: float,
+    time: np.ndarray,
+    smallest: float = SMALLEST_LIMIT,
+) -> tuple:
+    """Test value <= limit up to a relative tolerance; return (failed, relative excess, time).
+
+    The excess is divided by `smallest` if the magnitude of the limit is smaller.
+    """
+    scale = np.where(np.isinf(limit), 1.0, np.maximum(np.abs(limit), smallest))
     excess = (value - limit) / scale
     return excess > tolerance, excess, time
 
