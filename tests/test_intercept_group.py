@@ -202,7 +202,7 @@ def test_the_referee_rejects_a_plan_with_a_wrong_leg(planned):
         if limits != {"order"}:
             np.testing.assert_array_equal(verdict.leg, leg)
     one = pj.group.judge(*pj.take((groups, wrong["a leg aside"][0]), 0))
-    assert one.sentence().startswith("start: leg 1: the plan starts 0.01 off")
+    assert one.sentence().startswith("start: leg 1: the plan starts 0.025 off")
 
 
 def test_a_sweep_of_groups_has_a_row_for_every_group(monkeypatch, tmp_path):

@@ -165,7 +165,7 @@ def test_a_car_that_brakes_at_once_stops_before_every_wall(batches, name):
     blank = dict.fromkeys(("cost", "violation", "iterations", "status", "meeting"), np.zeros(NUM))
     speed = np.tile([0.5, 0.0, 0.0], (NUM, 1))
     drive = {"start": cases.start, "time": np.ones(NUM), "speed": speed, "curvature": 0.0 * speed}
-    plans = InterceptPlan(**drive, **blank)
+    plans = InterceptPlan(**drive, **blank, origin=cases.origin)
     verdict = referee_intercepts(cases, plans)
     assert verdict.wall_clearance.min() > 0.0
     assert set(verdict.failed_limit) <= {"mover", "meeting"}

@@ -39,8 +39,9 @@ LIMITS = [field.name for field in dataclasses.fields(CarLimits)]
 def leaves_of(found, setting):
     due = found["due_time"]
     leaves = {"time": due, "speed": found["initial_speed"], "curvature": found["initial_curvature"]}
-    names = ("start", "tolerance", "end_heading", "heading_tolerance")
-    leaves |= {name: found[name] for name in names}
+    names = ("start", "tolerance", "end_heading", "heading_tolerance", "earliest", "margin")
+    leaves |= {name: found[name] for name in (*names, "map_heading", "origin")}
+    leaves |= {"end_speed": found["end_speed_range"], "region": found["region"].reshape(NUM, -1, 2)}
     constants = {f"body.{name}": setting[f"body_{name}"] for name in BODY}
     constants |= {f"limits.{name}": setting[name] for name in LIMITS}
     constants |= {name: setting[name] for name in ("lower", "upper")}
@@ -51,9 +52,10 @@ def leaves_of(found, setting):
         centre = corners.mean(axis=2)
         group = {"centre": centre, "corners": corners - centre[:, :, None], "present": present}
         speeds = found["mover_velocity"].reshape(centre.shape) if kind == "mover" else 0.0 * centre
-        group |= {"velocity": speeds, **{name: 0.0 * present for name in ("radius", "growth")}}
+        group |= {"velocity": speeds, "radius": found[f"{kind}_radius"]}
+        group |= {"growth": found[f"{kind}_growth"]}
         leaves |= {f"{kind}s.{name}": leaf for name, leaf in group.items()}
-    plan = {name: found[name] for name in ("start", "speed", "curvature")}
+    plan = {name: found[name] for name in ("start", "speed", "curvature", "origin")}
     plan["time"] = found["meeting_time"]
     return leaves | {f"plan.{name}": leaf for name, leaf in plan.items()}
 
@@ -92,6 +94,7 @@ def test_the_rows_alone_lead_the_referee_to_the_same_verdict(finished):
     out, manifest = finished
     found = columns(out)
     case = tree(leaves_of(found, manifest["setting"]), target=None)
+    case.movers.track = None
     end = found["target_way"].reshape(NUM, -1, 2)[:, -1]
     verdict = referee_intercepts(case, case.plan, target_positions=lambda *_: end)
     np.testing.assert_array_equal(verdict.success, found["success"])

@@ -64,7 +64,8 @@ def arm_plan(row: Row, _: Entries) -> ArmPlan:
 def car_plan(row: Row, _: Entries) -> CarPlan:
     """Restore a car's plan from a run's row: speed and curvature at equally spaced times."""
     knots = {name: _numbers(row[name]) for name in ("start", "speed", "curvature")}
-    time, origin = _numbers(row["meeting_time"]), _numbers([0.0, 0.0])
+    # Runs of version 0.2 have no column `origin`.
+    time, origin = _numbers(row["meeting_time"]), _numbers(row.get("origin", [0.0, 0.0]))
     return CarPlan(**_outcome(row), time=time, origin=origin, **knots)
 
 

@@ -82,6 +82,6 @@ class InterceptSweep(Sweep[InterceptSettings]):
             f"{limits['body_length']:g} x {limits['body_width']:g} m. Sizes and limits are of a "
             "model car of scale 1:10: an assumption.",
             "The referee accepts a success: every limit within 1e-3 relative, at all samples no "
-            "obstacle within 1 mm of the body, and at the end the middle of the body within the "
-            "case's tolerance of the target.",
+            f"obstacle more than {2.5 * limits['body_length']:g} mm inside the body or its margin, "
+            "and at the end the middle of the body within the case's tolerance of the target.",
         ]

@@ -305,5 +305,5 @@ def _make_region(region: ArrayLike, batch: tuple[int, ...], dtype: DTypeLike) ->
         one = obstacles([region], dtype=dtype)
     except ArgumentError as error:
         raise error.with_names({"polygons": "region"}) from None
-    corners = one.corners[0] + one.centre[0]
+    corners = one.corners[0] + one.centre[:1]
     return jnp.broadcast_to(corners, batch + corners.shape)
