@@ -42,6 +42,7 @@ def car():
         time=np.asarray(0.4, FLOAT),
         speed=2.0 + 0.25 * knots,
         curvature=FLOAT(0.1) * knots - FLOAT(0.2),
+        origin=np.zeros(2, FLOAT),
     )
 
 

@@ -109,7 +109,8 @@ def test_the_gradient_of_the_cost_matches_finite_differences(knots, float64, mee
     case = case.replace(end_heading=jnp.array(2.0), heading_tolerance=jnp.array(0.1))
     planner = pj.intercept.planner(pieces=8, meet=meet)
     problem = planner.problem
-    field = jax.jit(lambda case: make_field(case, make_grid(case, SEARCHES[0].lattice)))(case)
+    grid = jax.jit(lambda case: make_grid(case, SEARCHES[0].lattice, is_time_free=False))(case)
+    field = jax.jit(make_field)(case, grid)
     positions = np.random.default_rng(3).uniform(1.0, 7.0, (8, 2))
     given = case, field, Weights(follow=1.0), positions
     model = jax.jit(lambda point: problem.build_model(point, *given))

@@ -116,11 +116,15 @@ def find_layers(target, walls=(), movers=(), velocities=0.0):
 def _find_layers(case):
     grid = reach.grid_of(LATTICE, case.start, case.time, case.limits.speed, case.lower, case.upper)
     ahead, turn_rates = jnp.array([0.05, 0.25]), jnp.array([0.0, 1.0, 0.8, 0.53])
-    vehicle = reach.Vehicle(jnp.array(0.16), ahead, case.limits.speed, turn_rates)
+    speeds = case.limits.speed * jnp.linspace(0.0, 1.0, LATTICE.levels)
+    vehicle = reach.Vehicle(jnp.array(0.16), ahead, speeds, turn_rates, jnp.array(jnp.inf))
     field = distance_field(case.walls, grid.corner, grid.cell, LATTICE.cells)
-    bits = reach.reach_set(grid, field.values, case.movers, vehicle, case.speed, grid.num).bits
+    allowed = jnp.ones((LATTICE.headings, *field.values.shape), bool)
+    scene = grid, field.values, allowed, case.movers, vehicle
+    bits = reach.reach_set(*scene, case.speed, grid.num).bits
+    goals = jnp.tile(case.target.pos, (9, 1))
     every = jnp.ones(LATTICE.headings, bool)
-    goal_cells = jax.vmap(lambda b: reach.goal_cells(grid, b, case.target.pos, 0.0, every)[1])(bits)
+    goal_cells = jax.vmap(lambda b: reach.goal_cells(grid, b, goals, 0.0, every)[1])(bits)
     return jnp.any(goal_cells, axis=(1, 2, 3)) & (jnp.arange(LATTICE.layers + 1) <= grid.num)
 
 
@@ -158,9 +162,11 @@ def test_a_mover_blocks_a_goal_while_it_covers_it():
 def test_a_distance_field_interpolates_distances_and_returns_its_own_derivatives(float64):
     rng = np.random.default_rng(3)
     box = pj.obstacles([[[2.0, 2.0], [5.0, 2.0], [5.0, 4.0], [2.0, 4.0]]], dtype=jnp.float64)
-    corner, spacing = jnp.zeros(2), jnp.array(0.0625)
+    corner, spacing = jnp.zeros(2), 0.0625
     x, y = jnp.asarray(rng.uniform(0.1, 7.8, (2, 400)))
-    near = jax.jit(lambda x, y: distance_field(box, corner, spacing, 128).near(x, y))
+    near = jax.jit(
+        lambda x, y: distance_field(box, corner, jnp.full(2, spacing), (128, 128)).near(x, y)
+    )
     far, *slopes = near(x, y)
     exact = distances(box.vertices(0.0), box.present, x[None], y[None])[0][0]
     outside = exact > 0.1

@@ -250,7 +250,8 @@ def driving(*walls, **settings):
     target = pj.TurningPath(np.float32([2.0, 4.0]), np.zeros(2, np.float32), np.float32(0.0))
     settings |= {"start": (1.0, 4.0, 0.0), "initial_speed": 1.0, "walls": walls}
     knots = {"speed": np.ones(5, np.float32), "curvature": np.zeros(5, np.float32)}
-    plan = CarPlan(**SOLVED, start=np.float32([1.0, 4.0, 0.0]), time=np.float32(1.0), **knots)
+    knots |= {"time": np.float32(1.0), "origin": np.zeros(2, np.float32)}
+    plan = CarPlan(**SOLVED, start=np.float32([1.0, 4.0, 0.0]), **knots)
     return jax.tree.map(np.asarray, pj.intercept.case(target, **settings)), plan
 
 

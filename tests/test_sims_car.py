@@ -41,7 +41,7 @@ def plans(speed, curvature):
     num = len(speed)
     zero, none = jnp.zeros(num), jnp.zeros(num, jnp.int32)
     knots = (jnp.asarray(np.stack(value), jnp.float32) for value in (speed, curvature))
-    drive = jnp.zeros((num, 3)), zero + END, *knots, jnp.zeros((num, 2))
+    drive = jnp.zeros((num, 3)), zero + END, *knots, *jnp.zeros((2, num, 2))
     return pj.intercept.InterceptPlan(zero, zero, none, none, *drive)
 
 

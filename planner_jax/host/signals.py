@@ -7,6 +7,7 @@ stop cleanly. The process exits without shutting the interpreter down, because X
 still compute would crash.
 """
 
+import atexit
 import contextlib
 import os
 import signal
@@ -44,6 +45,14 @@ def listen() -> None:
         if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
             signal.signal(number, lambda *_: None)  # `_watch` acts on the signal
     threading.Thread(target=_watch, args=(reader,), daemon=True).start()
+    # At shutdown Python restores the default handlers. A signal would then end a command without a
+    # line, although its work is done.
+    atexit.register(_ignore)
+
+
+def _ignore() -> None:
+    for number in _WORDS:
+        signal.signal(number, signal.SIG_IGN)
 
 
 @contextlib.contextmanager

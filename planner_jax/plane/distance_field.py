@@ -41,7 +41,11 @@ class DistanceField:
         ]
         low, high = (corners[k] + u * (corners[k + 1] - corners[k]) for k in (0, 2))
         left, right = (corners[k] + v * (corners[k + 2] - corners[k]) for k in (0, 1))
-        return low + v * (high - low), (right - left) / self.spacing[0], (high - low) / self.spacing[1]
+        return (
+            low + v * (high - low),
+            (right - left) / self.spacing[0],
+            (high - low) / self.spacing[1],
+        )
 
 
 def distance_field(
@@ -62,8 +66,7 @@ def distance_field(
 
     def take_nearer(k: Array, nearest: Array) -> Array:
         corners, present, radius = (
-            lax.dynamic_slice_in_dim(each, k, 1)
-            for each in (vertices, walls.present, walls.radius)
+            lax.dynamic_slice_in_dim(each, k, 1) for each in (vertices, walls.present, walls.radius)
         )
 
         def measure(corners: Array) -> Array:

@@ -1,11 +1,13 @@
 """Obstacles in the plane: convex polygons and circles that move, and distances from them."""
 
 import dataclasses
+
 import jax
 import jax.numpy as jnp
 from flax import struct
 from jax import Array
 from jax.typing import ArrayLike
+
 
 @struct.dataclass
 class Track:
@@ -39,9 +41,13 @@ class Obstacles:
     def vertices(self, time: ArrayLike) -> Array:
         """Return the V corners of the N obstacles at one time () [s], (N, V, 2) [m].
 
-        The obstacles must not have a track.
+        The corners of absent obstacles are also returned. Circles are not enlarged by their radius.
         """
-        return (self.centre + self.velocity * time)[..., None, :] + self.corners
+        if self.track is None:
+            return (self.centre + self.velocity * time)[..., None, :] + self.corners
+        placed = place(self, jnp.asarray(time)[None])
+        middle = jnp.stack([placed.x, placed.y], axis=-1)
+        return middle + jnp.stack(placed.leave(self.corners[..., 0], self.corners[..., 1]), axis=-1)
 
 
 @struct.dataclass
@@ -77,9 +83,7 @@ def place(group: Obstacles, times: Array) -> Placement:
     radius = group.radius[:, None] + group.growth[:, None] * jnp.maximum(times, 0.0)
     track = group.track
     if track is None:
-        x, y = (
-            group.centre[:, k, None] + group.velocity[:, k, None] * times for k in range(2)
-        )
+        x, y = (group.centre[:, k, None] + group.velocity[:, k, None] * times for k in range(2))
         velocity = (group.velocity[:, :1], group.velocity[:, 1:])
         return Placement(x, y, velocity, None, radius, group.present[:, None])
     num = track.poses.shape[1]
@@ -94,21 +98,21 @@ def place(group: Obstacles, times: Array) -> Placement:
     pose = before + jnp.clip(share, 0.0, 1.0) * (after - before)
     turn = (jnp.cos(pose[..., 2]), jnp.sin(pose[..., 2]), rate[..., 2])
     present = group.present[:, None] & is_between
-    return Placement(pose[..., 0], pose[..., 1], (rate[..., 0], rate[..., 1]), turn, radius, present)
+    return Placement(
+        pose[..., 0], pose[..., 1], (rate[..., 0], rate[..., 1]), turn, radius, present
+    )
 
 
 def move_on(group: Obstacles, elapsed: ArrayLike) -> Obstacles:
-    """Return obstacles whose time 0 is `elapsed` () or (B,) [s] later, as a new observation of them.
-
-    Their growth starts anew.
-    """
+    """Return obstacles whose time 0 is `elapsed` () or (B,) [s] later; their growth continues."""
     elapsed = jnp.asarray(elapsed)
     centre = group.centre + group.velocity * elapsed[..., None, None]
+    radius = group.radius + group.growth * elapsed[..., None]
     track = group.track
     if track is not None:
         begin, end = (each - elapsed[..., None] for each in (track.begin, track.end))
         track = dataclasses.replace(track, begin=begin, end=end)
-    return dataclasses.replace(group, centre=centre, track=track)
+    return dataclasses.replace(group, centre=centre, radius=radius, track=track)
 
 
 def join_obstacles(first: Obstacles, second: Obstacles) -> Obstacles:

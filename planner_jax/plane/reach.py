@@ -2,10 +2,10 @@
 
 Planners of interceptions (a car meets a moving target) start from coarse paths in this reach set.
 The set has one layer for each of several equally spaced times. A layer has one bit for every speed
-level, every heading bin and every cell of a rectangular grid. The bit tells whether the car can be there
-at that time without touching a standing or moving obstacle. At a layer the speed changes by at most
-one level, and the heading by a few bins. Between layers, and for half a step before the first
-layer, the car moves straight on.
+level, every heading bin and every cell of a rectangular grid. The bit tells whether the car can be
+there at that time without touching a standing or moving obstacle. At a layer the speed changes by
+at most one level, and the heading by a few bins. Between layers, and for half a step before the
+first layer, the car moves straight on.
 
 Path and timing are searched together, so that a car can wait for an obstacle to pass, or pass
 before it. One set covers all paths around the obstacles, all headings and all meeting times.
@@ -225,7 +225,7 @@ def reach_set(
     width = 2.0 * np.pi / headings
     angle = grid.heading + width * jnp.arange(headings, dtype=dtype)
     direction = jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=1)
-    pace = (speeds * grid.step)[None, :, None, None] / grid.cell
+    pace = (speeds * grid.step)[None, :, None, None] / grid.cell[None, None, None]
     # A move is the difference of two rounded positions, so that the moves of n layers add up to the
     # rounded position. If each move were rounded, a car with a heading of 11 degrees would never
     # change its row of cells.
@@ -362,7 +362,8 @@ def goal_cells(
     angle = grid.heading + width * bins.astype(grid.cell.dtype)
     back = ahead * jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=1)
     axle = goals[None] - back[:, None]
-    nearest = jnp.round((axle - grid.corner) / grid.cell).astype(jnp.int32)
+    corner, cell = grid.corner[None, None], grid.cell[None, None]
+    nearest = jnp.round((axle - corner) / cell).astype(jnp.int32)
     cells = nearest + jnp.asarray(AROUND, jnp.int32)[None]
     of_level = jax.vmap(jax.vmap(bit_at, (None, None, None, 0)), (None, None, 0, 0))
     of_all = jax.vmap(of_level, (None, 0, None, None))

@@ -41,7 +41,7 @@ def make_plans():
     return {
         "hit_plans": HitPlan(**flown, trajectory=pieces(12, 7, 3), stroke=stroke),
         "catch_plans": CatchPlan(**flown, trajectory=pieces(6, 7, 3), order=order, **times),
-        "drive_plans": InterceptPlan(**of_all, **driven, meeting=zeros(2)),
+        "drive_plans": InterceptPlan(**of_all, **driven, origin=zeros(2), meeting=zeros(2)),
         "block_plans": BlockPlan(**of_all, motion=pieces(10, 2, 6), contact_time=zeros()),
     }
 

@@ -124,7 +124,8 @@ class PathThenSpeed(Planner):
     def solve_at_once(self, cases: InterceptCase, attempt: Search) -> InterceptPlan:
         """Return the plans of a batch, computed together with `vmap`."""
         # All cases search with the same number of time steps, so that all loops are equally long.
-        layers = jnp.max(jax.vmap(lambda case: make_grid(case, attempt.lattice, is_time_free=True).num)(cases))
+        grids = jax.vmap(lambda case: make_grid(case, attempt.lattice, is_time_free=True))(cases)
+        layers = jnp.max(grids.num)
         return jax.vmap(lambda case: self.solve_in_layers(case, attempt, layers))(cases)
 
     def solve_in_layers(

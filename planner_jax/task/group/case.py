@@ -86,6 +86,7 @@ class InterceptGroup:
             # Remaining time [s]: at least 1 ms, because the time of a case must be positive.
             time=jnp.maximum(shared.time - begin, 1e-3),
             movers=move_on(movers, begin),
+            earliest=jnp.maximum(shared.earliest - begin, 0.0),
         )
 
 

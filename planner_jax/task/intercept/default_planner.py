@@ -133,38 +133,37 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
         return leave_units(plan, case, units, is_early=self.meet == "early")
 
     def _solve(self, case: InterceptCase, search: LoadedSearch) -> InterceptPlan:
-        problem = self.problem
-        grid = make_grid(case, search.lattice, is_time_free=problem.is_time_free)
+        problem, is_free = self.problem, self.problem.is_time_free
+        grid = make_grid(case, search.lattice, is_time_free=is_free)
         field, stages = make_field(case, grid), problem.list_stages(search)
-        tries_all = self.tries_all or problem.is_time_free
 
-        def refine(guess: Guess) -> InterceptPlan:
-            return problem.refine(case, field, guess, search, stages)
+        def find() -> Reachability:
+            return search_reach(case, search, grid, field, is_time_free=is_free)
 
-        def is_enough(plan: InterceptPlan) -> Array:
-            return ~jnp.asarray(tries_all) & protocol.is_solved(plan.status)
+        def try_start(state: tuple) -> tuple:
+            k, found, best = state
+            # Start -1 is the direct motion. If it solves the case, nothing is searched.
+            found = lax.cond(k == 0, find, lambda: found)
 
-        def follow_cells(direct: InterceptPlan) -> InterceptPlan:
-            found = search_reach(case, search, grid, field, is_time_free=problem.is_time_free)
-            num = jnp.where(found.is_reached, search.paths, 0)
-
-            def try_path(state: tuple) -> tuple:
-                k, best = state
+            def guess_along_cells() -> Guess:
                 noise = jax.tree.map(lambda leaf: leaf[k], search.noise)
-                plan = refine(self._guess(case, found, noise, search))
-                return k + 1, protocol.select(plan, best)
+                return self._guess(case, found, noise, search)
 
-            _, best = lax.while_loop(
-                lambda state: (state[0] < num) & ~is_enough(state[1]), try_path, (0, direct)
-            )
-            return self._explain(case, search, found, best)
+            guess = lax.cond(k < 0, lambda: problem.guess_directly(case), guess_along_cells)
+            plan = problem.refine(case, field, guess, search, stages)
+            is_path = (k < 0) | found.is_reached
+            return k + 1, found, protocol.select(plan, best, is_path)
 
-        direct = lax.cond(
-            search.is_direct,
-            lambda: refine(problem.guess_directly(case)),
-            lambda: make_straight_plan(case, self.pieces),
-        )
-        return lax.cond(is_enough(direct), lambda: direct, lambda: follow_cells(direct))
+        def is_open(state: tuple) -> Array:
+            k, found, best = state
+            is_enough = protocol.is_solved(best.status) & ~jnp.asarray(self.tries_all | is_free)
+            return ((k <= 0) | ((k < search.paths) & found.is_reached)) & ~is_enough
+
+        nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(find))
+        first = jnp.where(search.is_direct, -1, 0)
+        unsolved = make_straight_plan(case, self.pieces)
+        k, found, best = lax.while_loop(is_open, try_start, (first, nothing, unsolved))
+        return self._explain(case, search, (k <= 0) | found.is_reached, best)
 
     def solve_at_once(self, cases: InterceptCase, attempt: Search) -> InterceptPlan:
         """Plan a batch: try all random paths of cells together, select each case's best plan."""
@@ -200,7 +199,7 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
         plan = jax.tree.map(lambda leaf: leaf[best], plans)
         if not self.tries_all:
             plan = problem.refine_solved(case, field, plan, attempt)
-        return self._explain(case, attempt, found, plan)
+        return self._explain(case, attempt, found.is_reached, plan)
 
     def load_attempt(self, attempt: Search, cases: InterceptCase) -> LoadedSearch:
         """Return the search `attempt` in the form of the second argument of the compiled `solve`.
@@ -226,9 +225,9 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
         return self.problem.guess_along(case, found.grid, found.reach.speeds, path, layer)
 
     def _explain(
-        self, case: InterceptCase, attempt: LoadedSearch, found: Reachability, plan: InterceptPlan
+        self, case: InterceptCase, attempt: LoadedSearch, is_reached: Array, plan: InterceptPlan
     ) -> InterceptPlan:
-        is_open = found.is_reached | ~attempt.is_last
+        is_open = is_reached | ~attempt.is_last
         reason = jnp.where(is_open, plan.status, protocol.Status.NO_PATH)
         return explain(case, reason, plan, is_time_free=self.problem.is_time_free)
 

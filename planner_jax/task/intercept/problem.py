@@ -198,6 +198,7 @@ class MotionProblem:
         heading = jnp.where(is_heading_free, jnp.arctan2(leaving[1], leaving[0]), case.end_heading)
         square, cube = solve(heading)
         at = time * (jnp.arange(1, self.pieces + 1, dtype=time.dtype) / self.pieces)[:, None]
+        first, square, cube = first[None], square[None], cube[None]
         pos = at * (first + at * (square + at * cube))
         vel = first + at * (2.0 * square + 3.0 * at * cube)
         bend = 2.0 * square + 6.0 * at * cube

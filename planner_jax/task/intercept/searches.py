@@ -18,8 +18,8 @@ from planner_jax.core.protocol import Attempt
 from planner_jax.optimise.levenberg import LevenbergConfig
 from planner_jax.plane import cell_paths, reach
 from planner_jax.plane.distance_field import DistanceField, distance_field
-from planner_jax.task.intercept.case import InterceptCase
 from planner_jax.plane.target import rotate
+from planner_jax.task.intercept.case import InterceptCase
 from planner_jax.task.intercept.terms import discs_of, inside_map, nearest_in_region, wrap
 
 # Estimated memory of a search for each path, and for each 32-bit word of the bits that mark the
@@ -163,9 +163,7 @@ class Reachability:
         return jnp.any(self.layers)
 
 
-def make_grid(
-    case: InterceptCase, lattice: reach.Lattice, *, is_time_free: bool
-) -> reach.Grid:
+def make_grid(case: InterceptCase, lattice: reach.Lattice, *, is_time_free: bool) -> reach.Grid:
     """Return the grid of a case: cells that cover the part of its map that the car can use.
 
     The part is bounded by ellipses: a car whose path has the length L visits only points whose
@@ -277,7 +275,8 @@ def _search_grid(
 def _allowed_cells(case: InterceptCase, grid: reach.Grid) -> Array:
     """Return the cells in which the body's middle is on the map, (headings, rows, columns) bool."""
     lattice = grid.lattice
-    angle = grid.heading + (2.0 * np.pi / lattice.headings) * jnp.arange(lattice.headings)
+    bins = jnp.arange(lattice.headings, dtype=grid.cell.dtype)
+    angle = grid.heading + (2.0 * np.pi / lattice.headings) * bins
     middle = case.body.middle * jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=1)
     x, y = (
         grid.corner[k] + grid.cell[k] * jnp.arange(lattice.cells[k], dtype=grid.cell.dtype)
@@ -297,7 +296,7 @@ def _meeting_cells(
     headings = jnp.abs(wrap(angle - case.end_heading)) <= case.heading_tolerance + width
     # Of a region around the target, 9 points are tried: those nearest to a grid of 3 x 3 points.
     extent = jnp.max(jnp.abs(case.region), axis=0)
-    grid_points = reach.AROUND * extent[None]
+    grid_points = jnp.asarray(reach.AROUND, extent.dtype) * extent[None]
     away, _ = jax.vmap(nearest_in_region, (None, 0))(case.region, grid_points)
     points = goal[None] + grid_points - away
     cells, is_reached = reach.goal_cells(

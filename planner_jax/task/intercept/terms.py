@@ -4,10 +4,8 @@ The residuals are the distance from the target at the end, the acceleration, and
 penalties max(excess, 0) on limits and on distances from obstacles.
 """
 
-import dataclasses
 from collections.abc import Mapping
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
@@ -37,8 +35,8 @@ class Weights:
     slack: float = 0.015  # a value is penalised above (1 - slack) times its limit
 
 
-# Factors of the discomfort, in the units of `units.enter_units`: of the lateral jerk, a time; and of
-# the steering angle's rate, an acceleration times a time.
+# Factors of the discomfort, in the units of `units.enter_units`: of the lateral jerk, a time; and
+# of the steering angle's rate, an acceleration times a time.
 JERK = 0.5
 STEERING = 0.5
 
@@ -338,7 +336,8 @@ def inside_map(case: InterceptCase, points: Array) -> Array:
     They are infinite if the map is unbounded.
     """
     at = rotate(points, -case.map_heading)
-    return jnp.min(jnp.minimum(at - case.lower, case.upper - at), axis=-1)
+    lower, upper = (jnp.broadcast_to(each, at.shape) for each in (case.lower, case.upper))
+    return jnp.min(jnp.minimum(at - lower, upper - at), axis=-1)
 
 
 def is_blocked(case: InterceptCase) -> tuple[Array, Array]:

@@ -102,7 +102,7 @@ def _enter_obstacles(group: Obstacles, units: Units) -> Obstacles:
     if track is None:
         corners = rotate(corners, turn)
     else:
-        xy = rotate(track.poses[..., :2] - origin, turn) / length
+        xy = rotate(track.poses[..., :2] - origin[None, None], turn) / length
         heading = track.poses[..., 2:] + turn
         track = dataclasses.replace(
             track,
