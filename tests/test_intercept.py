@@ -12,7 +12,7 @@ from planner_jax.cli.compilation import record_programs
 from planner_jax.optimise.levenberg import LevenbergConfig
 from planner_jax.plane.reach import Lattice
 from planner_jax.robot.car import pose_at
-from planner_jax.task.intercept.motion import Quadratic, by_unknowns, motion
+from planner_jax.robot.car_motion import Quadratic, by_unknowns, motion
 from planner_jax.task.intercept.searches import Search, make_field, make_grid
 from planner_jax.task.intercept.terms import Weights
 

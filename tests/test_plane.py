@@ -164,9 +164,8 @@ def test_a_distance_field_interpolates_distances_and_returns_its_own_derivatives
     box = pj.obstacles([[[2.0, 2.0], [5.0, 2.0], [5.0, 4.0], [2.0, 4.0]]], dtype=jnp.float64)
     corner, spacing = jnp.zeros(2), 0.0625
     x, y = jnp.asarray(rng.uniform(0.1, 7.8, (2, 400)))
-    near = jax.jit(
-        lambda x, y: distance_field(box, corner, jnp.full(2, spacing), (128, 128)).near(x, y)
-    )
+    apart = jnp.full(2, spacing)
+    near = jax.jit(lambda x, y: distance_field(box, corner, apart, (128, 128)).near(x, y))
     far, *slopes = near(x, y)
     exact = distances(box.vertices(0.0), box.present, x[None], y[None])[0][0]
     outside = exact > 0.1

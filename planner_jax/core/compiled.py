@@ -77,8 +77,9 @@ def cached_by_precision(load: Callable[..., Settings]) -> Callable[..., Settings
     """
 
     def place(leaf: ArrayLike) -> jax.Array:
-        is_whole = isinstance(leaf, int) and not isinstance(leaf, bool)
-        return jax.device_put(np.int32(leaf) if is_whole else leaf)
+        if isinstance(leaf, int) and not isinstance(leaf, bool):
+            return jax.device_put(np.int32(leaf))
+        return jax.device_put(leaf)
 
     @functools.lru_cache(maxsize=1024)
     def load_once(is_float64: bool, *args: object) -> Settings:

@@ -3,9 +3,10 @@
 import dataclasses
 from collections.abc import Sequence
 
-import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import DTypeLike
+from numpy.typing import ArrayLike
 
 from planner_jax.core.checks import floating, numeric, shape_of
 from planner_jax.core.choices import require
@@ -29,12 +30,12 @@ class Circle:
 
 def obstacles(
     polygons: object,
-    velocities: object = 0.0,
+    velocities: ArrayLike = 0.0,
     *,
     paths: Sequence[object] | None = None,
-    growth: object = 0.0,
-    origin: object = (0.0, 0.0),
-    dtype: object = jnp.float32,
+    growth: ArrayLike = 0.0,
+    origin: ArrayLike = (0.0, 0.0),
+    dtype: DTypeLike = jnp.float32,
 ) -> Obstacles:
     """Make the obstacles of one case from lists of corners.
 
@@ -99,9 +100,8 @@ def obstacles(
     cast = [jnp.asarray(x if x.dtype == bool else x.astype(dtype)) for x in leaves]
     track = None
     if any(table is not None for table in tables):
-        track = jax.tree.map(
-            lambda x: jnp.asarray(x.astype(dtype)), _track(tables, num, centre, velocity, shift)
-        )
+        rows = _resample(tables, num, centre, velocity, shift)
+        track = Track(*(jnp.asarray(row.astype(dtype)) for row in rows))
     return Obstacles(*cast, track=track)
 
 
@@ -138,14 +138,17 @@ def _check_path(k: int, path: object) -> tuple[np.ndarray, np.ndarray]:
     return times, poses
 
 
-def _track(
+def _resample(
     tables: list[tuple[np.ndarray, np.ndarray] | None],
     num: int,
     centre: np.ndarray,
     velocity: np.ndarray,
     shift: np.ndarray,
-) -> Track:
-    """Resample tables of poses at equal time steps; obstacles without a table keep a velocity."""
+) -> tuple[np.ndarray, ...]:
+    """Return the arrays of a `Track`: tables of poses at equal time steps, relative to `shift`.
+
+    Obstacles without a table keep their velocity.
+    """
     grids = [None if table is None else _even_times(table[0]) for table in tables]
     horizon = max(table[0][-1] for table in tables if table is not None)
     longest = _padded(max(len(grid) for grid in grids if grid is not None))
@@ -163,7 +166,7 @@ def _track(
         poses[k] = sampled[np.minimum(np.arange(longest), len(grid) - 1)]
         begin[k], end[k] = grid[0], times[-1]
         step[k] = grid[1] - grid[0] if len(grid) > 1 else 1.0
-    return Track(poses, begin, step, end)
+    return poses, begin, step, end
 
 
 def _even_times(times: np.ndarray) -> np.ndarray:

@@ -133,8 +133,8 @@ def join_obstacles(first: Obstacles, second: Obstacles) -> Obstacles:
             poses = jnp.concatenate([group.centre, still[..., None]], axis=-1)[..., None, :]
             track = Track(poses, -far, 2.0 * far, far)
         if track is not None:
-            track = track.replace(poses=_repeat_last(track.poses, num))
-        return group.replace(corners=corners, track=track)
+            track = dataclasses.replace(track, poses=_repeat_last(track.poses, num))
+        return dataclasses.replace(group, corners=corners, track=track)
 
     return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), pad(first), pad(second))
 

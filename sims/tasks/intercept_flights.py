@@ -31,7 +31,13 @@ from planner_jax.sims.tasks.intercept import (
 from planner_jax.task.intercept.api import draw, positions
 from planner_jax.task.intercept.api import planner as intercept_planner
 from planner_jax.task.intercept.case import InterceptCase
-from planner_jax.task.intercept.searches import SEARCHES, search_reach
+from planner_jax.task.intercept.searches import (
+    SEARCHES,
+    Reachability,
+    make_field,
+    make_grid,
+    search_reach,
+)
 
 NEAR, FAR = 0.05, 0.5  # [m], two more distances from the target within which drives are counted
 _KEPT = 2  # number of simulated frames from one recorded sample to the next
@@ -226,9 +232,13 @@ def reach_layers(case: InterceptCase) -> list[tuple[float, np.ndarray]]:
     The car starts as in `case`, keeps its limits and avoids the obstacles.
     """
     search = SEARCHES["given"][0]
-    found = jax.device_get(
-        jax.jit(lambda case: search_reach(case, search, is_time_free=False))(case)
-    )
+
+    def search_cells(case: InterceptCase) -> Reachability:
+        # The reach set is computed in SI units, since the cells are drawn in the world frame.
+        grid = make_grid(case, search.lattice, is_time_free=False)
+        return search_reach(case, search, grid, make_field(case, grid), is_time_free=False)
+
+    found = jax.device_get(jax.jit(search_cells)(case))
     grid, words = found.grid, np.bitwise_or.reduce(found.reach.bits, axis=(2, 3))
     layers = []
     for number in range(int(grid.num) + 1):

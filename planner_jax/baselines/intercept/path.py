@@ -7,7 +7,7 @@ from flax import struct
 from jax import Array, lax
 
 from planner_jax.optimise.levenberg import LevenbergConfig, Model, least_squares
-from planner_jax.task.intercept.motion import Quadratic, by_unknowns, motion
+from planner_jax.robot.car_motion import Quadratic, by_unknowns, motion
 
 _HIGHEST = lax.Precision.HIGHEST
 

@@ -20,8 +20,8 @@ from planner_jax.baselines.intercept.path import Path, path_of_drive
 from planner_jax.plane.cell_paths import PathNoise, draw_noise
 from planner_jax.plane.obstacles import Obstacles
 from planner_jax.plane.target import TurningPath
+from planner_jax.robot.car_motion import motion
 from planner_jax.task.intercept.case import InterceptCase
-from planner_jax.task.intercept.motion import motion
 from planner_jax.task.intercept.problem import Guess, MotionProblem
 from planner_jax.task.intercept.searches import (
     Reachability,
@@ -109,7 +109,9 @@ class PathSource:
         grid = found.grid
         path = draw_cell_path(case, found, layer, noise, 0.0)
         time = (layer + 0.5) * grid.step
-        guess = self.problem.guess_along(dataclasses.replace(case, time=time), grid, path, layer)
+        guess = self.problem.guess_along(
+            dataclasses.replace(case, time=time), grid, found.reach.speeds, path, layer
+        )
         return time, guess
 
     def select_different(

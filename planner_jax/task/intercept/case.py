@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 from collections.abc import Sequence
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -284,7 +284,7 @@ def _make_obstacles(
     origin: np.ndarray,
     batch: tuple[int, ...],
     dtype: DTypeLike,
-    **movement: object,
+    **movement: Any,
 ) -> Obstacles:
     if isinstance(polygons, Obstacles):
         if origin.any():

@@ -9,9 +9,9 @@ from jax import Array
 
 from planner_jax.core.protocol import Status, is_solved, status_of
 from planner_jax.robot.car import CarPlan
+from planner_jax.robot.car_motion import motion
 from planner_jax.task.intercept import terms
 from planner_jax.task.intercept.case import InterceptCase
-from planner_jax.task.intercept.motion import motion
 
 _GRAZING = 5e-3  # [m], required clearance at samples, so that nothing is touched between samples
 

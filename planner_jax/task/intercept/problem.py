@@ -28,9 +28,9 @@ from planner_jax.plane.cell_paths import CellPath
 from planner_jax.plane.distance_field import DistanceField
 from planner_jax.plane.obstacles import join_obstacles
 from planner_jax.plane.reach import Grid
+from planner_jax.robot.car_motion import Quadratic, by_unknowns, motion
 from planner_jax.task.intercept import terms
 from planner_jax.task.intercept.case import InterceptCase
-from planner_jax.task.intercept.motion import Quadratic, by_unknowns, motion
 from planner_jax.task.intercept.plan import InterceptPlan, make_plan
 from planner_jax.task.intercept.searches import Search, Warm
 from planner_jax.task.intercept.units import Units, enter_units, leave_units, units_of
@@ -356,7 +356,7 @@ class StartedCase(InterceptCase):
 class _Context:
     case: StartedCase
     units: Units
-    moving: StartedCase  # the case in its units, with its walls added to the movers, at speed 0
+    moving: InterceptCase  # the case in its units, with its walls added to the movers, at speed 0
     field: DistanceField  # distances of a map without walls
 
 

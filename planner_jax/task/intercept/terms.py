@@ -15,8 +15,8 @@ from planner_jax.plane.distance_field import DistanceField
 from planner_jax.plane.obstacles import distances, join_obstacles, place, separation
 from planner_jax.plane.target import rotate
 from planner_jax.robot.car import CarBody
+from planner_jax.robot.car_motion import V_RIGHT, Motion
 from planner_jax.task.intercept.case import InterceptCase
-from planner_jax.task.intercept.motion import V_RIGHT, Motion
 
 _HIGHEST = lax.Precision.HIGHEST
 
