@@ -5,8 +5,6 @@ from collections.abc import Sequence
 
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import DTypeLike
-from numpy.typing import ArrayLike
 
 from planner_jax.core.checks import floating, numeric, shape_of
 from planner_jax.core.choices import require
@@ -30,12 +28,12 @@ class Circle:
 
 def obstacles(
     polygons: object,
-    velocities: ArrayLike = 0.0,
+    velocities: object = 0.0,
     *,
     paths: Sequence[object] | None = None,
-    growth: ArrayLike = 0.0,
-    origin: ArrayLike = (0.0, 0.0),
-    dtype: DTypeLike = jnp.float32,
+    growth: object = 0.0,
+    origin: object = (0.0, 0.0),
+    dtype: object = jnp.float32,
 ) -> Obstacles:
     """Make the obstacles of one case from lists of corners.
 
@@ -80,8 +78,8 @@ def obstacles(
         rule = f"the shape (2,) or ({count}, 2)"
         raise ArgumentError("velocities", rule, shape, verb="have")
     require(bool(np.isfinite(np.asarray(velocities)).all()), "velocities", "finite", velocities)
-    if shape_of("growth", growth) not in ((), (count,)):
-        raise ArgumentError("growth", f"the shape () or ({count},)", np.shape(growth), verb="have")
+    if (shape := shape_of("growth", growth)) not in ((), (count,)):
+        raise ArgumentError("growth", f"the shape () or ({count},)", shape, verb="have")
     require(bool((np.asarray(growth) >= 0.0).all()), "growth", ">= 0", growth)
     given = _check_paths(paths, count)
     tables = [given[k] for k in owner]

@@ -7,6 +7,7 @@ from .api import planner as planner
 from .api import predict as predict
 from .api import read_map as read_map
 from .api import walls_of_grid as walls_of_grid
+from .case import Circle as Circle
 from .case import InterceptCase as InterceptCase
 from .case import case as case
 from .default_planner import SpacetimeIntercept as SpacetimeIntercept

@@ -1,0 +1,170 @@
+"""Interceptions in any units and frames, among recorded traffic, with regions and end speeds."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import struct
+
+import planner_jax as pj
+from planner_jax.plane.obstacles import place
+from planner_jax.plane.reach import Lattice
+from planner_jax.task.intercept.searches import Search
+from planner_jax.task.intercept.terms import nearest_in_region
+
+SMALL = {"searches": (Search(2, lattice=Lattice(layers=20, headings=16), is_direct=True),)}
+BOX = np.array([[-1.0, -0.5], [1.0, -0.5], [1.0, 0.5], [-1.0, 0.5]])
+
+
+def problem(length=1.0, time=1.0, shift=(0.0, 0.0), turn=0.0):
+    """Return a car's drive past a box, in units that are 1 / `length` m and 1 / `time` s."""
+    cos, sin = np.cos(turn), np.sin(turn)
+    shift = np.asarray(shift, float)
+
+    def move(points):
+        return length * np.asarray(points, float) @ np.array([[cos, sin], [-sin, cos]]) + shift
+
+    speed, acceleration = length / time, length / time**2
+    velocity = move([3.0, 0.5]) - move([0.0, 0.0])
+    target = pj.TurningPath(move([14.0, 3.0]), velocity / time, np.zeros(()))
+    return pj.intercept.case(
+        target,
+        6.0 * time,
+        start=(*move([0.0, 0.0]), turn),
+        initial_speed=5.0 * speed,
+        walls=[move(BOX + [9.0, 0.5])],
+        lower=-np.inf,
+        upper=np.inf,
+        tolerance=0.3 * length,
+        length=4.5 * length,
+        width=1.6 * length,
+        wheelbase=2.6 * length,
+        rear_overhang=0.9 * length,
+        speed=12.0 * speed,
+        acceleration=4.0 * acceleration,
+        lateral_acceleration=4.0 * acceleration,
+        curvature=0.18 / length,
+        steering_rate=0.6 / time,
+    )
+
+
+def test_a_problem_in_other_units_far_away_and_rotated_has_the_same_plan():
+    planner = pj.intercept.planner(**SMALL)
+    usual = pj.plan(planner, problem())
+    assert usual.status == pj.Status.CONVERGED
+    for length, time, shift, turn in (
+        (1000.0, 1.0, (0.0, 0.0), 0.0),
+        (1e-3, 1.0 / 3600.0, (0.0, 0.0), 0.0),
+        (1.0, 1.0, (5e5, 4.6e6), 0.0),
+        (1.0, 1.0, (-30.0, 20.0), 2.2),
+        (1000.0, 1.0, (5e8, 1e8), -0.7),
+    ):
+        case = problem(length, time, shift, turn)
+        plan = pj.plan(planner, case)
+        assert pj.intercept.judge(case, plan).success
+        np.testing.assert_allclose(plan.speed * time / length, usual.speed, rtol=2e-3, atol=2e-3)
+        np.testing.assert_allclose(plan.curvature * length, usual.curvature, atol=1e-3)
+        np.testing.assert_allclose(plan.cost * time**3 / length**2, usual.cost, rtol=1e-2)
+
+
+def test_samples_of_a_plan_at_utm_coordinates_are_exact_to_a_millimetre():
+    shift = np.array([500123.25, 4612345.75])
+    case = problem(shift=shift)
+    plan = pj.plan(pj.intercept.planner(**SMALL), case)
+    near = pj.plan(pj.intercept.planner(**SMALL), problem())
+    far, here = plan.sample(5.0).pos, near.sample(5.0).pos
+    assert far.dtype == np.float64
+    np.testing.assert_allclose(far[0], shift, atol=1e-9)
+    np.testing.assert_allclose(far - shift, here, atol=0.02)
+
+
+def test_a_table_of_poses_is_linear_between_its_times_and_ends_with_them(float64):
+    times, poses = [1.0, 2.0, 4.0], [[0.0, 0.0, 3.0], [2.0, 0.0, 3.2], [2.0, 6.0, 3.6]]
+    group = pj.obstacles([BOX], paths=[(times, poses)], growth=0.1, dtype=jnp.float64)
+    placed = place(group, jnp.array([0.9, 1.5, 3.0, 4.0, 4.1]))
+    np.testing.assert_array_equal(placed.present[0], [False, True, True, True, False])
+    np.testing.assert_allclose(placed.x[0, 1:4], [1.0, 2.0, 2.0])
+    np.testing.assert_allclose(placed.y[0, 1:4], [0.0, 3.0, 6.0], atol=1e-12)
+    np.testing.assert_allclose(placed.turn[0][0, 1:4], np.cos([3.1, 3.4, 3.6]))
+    np.testing.assert_allclose(placed.turn[2][0, 1:3], [0.2, 0.2])
+    np.testing.assert_allclose(placed.radius[0], 0.1 * np.array([0.9, 1.5, 3.0, 4.0, 4.1]))
+    corners = group.vertices(2.0)[0, :4]
+    cos, sin = np.cos(3.2), np.sin(3.2)
+    np.testing.assert_allclose(corners, BOX @ [[cos, sin], [-sin, cos]] + [2.0, 0.0])
+
+
+def test_the_car_avoids_a_recorded_mover_and_stops_in_a_region_with_a_margin():
+    lorry = 0.4 * BOX
+    path = ([0.0, 5.0, 10.0], [[3.0, 4.0, 0.0], [4.0, 4.0, 1.5], [5.0, 7.0, 1.6]])
+    case = pj.intercept.case(
+        pj.TurningPath(np.float32([6.5, 4.0]), np.zeros(2, np.float32), np.float32(0.0)),
+        movers=[lorry],
+        mover_paths=[path],
+        walls=[pj.intercept.Circle(4.5, 2.6, 0.3)],
+        region=[[-0.5, -0.3], [0.5, -0.3], [0.5, 0.3], [-0.5, 0.3]],
+        tolerance=0.01,
+        end_speed=(0.0, 0.05),
+        margin=0.1,
+    )
+    plan = pj.plan(pj.intercept.planner(**SMALL), case)
+    verdict = pj.intercept.judge(case, plan)
+    assert plan.status == pj.Status.CONVERGED and verdict.success, verdict.sentence(())
+    assert verdict.mover_clearance >= 0.099 and verdict.wall_clearance >= 0.099
+    assert verdict.end_speed <= 0.0501 and verdict.miss <= 0.01
+
+
+@struct.dataclass
+class Bare:
+    pos: jax.Array
+
+    def at(self, time):
+        return self.pos + jnp.stack([jnp.sin(time), time])
+
+
+def test_the_velocity_of_a_path_that_returns_positions_is_their_derivative():
+    case = pj.intercept.case(Bare(jnp.zeros(2)), upper=(20.0, 20.0))
+    state = case.target.at(jnp.float32(0.5))
+    np.testing.assert_allclose(state.pos, [np.sin(0.5), 0.5], rtol=1e-6)
+    np.testing.assert_allclose(state.vel, [np.cos(0.5), 1.0], rtol=1e-6)
+
+
+def test_a_target_may_be_a_table_of_positions_in_the_plane():
+    times = np.linspace(0.0, 10.0, 21)
+    table = pj.table_path(times, np.stack([0.3 * times, np.cos(times)], axis=1))
+    case = pj.intercept.case(table, lower=(-5.0, -5.0))
+    np.testing.assert_allclose(case.target.at(jnp.float32(4.2)).pos, [1.26, np.cos(4.2)], atol=2e-3)
+
+
+def test_the_vector_from_a_region_is_exact_and_its_slope_is_the_derivative(float64):
+    region = jnp.asarray(BOX)
+    for point in ([2.0, 0.2], [1.7, 1.4], [-3.0, -0.1], [0.2, -2.0]):
+        point = jnp.array(point)
+        away, slope = nearest_in_region(region, point)
+        nearest = np.clip(point, [-1.0, -0.5], [1.0, 0.5])
+        np.testing.assert_allclose(away, point - nearest, atol=1e-12)
+        np.testing.assert_allclose(
+            slope, jax.jacfwd(lambda p: nearest_in_region(region, p)[0])(point)
+        )
+    assert not np.any(nearest_in_region(region, jnp.array([0.3, 0.1]))[0])
+    away, slope = nearest_in_region(jnp.zeros((1, 2)), jnp.array([0.3, 0.1]))
+    np.testing.assert_allclose(away, [0.3, 0.1])
+    np.testing.assert_allclose(slope, np.eye(2))
+
+
+@pytest.mark.parametrize(
+    "settings, says",
+    [
+        ({"movers": [BOX], "mover_paths": []}, "mover_paths must have 1 entries"),
+        ({"movers": [BOX], "mover_paths": [([0, 1], np.zeros((3, 3)))]}, "mover_paths"),
+        ({"movers": [BOX], "mover_paths": [([1, 0], np.zeros((2, 3)))]}, "increasing times"),
+        ({"movers": [BOX], "mover_growth": -1.0}, "mover_growth must be >= 0"),
+        ({"walls": [pj.intercept.Circle(1.0, 1.0, 0.0)]}, "walls"),
+        ({"margin": -0.1}, "margin must be >= 0"),
+        ({"end_speed": (-1.0, 1.0)}, "end_speed must be >= 0"),
+        ({"origin": (0.0, 0.0, 0.0)}, "origin must have the shape"),
+        ({"start": (5e5, 4e6, 0.0)}, "target must be relative to the argument origin"),
+    ],
+)
+def test_a_wrong_argument_is_named(settings, says):
+    with pytest.raises(ValueError, match=says):
+        pj.intercept.case(Bare(jnp.zeros(2)), **settings)
