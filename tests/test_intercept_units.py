@@ -113,6 +113,21 @@ def test_the_car_avoids_a_recorded_mover_and_stops_in_a_region_with_a_margin():
     assert verdict.end_speed <= 0.0501 and verdict.miss <= 0.01
 
 
+@pytest.mark.parametrize(
+    "settings, status",
+    [
+        ({"time": 1.0}, pj.Status.TOO_FAR),
+        ({"start": (-1.0, 4.0, 0.0)}, pj.Status.BLOCKED),
+        ({"start": (0.8, 4.0, 0.0), "walls": [0.3 * BOX + [0.9, 4.0]]}, pj.Status.BLOCKED),
+        ({"walls": [[[2, -1], [2.2, -1], [2.2, 9], [2, 9]]]}, pj.Status.NO_PATH),
+    ],
+)
+def test_the_status_says_why_there_is_no_plan(settings, status):
+    target = pj.TurningPath(np.float32([6.5, 4.0]), np.zeros(2, np.float32), np.float32(0.0))
+    case = pj.intercept.case(target, **{"time": 10.0, **settings})
+    assert pj.plan(pj.intercept.planner(**SMALL), case).status == status
+
+
 @struct.dataclass
 class Bare:
     pos: jax.Array

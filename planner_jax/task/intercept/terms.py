@@ -362,6 +362,19 @@ def is_blocked(case: InterceptCase) -> tuple[Array, Array]:
     return (jnp.min(at_start) < 0.0) | is_off, is_goal_blocked
 
 
+def is_too_far(case: InterceptCase) -> Array:
+    """Return whether the target is further away than any path of the car by the case's time."""
+    direction = jnp.stack([jnp.cos(case.start[2]), jnp.sin(case.start[2])])
+    middle = case.start[:2] + case.body.middle * direction
+    away, _ = nearest_in_region(case.region, middle - case.target.at(case.time).pos)
+    acceleration = jnp.minimum(case.limits.acceleration, 1e6)
+    gained = jnp.minimum(case.speed + 0.5 * acceleration * case.time, case.limits.speed)
+    # The middle of a turning body may drive further than the rear axle.
+    across = case.body.middle * case.limits.curvature
+    longest = gained * case.time * jnp.sqrt(1.0 + across**2)
+    return jnp.sqrt(jnp.sum(away**2)) > longest + case.tolerance
+
+
 def nearest_in_region(region: Array, point: Array) -> tuple[Array, Array]:
     """Return the vector to a point () from the nearest point of a convex region, and its slope.
 
