@@ -118,6 +118,7 @@ def test_the_states_of_a_plan_are_the_middles_of_the_body_at_the_time_steps(prob
         time=jnp.asarray(4.0),
         speed=jnp.full(knots, 8.0),
         curvature=jnp.full(knots, 0.0),
+        origin=jnp.zeros(2),
     )
     row = problems[0].row(plan)
     assert (row["file"], row["problem"]) == ("commonroad.xml", 7)

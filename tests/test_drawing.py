@@ -33,6 +33,7 @@ def drive():
         time=case.time,
         speed=jnp.ones(9),
         curvature=jnp.zeros(9),
+        origin=case.origin,
         meeting=jnp.array([4.95, 1.0]),
     )
     return case, plan

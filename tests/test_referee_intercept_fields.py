@@ -25,7 +25,7 @@ from test_referee_intercept import (
 )
 
 import planner_jax as pj
-from planner_jax.plane.obstacles import Circle
+from planner_jax.plane.make_obstacles import Circle
 from planner_jax.referee.clearance import clearances
 from planner_jax.referee.intercept import LONGEST_MOVE
 from planner_jax.task.group.plan import GroupPlan

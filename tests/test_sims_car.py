@@ -152,7 +152,7 @@ def test_contacts_of_planned_poses_equal_those_of_the_referee():
     cases = pj.intercept.draw(6, "hard", 1)
     speed, curvature = np.full((6, PIECES + 1), 0.6), np.tile(0.6 * np.sin(6.0 * SHARE), (6, 1))
     plan = plans(speed, curvature).replace(start=cases.start, time=cases.time)
-    setpoints = plan.sample(50.0)
+    setpoints = plan.sample(400.0)
     poses = np.concatenate([setpoints.pos, setpoints.heading[..., None]], axis=2).astype(float)
     flown = driving.Driven(
         times=setpoints.time,
@@ -162,8 +162,10 @@ def test_contacts_of_planned_poses_equal_those_of_the_referee():
         **{"plans": np.ones(6, int), "paths": np.zeros((6, len(setpoints.time), 0, 2))},
     )
     found, verdict = driving.score(cases, plan, flown), pj.intercept.judge(cases, plan)
-    for name in ("wall_clearance", "mover_clearance", "miss"):
-        np.testing.assert_allclose(getattr(found, name), getattr(verdict, name), atol=2e-4)
+    # Both take the least clearance over samples, at different times: the body moves by 1.5 mm
+    # between two setpoints.
+    for name, error in (("wall_clearance", 1e-3), ("mover_clearance", 1e-3), ("miss", 2e-4)):
+        np.testing.assert_allclose(getattr(found, name), getattr(verdict, name), atol=error)
     assert found.touched.any() and not found.touched.all()
     assert not found.success.any()
 

@@ -72,7 +72,7 @@ def obstacles(
     owner = [k for k, each in enumerate(divided) for _ in each]  # of each part, its obstacle
     parts = [part for each in divided for part in each]
     most = max((len(each) for each in parts), default=3)
-    num, size = _padded(len(parts)), max(_CORNERS, 1 << (most - 1).bit_length())
+    num, size = _pad_count(len(parts)), max(_CORNERS, 1 << (most - 1).bit_length())
     shape = shape_of("velocities", velocities)
     if shape not in ((), (2,), (count, 2)):
         rule = f"the shape (2,) or ({count}, 2)"
@@ -103,7 +103,7 @@ def obstacles(
     return Obstacles(*cast, track=track)
 
 
-def _padded(num: int) -> int:
+def _pad_count(num: int) -> int:
     return next((size for size in _COUNTS if num <= size), -(-num // _COUNTS[-1]) * _COUNTS[-1])
 
 
@@ -149,7 +149,7 @@ def _resample(
     """
     grids = [None if table is None else _even_times(table[0]) for table in tables]
     horizon = max(table[0][-1] for table in tables if table is not None)
-    longest = _padded(max(len(grid) for grid in grids if grid is not None))
+    longest = _pad_count(max(len(grid) for grid in grids if grid is not None))
     poses, begin = np.zeros((num, longest, 3)), np.zeros(num)
     step, end = np.ones(num), np.zeros(num)
     for k, (table, grid) in enumerate(zip(tables, grids, strict=True)):

@@ -170,7 +170,8 @@ def _stencils(grid: Grid, movers: Obstacles, radius: Array, time: Array) -> Arra
         each.reshape(1, -1) for each in jnp.meshgrid(grid.cell[0] * steps, grid.cell[1] * steps)
     )
     placed = place(movers, time[None])
-    local = placed.enter(placed.x + x, placed.y + y)
+    none = jnp.zeros_like(placed.x)
+    local = dataclasses.replace(placed, x=none, y=none).enter(x, y)
     far, _ = distances(movers.corners, placed.present, *local)
     touches = far < radius + placed.radius
     return _pack(touches.reshape(-1, _STENCIL, _STENCIL))[0]
@@ -305,7 +306,8 @@ def reach_set(
 
 def _start_bits(grid: Grid, initial_speed: Array, speeds: Array) -> Array:
     lattice, cell = grid.lattice, grid.start
-    near = jnp.abs(speeds - initial_speed) < jnp.maximum(speeds[-1] - speeds[-2], 1e-6)
+    level = initial_speed / speeds[-1] * (lattice.levels - 1)
+    near = jnp.abs(jnp.arange(lattice.levels, dtype=level.dtype) - level) < 1.0
     x, y = (jnp.arange(num, dtype=cell.dtype) for num in lattice.cells)
     at = (y[:, None] == cell[1]) & (x[None] == cell[0])
     bits = near[:, None, None] & (jnp.arange(lattice.headings) == 0)[None, :, None]

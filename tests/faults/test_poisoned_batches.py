@@ -27,10 +27,9 @@ def test_a_table_names_arrays_of_its_case_and_every_rule_can_be_broken(name):
     options = {"robot": with_all_limits(pj.robot_named(robots[name]))} if name in robots else {}
     drawn = pj.task_named(name).draw(1, **options) if options else CASES[name]
     case = pj.take(jax.tree.map(np.asarray, drawn), 0)
-    for field in type(case).rules:
-        part_at(case, field.name)
+    present = [field for field in type(case).rules if part_at(case, field.name) is not None]
     places = {place for place, _ in poisons(case)}
-    assert places >= {field.name for field in type(case).rules if field.kind is np.floating}
+    assert places >= {field.name for field in present if field.kind is np.floating}
 
 
 @pytest.mark.parametrize("name", TASKS)
