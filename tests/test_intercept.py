@@ -181,7 +181,7 @@ SCENES = {
     "start in a wall": (scene((6.0, 4.0), [WALL], start=(3.85, 4.0, 0.0)), pj.Status.BLOCKED),
     "goal in a wall": (scene((4.0, 4.0), [WALL]), pj.Status.BLOCKED),
     "off the map": (scene((8.5, 4.0)), pj.Status.BLOCKED),
-    "too far for the time": (scene((7.8, 4.0), time=3.0), pj.Status.NO_PATH),
+    "too far for the time": (scene((7.8, 4.0), time=3.0), pj.Status.TOO_FAR),
     "NaN": (dataclasses.replace(scene(NEAR), target=still(np.nan, 4.0)), pj.Status.BAD_INPUT),
     "north": (scene((5.0, 5.0), end_heading=0.5 * np.pi), pj.Status.CONVERGED),
     "west": (scene((5.0, 5.0), end_heading=np.pi), pj.Status.CONVERGED),

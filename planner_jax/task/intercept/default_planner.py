@@ -68,7 +68,7 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
     meet: Literal["given", "early", "least"] = "given"
     pieces: int = 32  # number of pieces of speed and curvature
     samples: int = 3  # samples of each piece at which least squares check obstacles
-    checked: int = 10  # samples of each piece at which the finished plan is checked
+    checked: int = 16  # samples of each piece at which the finished plan is checked
     # Whether all paths of a search are tried and the best plan is selected, instead of the first
     # solved plan. If `meet` is not "given", all paths are always tried.
     tries_all: bool = False

@@ -80,7 +80,7 @@ class MotionProblem:
     meet: Literal["given", "early", "least"] = "given"  # as in `SpacetimeIntercept`
     pieces: int = 32  # number of pieces of speed and curvature
     samples: int = 3  # samples of each piece at which the cost checks obstacles
-    checked: int = 10  # samples of each piece at which the finished plan is checked
+    checked: int = 16  # samples of each piece at which the finished plan is checked
 
     @property
     def is_time_free(self) -> bool:

@@ -1,0 +1,49 @@
+"""Plan all problems of a folder of CommonRoad files, and write the plans for `commonroad_judge.py`.
+
+    python benchmarks/commonroad_reader/commonroad_rows.py FOLDER [--out PLANS.json] [--meet given]
+
+The alternative goals of a file are tried in turn, up to the first solved plan. The program prints
+for each file the status, the number of tried goals and the verdict of the library's referee.
+"""
+
+import argparse
+import json
+from pathlib import Path
+
+from commonroad_reader import read
+
+import planner_jax as pj
+
+
+def main() -> None:
+    """Print a row for every file, and write the plans."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.add_argument("folder", type=Path, help="folder of XML files")
+    parser.add_argument("--out", type=Path, default=Path("plans.json"), help="file for the plans")
+    parser.add_argument("--meet", default="given", help="given, early or least")
+    options = parser.parse_args()
+    files = sorted(options.folder.glob("*.xml"))
+    if not files:
+        parser.error(f"folder must have XML files, got {options.folder}")
+    planner, rows, accepted = pj.intercept.planner(meet=options.meet), [], 0
+    for file in files:
+        problems = read(file)
+        for tried, problem in enumerate(problems, 1):
+            case = problem.case()
+            plan = pj.plan(planner, case)
+            if pj.are_solved(plan) or tried == len(problems):
+                break
+        else:
+            parser.error(f"{file} must have a planning problem")
+        verdict = pj.intercept.judge(case, plan)
+        rows.append(problem.row(plan))
+        accepted += bool(verdict.success)
+        status = pj.Status(int(plan.status)).name
+        print(f"{file.stem:26} {status:12} goals {tried}: {verdict.sentence()}")
+    options.out.write_text(json.dumps(rows))
+    print(f"accepted by the referee: {accepted} of {len(files)}")
+
+
+if __name__ == "__main__":
+    main()
