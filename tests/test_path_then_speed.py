@@ -233,7 +233,7 @@ SCENES = {
     "a wall across": (scene(walls=[BARRIER]), pj.Status.NO_PATH),
     "parked on the goal": (scene(movers=[SQUARE + [6.0, 4.0]]), pj.Status.BLOCKED),
     "parked on the start": (scene(movers=[SQUARE + [0.8, 4.0]]), pj.Status.BLOCKED),
-    "too far for the time": (scene((7.8, 4.0), time=3.0), pj.Status.NO_PATH),
+    "too far for the time": (scene((7.8, 4.0), time=3.0), pj.Status.TOO_FAR),
     "NaN": (dataclasses.replace(scene(), target=still(np.nan, 4.0)), pj.Status.BAD_INPUT),
 }
 

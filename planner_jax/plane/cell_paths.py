@@ -99,7 +99,8 @@ def draw_path(
 
         def back(state: tuple, n: Array) -> tuple[tuple, tuple]:
             level, heading, cell, last = state
-            before = cell - jnp.sum(reach.moves[n, level, heading % lattice.headings], axis=0)
+            moved = reach.moves[n, level, heading % lattice.headings]
+            before = cell - jnp.sum(moved, axis=0, dtype=cell.dtype)
             from_level, turn = level + choices[:, 0], choices[:, 1]
             bits = reach.bits[n]
             is_step = jax.vmap(lambda v, h: bit_at(bits, v, h, before))(from_level, heading - turn)
@@ -108,8 +109,8 @@ def draw_path(
             turning, uneven = jnp.abs(turn) + jnp.abs(turn - last), jnp.abs(choices[:, 0])
             rough = _TURNING * turning.astype(dtype)
             rough += _UNEVEN * uneven.astype(dtype)
-            moved = (before - grid.start).astype(dtype) * grid.cell
-            rate = moved / ((n.astype(dtype) + 0.5) * grid.step)
+            away = (before - grid.start).astype(dtype) * grid.cell
+            rate = away / ((n.astype(dtype) + 0.5) * grid.step)
             mean = jnp.dot(along, rate, precision=lax.Precision.HIGHEST)
             velocity = _velocity(from_level, heading - turn, grid)
             rough += directness * jnp.sum((velocity - mean[None]) ** 2, axis=-1)

@@ -71,8 +71,8 @@ def enter_units(case: InterceptCase, units: Units) -> InterceptCase:
         end_heading=case.end_heading + turn,
         walls=_enter_obstacles(case.walls, units),
         movers=_enter_obstacles(case.movers, units),
-        lower=(case.lower - to_map) / units.length,
-        upper=(case.upper - to_map) / units.length,
+        lower=_divide(case.lower - to_map, units.length),
+        upper=_divide(case.upper - to_map, units.length),
         body=CarBody(
             length=body.length / units.length,
             width=body.width / units.length,
@@ -80,19 +80,25 @@ def enter_units(case: InterceptCase, units: Units) -> InterceptCase:
             rear_overhang=body.rear_overhang / units.length,
         ),
         limits=CarLimits(
-            speed=limits.speed / units.speed,
-            acceleration=limits.acceleration / units.acceleration,
-            lateral_acceleration=limits.lateral_acceleration / units.acceleration,
-            curvature=limits.curvature * units.length,
-            steering_rate=limits.steering_rate * units.time,
+            speed=_divide(limits.speed, units.speed),
+            acceleration=_divide(limits.acceleration, units.acceleration),
+            lateral_acceleration=_divide(limits.lateral_acceleration, units.acceleration),
+            curvature=_divide(limits.curvature, 1.0 / units.length),
+            steering_rate=_divide(limits.steering_rate, 1.0 / units.time),
         ),
         region=rotate(case.region, turn) / units.length,
         earliest=case.earliest / units.time,
-        end_speed=case.end_speed / units.speed,
+        end_speed=_divide(case.end_speed, units.speed),
         margin=case.margin / units.length,
         map_heading=case.map_heading + turn,
         origin=jnp.zeros_like(case.origin),
     )
+
+
+def _divide(value: Array, unit: Array) -> Array:
+    """Divide by a unit; an infinite value stays infinite, and its derivatives are 0, not NaN."""
+    is_finite = jnp.isfinite(value)
+    return jnp.where(is_finite, jnp.where(is_finite, value, 0.0) / unit, value)
 
 
 def _enter_obstacles(group: Obstacles, units: Units) -> Obstacles:
