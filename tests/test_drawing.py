@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 import planner_jax as pj
 from planner_jax.core.errors import ArgumentError
-from planner_jax.task.intercept.drawing import instants
+from planner_jax.task.intercept.drawing import find_outlines, instants
 
 L_SHAPE = [(3, 5), (5, 5), (5, 6), (4, 6), (4, 7), (3, 7)]
 MOVER = [(6.0, 1.0), (6.5, 1.0), (6.5, 1.5), (6.0, 1.5)]
@@ -56,6 +56,35 @@ def test_a_plan_is_drawn_with_walls_bodies_and_the_verdict(drive):
     expected = [(0.95 + time, 1.0) for time in instants(4.0, 6)]
     np.testing.assert_allclose(bodies, expected, atol=1e-5)
     assert axes.figure.axes[1].get_ylabel() == "speed of the car [m/s]"
+
+
+def test_circles_absent_movers_and_a_map_without_bounds_are_drawn():
+    square = 0.5 * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+    case = pj.intercept.case(
+        pj.TurningPath(np.float32([4.95, 1.0]), np.zeros(2, np.float32), np.float32(0.0)),
+        4.0,
+        start=(0.8, 1.0, 0.0),
+        initial_speed=1.0,
+        walls=[pj.intercept.Circle(3.0, 2.5, 0.7)],
+        movers=[square],
+        mover_paths=[([0.0, 1.0], [[3.0, -2.0, 0.0], [3.0, -1.0, 0.5]])],
+        lower=-np.inf,
+        upper=np.inf,
+    )
+    still = find_outlines(case.walls, 0.0)[0]
+    np.testing.assert_allclose(np.linalg.norm(still - [3.0, 2.5], axis=1), 0.7, rtol=1e-5)
+    cos, sin = np.cos(0.25), np.sin(0.25)
+    turned = square @ [[cos, sin], [-sin, cos]] + [3.0, -1.5]
+    np.testing.assert_allclose(find_outlines(case.movers, 0.5)[0][:4], turned, atol=1e-5)
+    assert np.isnan(find_outlines(case.movers, 1.1)[0]).all()
+    knots = {"speed": jnp.ones(9), "curvature": jnp.zeros(9)}
+    none = {name: jnp.array(0) for name in ("iterations", "status")}
+    numbers = {name: jnp.array(0.0) for name in ("cost", "violation")}
+    rest = {"start": case.start, "time": case.time, "meeting": jnp.array([4.95, 1.0])}
+    plan = pj.intercept.InterceptPlan(**numbers, **none, **knots, **rest, origin=case.origin)
+    axes = pj.intercept.draw_plan(case, plan)
+    (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
+    assert left < 0.8 < 4.95 < right < 10.0 and low < 1.0 < high < 10.0
 
 
 def test_a_case_of_a_batch_is_drawn_by_its_index_and_says_what_fails(drive):

@@ -40,6 +40,15 @@ def write_grid(folder):
     (folder / "cells.yaml").write_text(yaml.safe_dump(fields))
 
 
+def test_a_file_with_utm_coordinates_keeps_millimetres(tmp_path):
+    far = {"start": [500000.8, 4600004.0, 0.0], "walls": None, "movers": None}
+    far |= {"lower": [500000, 4600000], "upper": [500008, 4600008], "mover_velocities": None}
+    target = {"position": [500003.124, 4600004.623]}
+    case = read_case(write_case(tmp_path, **far, target=target))
+    world = np.asarray(case.origin, float) + np.asarray(case.target.pos, float)
+    np.testing.assert_allclose(world, target["position"], atol=1e-6)
+
+
 def test_the_command_writes_plan_setpoints_and_picture(tmp_path, capsys):
     out = tmp_path / "out"
     command = ["plan", "intercept", "--map", str(write_case(tmp_path)), "--out", str(out)]

@@ -5,7 +5,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
 from planner_jax.cli.plan.answer import Answer, Margin, Single, closest_to
@@ -62,11 +61,11 @@ def _target(given: object) -> TurningPath:
     fields = _fields_of("target", given, tuple(_TARGET))
     if "position" not in fields:
         raise ArgumentError("target.position", "given", shown="nothing")
-    numbers = [
-        numbers_of(f"target.{name}", fields.get(name, np.zeros(shape)), (), shape)
+    numbers: list[Any] = [
+        numbers_of(f"target.{name}", fields.get(name, np.zeros(shape)), (), shape).astype(float)
         for name, shape in _TARGET.items()
     ]
-    return TurningPath(*(jnp.asarray(each, jnp.float32) for each in numbers))
+    return TurningPath(*numbers)
 
 
 def _with_grid(path: Path, grid: object, given: dict[str, Any]) -> dict[str, Any]:
@@ -145,5 +144,5 @@ class SingleIntercept(Single[SingleInterceptSettings]):
         """Draw the plan from above into the folder `out`, and return the picture's path."""
         path = out / "plane.png"
         figure = lambda canvas: drawing.draw_plan(answer.case, answer.plan, canvas.subplots())  # noqa: E731
-        draw(path, figure, drawing.figure_size(answer.case))
+        draw(path, figure, drawing.figure_size(answer.case, answer.plan))
         return [path]

@@ -18,9 +18,12 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.patheffects import withStroke
 from matplotlib.transforms import offset_copy
+from scipy.spatial import ConvexHull
 
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.protocol import take
+from planner_jax.plane.obstacles import Obstacles, Placement, place
+from planner_jax.plane.target import rotate
 from planner_jax.robot.car import knots_at, pose_at
 from planner_jax.runs import style
 from planner_jax.runs.style import Look
@@ -129,11 +132,10 @@ def draw_plan(
         verdict = dataclasses.replace(verdict, **fields)
     elif index is not None:
         raise ArgumentError("index", "None for one case", index)
-    movers = jax.jit(case.movers.vertices)
     drive = SampledDrive(
-        bounds=np.array([case.lower, case.upper]),
-        walls=list(np.asarray(case.walls.vertices(0.0))[np.asarray(case.walls.present)]),
-        movers_at=lambda time: list(np.asarray(movers(time))[np.asarray(case.movers.present)]),
+        bounds=_bounds_of(case, plan),
+        walls=find_outlines(case.walls, 0.0),
+        movers_at=lambda time: find_outlines(case.movers, time),
         target_at=lambda times: np.asarray(jax.vmap(lambda t: case.target.at(t).pos)(times)),
         due=float(case.time),
         size=(float(case.body.length), float(case.body.width), float(case.body.rear_overhang)),
@@ -147,7 +149,7 @@ def draw_plan(
         if ax is None:
             import matplotlib.pyplot as plt
 
-            ax = plt.subplots(figsize=figure_size(case))[1]
+            ax = plt.subplots(figsize=figure_size(case, plan))[1]
         draw_drive(ax, drive, colours, by_speed=True)
         ax.figure.colorbar(colours, ax=ax, label="speed of the car [m/s]", fraction=0.045, pad=0.02)
         below = offset_copy(
@@ -160,9 +162,48 @@ def draw_plan(
     return ax
 
 
-def figure_size(case: InterceptCase) -> tuple[float, float]:
-    """Return width and height [inch] of a figure in which `draw_plan` draws one case's map."""
-    wide, tall = np.asarray(case.upper, float) - np.asarray(case.lower, float)
+def _bounds_of(case: InterceptCase, plan: InterceptPlan) -> np.ndarray:
+    """Return the corners (2, 2) [m] of the rectangle that is drawn.
+
+    It holds the map, or if the map is unbounded the car's and the target's path.
+    """
+    sides = np.array([case.lower, case.upper], float)
+    points = np.stack(np.meshgrid(*sides.T), axis=-1).reshape(-1, 2)
+    points = np.asarray(rotate(jnp.asarray(points), case.map_heading))
+    margin = 0.0
+    if not np.isfinite(sides).all():
+        margin = 3.0 * float(case.body.length)
+        motion = sample_motion(plan.start, plan.time, plan.speed, plan.curvature, _SAMPLES)
+        target = jax.vmap(lambda time: case.target.at(time).pos)(jnp.asarray(motion["time"]))
+        points = np.concatenate([motion["pose"][:, :2], target])
+    return np.array([points.min(axis=0) - margin, points.max(axis=0) + margin])
+
+
+def find_outlines(group: Obstacles, time: float) -> list[np.ndarray]:
+    """Return the outlines (V, 2) [m] of the obstacles at one time [s]; absent ones are NaN."""
+    placed, corners = _place_corners(group, jnp.asarray(time, group.centre.dtype))
+    exists, radius = np.broadcast_arrays(placed.present, placed.radius)
+    angles = np.linspace(0.0, 2.0 * np.pi, 48, endpoint=False)
+    around = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    outlines = []
+    for k in np.flatnonzero(group.present):
+        outline = np.asarray(corners[k], float)
+        if radius[k, 0] > 0.0:
+            points = (outline[:, None] + radius[k, 0] * around).reshape(-1, 2)
+            outline = points[ConvexHull(points).vertices]
+        outlines.append(outline if exists[k, 0] else np.full_like(outline, np.nan))
+    return outlines
+
+
+@jax.jit
+def _place_corners(group: Obstacles, time: Array) -> tuple[Placement, Array]:
+    return place(group, time[None]), group.vertices(time)
+
+
+def figure_size(case: InterceptCase, plan: InterceptPlan) -> tuple[float, float]:
+    """Return width and height [inch] of a figure in which `draw_plan` draws one case."""
+    lower, upper = _bounds_of(case, plan)
+    wide, tall = upper - lower
     scale = 6.4 / max(wide, tall)
     return max(scale * wide, 3.9) + 1.6, max(scale * tall, 1.2) + 1.3
 
@@ -189,9 +230,9 @@ def draw_drive(
         axes.plot(*path.T, color=style.GREY, linewidth=0.7, zorder=1.5)
     path = drive.target_at(np.linspace(0.0, drive.due, 101))
     axes.plot(*path.T, color=style.INK, linewidth=1.0, linestyle=(0, (4, 2)), zorder=3)
-    for place, shade in zip(drive.target_at(times), shades, strict=True):
+    for point, shade in zip(drive.target_at(times), shades, strict=True):
         colour = style.INK if by_speed else shade
-        axes.plot(*place, "o", zorder=6, color=colour, markersize=5.5, mec=style.INK, mew=0.6)
+        axes.plot(*point, "o", zorder=6, color=colour, markersize=5.5, mec=style.INK, mew=0.6)
     parts = np.stack([drive.middle[:-1], drive.middle[1:]], axis=1)
     line = LineCollection(list(parts), cmap=colours.cmap, norm=colours.norm, linewidths=2.2)
     line.set(array=values[:-1], zorder=4, capstyle="round")
@@ -220,16 +261,16 @@ def _label_times(
     Places that are less than `gap` [m] from the last text have none.
     """
     last = np.full(2, np.inf)
-    for k, (time, place) in enumerate(zip(times, places, strict=True)):
-        if np.linalg.norm(place - last) >= gap:
+    for k, (time, point) in enumerate(zip(times, places, strict=True)):
+        if np.linalg.norm(point - last) >= gap:
             x, y = places[min(k + 1, len(places) - 1)] - places[max(k - 1, 0)]
             length = float(np.hypot(x, y))
             offset = (-15.0 * side * y / length, 13.0 * side * x / length) if length else (0, 13)
             look: Look = {"textcoords": "offset points", "fontsize": 8.0, "color": style.INK}
             look |= {"ha": "center", "va": "center", "zorder": 9}
             halo = [withStroke(linewidth=2.0, foreground="white")]
-            axes.annotate(f"{time:g} s", place, offset, path_effects=halo, **look)
-            last = place
+            axes.annotate(f"{time:g} s", point, offset, path_effects=halo, **look)
+            last = point
 
 
 def entries(colours: ScalarMappable, *, by_speed: bool = False) -> list[Artist]:
