@@ -90,7 +90,7 @@ def draw_path(
 
     cosine, sine = jnp.cos(grid.heading), jnp.sin(grid.heading)
     along = jnp.stack([jnp.stack([cosine, sine]), jnp.stack([-sine, cosine])])
-    along *= 1.0 / (reach.speeds[-1] - reach.speeds[-2])
+    along /= reach.speeds[-1] - reach.speeds[-2]
 
     def draw(ends: Array, steps: Array) -> CellPath:
         score = ends + jnp.where(jnp.arange(9) == 0, 1.0, 0.0)[None, None]

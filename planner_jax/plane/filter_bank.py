@@ -34,7 +34,7 @@ _CHANGE, _TURNING = 0.1, 0.05  # prior probabilities of a change, and of a stead
 # The motion may change between the observation this many before the last one, and the next one.
 _BEFORE = np.array([*range(1, 11), 12, 14, 17, 20, 24, 28, 33, 39, 46, 54])
 _OUTLIER = 0.005  # prior probability that an observation is an outlier
-_KEPT = 48  # number of hypotheses that a mixture keeps: those of the greatest probabilities
+_KEPT = 48  # number of hypotheses in a mixture, the most probable ones
 _LEAST = 1e-100  # [m, m/s], least noise and speed
 _NODE, _WEIGHT = np.polynomial.legendre.leggauss(6)
 
@@ -54,12 +54,12 @@ class Mixture(NamedTuple):
 
 
 class Fit(NamedTuple):
-    """What the bank finds about N targets."""
+    """State, change of motion and noise of N targets, estimated from their observations."""
 
     mixture: Mixture
-    chance_changed: np.ndarray  # (N,)
+    chance_changed: np.ndarray  # (N,), probability that the motion changed
     since: np.ndarray  # (N,) [s], expected time of the change after the last observation, < 0
-    noise: np.ndarray  # (N,) [m]
+    noise: np.ndarray  # (N,) [m], standard deviation of an observed coordinate
 
 
 def fit_bank(times: np.ndarray, places: np.ndarray, noise: float | None) -> Fit:

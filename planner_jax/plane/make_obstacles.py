@@ -148,7 +148,7 @@ def _resample(
     Obstacles without a table keep their velocity.
     """
     grids = [None if table is None else _even_times(table[0]) for table in tables]
-    horizon = max(table[0][-1] for table in tables if table is not None)
+    horizon = max(1.0, *(table[0][-1] for table in tables if table is not None))
     longest = _pad_count(max(len(grid) for grid in grids if grid is not None))
     poses, begin = np.zeros((num, longest, 3)), np.zeros(num)
     step, end = np.ones(num), np.zeros(num)

@@ -1,4 +1,4 @@
-"""Occupancy grids: maps of square cells, such as those of ROS, and rectangles that cover them."""
+"""Occupancy grids, which are maps of square cells, and rectangles that cover occupied cells."""
 
 import dataclasses
 import math

@@ -2,7 +2,7 @@
 
 A leg is the drive to one target. It starts at the time and state at which the previous leg ends.
 `SpacetimeIntercept` plans each leg such that the meeting is as early as possible. If no such plan
-is found, it plans the leg with the least squared acceleration instead. The first legs of all cases
+is found, it plans the leg with the least discomfort instead. The first legs of all cases
 of a batch, in all proposed orders, are planned together, then all second legs, and so on.
 """
 

@@ -102,7 +102,7 @@ def planner(name: str = "spacetime", **options: object) -> Planner[InterceptCase
     * `spacetime`: computes the set of cells in space and time that the car can reach, and optimises
       path and speed together, by least squares from random paths through this set.
     * `quick`: `spacetime` with fewer paths and steps, for large batches on a GPU.
-    * `best`: `spacetime` with more paths and steps; selects the plan of least squared acceleration.
+    * `best`: `spacetime` with more paths and steps; selects the plan of least discomfort.
     * `lattice`: plans eight paths among the walls, then the speed along each path among the moving
       obstacles, and selects the best plan.
     * `paper`: the planner of [Qu2022]: one path by Hybrid A*, smoothed, then the speed along it. It

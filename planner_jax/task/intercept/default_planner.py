@@ -2,13 +2,16 @@
 
 [Qu2022] plans a path among the walls, and then a speed along it among the moving obstacles. If such
 an obstacle stays on the path, no speed avoids it. Here path and speed are planned together. The
-reach set (`plane.reach`) holds the cells of the map in which the car can be at each time. Random
-paths of cells through the set are starting points of Levenberg-Marquardt (`problem`). The unknowns
-are the car's speed and curvature at equally spaced times. There are three stages:
+unknowns are the car's speed and curvature at equally spaced times, found by Levenberg-Marquardt
+(`problem`). The first starting point is the direct motion to the target. If it leads to no plan,
+the others are random paths of cells through the reach set (`plane.reach`), which holds the cells of
+the map in which the car can be at each time. There are three stages:
 
-1. follow the positions of the cells;
+1. follow the positions of the starting point;
 2. keep every limit;
-3. once every limit holds, reduce the squared acceleration, or meet the target earlier.
+3. once every limit holds, reduce the discomfort, or meet the target earlier.
+
+All numbers are in the units of the case (`units`).
 """
 
 import dataclasses
@@ -58,9 +61,9 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
     """Planner of interceptions by least squares from random paths of reachable grid cells.
 
     `meet` selects the time of the meeting: "given" is the time of the case, "early" is as early as
-    possible before it, and "least" is the time, up to the case's time, that needs the least effort,
-    which is the integral of the squared acceleration. A plan's cost is the meeting time [s] if
-    `meet` is "early", and else the effort [m^2/s^3].
+    possible before it, and "least" is the time, up to the case's time, of the least discomfort. A
+    plan's cost is the meeting time [s] if `meet` is "early", and else the discomfort [m^2/s^3] of
+    `terms.limit_terms`.
     """
 
     case_type: ClassVar[type] = InterceptCase
@@ -124,7 +127,7 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
         return self.smooth_near(cases, plans)
 
     def solve(self, case: InterceptCase, attempt: Search) -> InterceptPlan:
-        """Plan one case by least squares from random paths of cells, up to the first solved plan.
+        """Plan one case by least squares from several starting points, up to the first solved plan.
 
         With `tries_all`, or if the meeting time is free, all paths are tried for the best plan.
         """
@@ -166,7 +169,7 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
         return self._explain(case, search, (k <= 0) | found.is_reached, best)
 
     def solve_at_once(self, cases: InterceptCase, attempt: Search) -> InterceptPlan:
-        """Plan a batch: try all random paths of cells together, select each case's best plan."""
+        """Plan a batch: try all starting points together, select each case's best plan."""
         search, is_free = self.load_attempt(attempt, cases), self.problem.is_time_free
         units = jax.vmap(units_of)(cases)
         local = jax.vmap(enter_units)(cases, units)
@@ -238,5 +241,5 @@ def quick(**fields: object) -> SpacetimeIntercept:
 
 
 def best(**fields: object) -> SpacetimeIntercept:
-    """Make a `SpacetimeIntercept` that tries more paths to reduce the squared acceleration."""
+    """Make a `SpacetimeIntercept` that tries more paths to reduce the discomfort."""
     return SpacetimeIntercept(**{"searches": BEST, "tries_all": True, **fields})

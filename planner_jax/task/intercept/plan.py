@@ -44,15 +44,15 @@ def make_plan(
     """
     drive = motion(case.start, time, speed, curvature, samples)
     weights = terms.Weights()
-    _, violation, effort = terms.limit_terms(case, time, speed, curvature, weights, points)
+    _, violation, discomfort = terms.limit_terms(case, time, speed, curvature, weights, points)
     _, missed = terms.meeting_terms(case, drive, time, weights)
     too_close = (_GRAZING - jnp.min(terms.clearance(case, drive))) / case.body.width
     worst = jnp.maximum(jnp.maximum(violation, missed), too_close)
     return InterceptPlan(
-        cost=effort,
+        cost=discomfort,
         violation=worst,
         iterations=steps,
-        status=status_of(effort, worst, True),
+        status=status_of(discomfort, worst, True),
         start=case.start,
         time=time,
         speed=speed,

@@ -1,9 +1,9 @@
 """The least-squares problem of an interception: cost, stages of its solution, and derivatives.
 
 The n unknowns are speed and curvature at K equally spaced times (knots) after the start, and the
-time of the meeting if it is free. The cost is a sum of squares (`terms`): the effort, which is the
-integral of the squared acceleration; the distance from the target at the end; and one-sided
-penalties (hinges) on limits and on distances from obstacles.
+time of the meeting if it is free. The cost is a sum of squares (`terms`): the discomfort, which
+is an integral of squared accelerations, lateral jerk and steering rate; the distance from the
+target at the end; and one-sided penalties (hinges) on limits and on distances from obstacles.
 
 The search for a path round the obstacles cannot be differentiated. Its path only determines where
 least squares start and which local minimum of the cost they reach. This minimum moves smoothly with
@@ -40,7 +40,7 @@ _HIGHEST = lax.Precision.HIGHEST
 _SOONEST = 0.01  # earliest time of a meeting, divided by the case's time
 
 # Weights of the cost in the three stages: follow the path of grid cells, keep all limits, and
-# reduce the effort, which is the integral of the squared acceleration.
+# reduce the discomfort.
 _FOLLOWING = terms.Weights(follow=10.0, obstacle=0.0, early=0.0)
 _KEEPING = terms.Weights()
 _SETTLING = terms.Weights(effort=10.0)
@@ -74,7 +74,8 @@ class Guess:
 class MotionProblem:
     """The least-squares problem of an interception, which `SpacetimeIntercept` solves.
 
-    `meet` selects the time of the meeting: the case's, the earliest, or the one of least effort.
+    `meet` selects the time of the meeting: the case's time, the earliest, or the time of the least
+    discomfort.
     """
 
     meet: Literal["given", "early", "least"] = "given"  # as in `SpacetimeIntercept`
@@ -89,7 +90,7 @@ class MotionProblem:
 
     @property
     def weights(self) -> terms.Weights:
-        """Weights of the last stage, which reduces the meeting time or the squared acceleration."""
+        """Weights of the last stage, which reduces the meeting time or the discomfort."""
         return _HURRYING if self.meet == "early" else _SETTLING
 
     def pack(self, speed: Array, curvature: Array, time: Array) -> Array:
@@ -169,11 +170,12 @@ class MotionProblem:
         return Guess(point=point, positions=interpolate(cells, case.start[:2], at - 0.5))
 
     def guess_directly(self, case: InterceptCase) -> Guess:
-        """Return a starting point whose motion has the least squared acceleration of a point.
+        """Return a starting point that leads directly to the target, past no obstacle.
 
-        Obstacles and limits are ignored. The point starts as the car does, and is at the target at
-        the case's time, or at an earlier time if the meeting shall be early. Its position is a
-        cubic polynomial in time. The case is in the units of `units.enter_units`.
+        The motion is a point's motion with the least integral of the squared acceleration: a cubic
+        polynomial in time. The point starts with the car's position and velocity. It is at the
+        target at the case's time, or at an earlier time if the meeting shall be early. Obstacles
+        and limits are ignored. The case is in the units of `units.enter_units`.
         """
         time = self._direct_time(case)
         is_heading_free = case.heading_tolerance >= np.pi
@@ -183,7 +185,7 @@ class MotionProblem:
             ahead = jnp.stack([jnp.cos(heading), jnp.sin(heading)])
             goal = case.target.at(time).pos - case.body.middle * ahead
             offset = goal - first * time
-            free = first + 1.5 * offset / time  # velocity at the end that needs least effort
+            free = first + 1.5 * offset / time  # velocity at the end of the optimal motion
             along = jnp.clip(jnp.dot(free, ahead, precision=_HIGHEST), 0.1, case.limits.speed)
             low, high = case.end_speed[0], case.end_speed[1]
             end = ahead * jnp.clip(along, low, jnp.maximum(high, low))
@@ -215,9 +217,7 @@ class MotionProblem:
         times = case.time * jnp.linspace(1.0 / 16.0, 1.0, 16, dtype=case.time.dtype)
         away = jax.vmap(lambda time: case.target.at(time).pos)(times)
         apart = jnp.sqrt(jnp.sum(away**2, axis=1))
-        gained = jnp.minimum(case.limits.acceleration, 1e6) * times
-        most = jnp.minimum(case.speed + 0.5 * gained, case.limits.speed) * times
-        is_open = (most >= apart) & (times >= case.earliest)
+        is_open = (terms.longest_drive(case, times) >= apart) & (times >= case.earliest)
         return jnp.where(jnp.any(is_open), times[jnp.argmax(is_open)], case.time)
 
     def build_model(

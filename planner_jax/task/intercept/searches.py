@@ -38,7 +38,7 @@ class Search(Attempt):
     paths: int = 16  # number of paths from which least squares run
     solver: LevenbergConfig = LevenbergConfig()  # settings of the stage that meets all limits
     following: int = 4  # number of steps of the first stage, which follows the path of cells
-    settling: int = 16  # number of steps of the last stage, which reduces the effort or the time
+    settling: int = 16  # number of steps of the last stage, which reduces the cost
     margin: float = 0.03  # [m], distance from obstacles below which they are penalised
     slack: float = 0.015  # a value is penalised above (1 - slack) times its limit
     discs: int = 3  # number of discs that cover the car's body in least squares
@@ -167,8 +167,7 @@ def make_grid(case: InterceptCase, lattice: reach.Lattice, *, is_time_free: bool
     """Return the grid of a case: cells that cover the part of its map that the car can use.
 
     The part is bounded by ellipses: a car whose path has the length L visits only points whose
-    distances from the start and from the target add up to at most L. The case is in the units of
-    `units.enter_units`, so that it starts at the origin.
+    distances from the start and from the target add up to at most L.
 
     Args:
         case: the case.
@@ -234,28 +233,13 @@ def search_reach(
     equally spaced times; by default they extend to the case's time. `is_time_free` is true if the
     target may be met before the case's time.
     """
-    speed, most = _top_speed(case), case.limits.acceleration
-    return _search_grid(case, search, grid, field, speed, most, is_time_free, layers)
-
-
-def _search_grid(
-    case: InterceptCase,
-    search: Search,
-    grid: reach.Grid,
-    field: DistanceField,
-    speed: Array,
-    acceleration: Array,
-    is_time_free: bool,
-    layers: Array | None = None,
-) -> Reachability:
-    lattice = search.lattice
+    lattice, limits, speed = search.lattice, case.limits, _top_speed(case)
     radius, ahead = discs_of(case.body, 2)
-    limits = case.limits
     level = speed * jnp.linspace(0.0, 1.0, lattice.levels)
     quickest = limits.lateral_acceleration / jnp.maximum(level, 0.1 * speed)
     turn_rates = jnp.minimum(limits.curvature * level, quickest)
     vehicle = reach.Vehicle(
-        search.body_scale * radius + case.margin, ahead, level, turn_rates, acceleration
+        search.body_scale * radius + case.margin, ahead, level, turn_rates, limits.acceleration
     )
     needed = grid.num if layers is None else layers
     coarse = field.values[::_NODES, ::_NODES]
@@ -335,11 +319,11 @@ def earliest_arrival(case: InterceptCase) -> Array:
     The estimate is the first time in the reach set (about 20 times up to 10 s) at which the car can
     be at the target; infinite if there is none up to the case's time. Nothing is optimised.
     """
-    grid = reach.grid_of(
-        _ARRIVAL.lattice, case.start, case.time, case.limits.speed, case.lower, case.upper
-    )
-    speed, unlimited = case.limits.speed, jnp.full_like(case.time, jnp.inf)
-    field = make_field(case, grid)
-    found = _search_grid(case, _ARRIVAL, grid, field, speed, unlimited, True)
+    # The speed may change by one level at any time, as if the acceleration had no limit.
+    unlimited = dataclasses.replace(case.limits, acceleration=jnp.full_like(case.time, jnp.inf))
+    case = dataclasses.replace(case, limits=unlimited)
+    whole = case.start, case.time, case.limits.speed, case.lower, case.upper
+    grid = reach.grid_of(_ARRIVAL.lattice, *whole)
+    found = search_reach(case, _ARRIVAL, grid, make_field(case, grid), is_time_free=True)
     first = jnp.argmax(found.layers).astype(case.time.dtype)
     return jnp.where(found.is_reached, (first + 0.5) * found.grid.step, jnp.inf)

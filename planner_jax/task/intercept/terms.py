@@ -341,10 +341,10 @@ def inside_map(case: InterceptCase, points: Array) -> Array:
 
 
 def is_blocked(case: InterceptCase) -> tuple[Array, Array]:
-    """Return whether the car overlaps an obstacle at the start, and whether the target is blocked.
+    """Return whether the car is blocked at the start, and whether the target is blocked, () bool.
 
-    The car is also blocked if it starts off the map. The target is blocked if at the meeting time
-    it is off the map, or nearer to an obstacle than half the car's width.
+    The car is blocked if it overlaps an obstacle or is off the map. The target is blocked if at the
+    meeting time it is off the map, or nearer to an obstacle than half the car's width.
     """
     goal = case.target.at(case.time).pos
     first = jnp.zeros_like(case.time)[None]
@@ -367,12 +367,16 @@ def is_too_far(case: InterceptCase) -> Array:
     direction = jnp.stack([jnp.cos(case.start[2]), jnp.sin(case.start[2])])
     middle = case.start[:2] + case.body.middle * direction
     away, _ = nearest_in_region(case.region, middle - case.target.at(case.time).pos)
-    acceleration = jnp.minimum(case.limits.acceleration, 1e6)
-    gained = jnp.minimum(case.speed + 0.5 * acceleration * case.time, case.limits.speed)
     # The middle of a turning body may drive further than the rear axle.
     across = case.body.middle * case.limits.curvature
-    longest = gained * case.time * jnp.sqrt(1.0 + across**2)
+    longest = longest_drive(case, case.time) * jnp.sqrt(1.0 + across**2)
     return jnp.sqrt(jnp.sum(away**2)) > longest + case.tolerance
+
+
+def longest_drive(case: InterceptCase, times: Array) -> Array:
+    """Return upper bounds (...) [m] of the distances that the car can drive until times (...)."""
+    gained = 0.5 * jnp.minimum(case.limits.acceleration, 1e6) * times
+    return jnp.minimum(case.speed + gained, case.limits.speed) * times
 
 
 def nearest_in_region(region: Array, point: Array) -> tuple[Array, Array]:

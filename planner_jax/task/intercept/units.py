@@ -147,8 +147,3 @@ def leave_units(
         meeting=case.target.at(plan.time * units.time).pos,
         origin=case.origin,
     )
-
-
-def enter_plan(plan: InterceptPlan, units: Units) -> tuple[Array, Array, Array]:
-    """Return speed, curvature and time of a plan of a case, converted to the case's units."""
-    return plan.speed / units.speed, plan.curvature * units.length, plan.time / units.time
