@@ -12,7 +12,7 @@ from planner_jax.ball.flight import drag_free_flight
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.protocol import Status, take
 from planner_jax.studies.block.camera import looking_at
-from planner_jax.studies.block.contact_check import delay_motion, end_at_contact
+from planner_jax.studies.block.contact_check import end_at_contact
 from planner_jax.studies.block.flight_fit import Sight
 from planner_jax.studies.block.observation import cautious, eye
 from planner_jax.studies.block.receding import Aim, decide
@@ -94,18 +94,6 @@ def test_replanning_starts_from_the_motion_with_the_new_ball(cases):
     np.testing.assert_array_equal(again.contact_time[both], warm.contact_time[both])
 
 
-def test_a_late_motion_has_a_later_contact_or_fails(cases):
-    plans = pj.plan(SMALL, cases)
-    solved = pj.are_solved(plans)
-    in_time = delay_motion(cases, plans, np.zeros(6, np.float32))
-    np.testing.assert_array_equal(in_time.contact_time, plans.contact_time)
-    assert pj.block.judge(cases, in_time).success[solved].all()
-    late = delay_motion(cases, plans, np.full(6, 0.25, np.float32))
-    verdict = pj.block.judge(cases, late)
-    assert not verdict.success.any()
-    assert not np.isin(verdict.failed_limit[solved], ("start", "continuity", "velocity")).any()
-
-
 @pytest.mark.slow
 def test_the_noise_of_a_throw_does_not_depend_on_its_batch(cases):
     seeds = np.arange(6, dtype=np.uint32)
@@ -133,11 +121,8 @@ def test_invalid_decisions_are_rejected(cases, change, error, message):
 @pytest.mark.parametrize(
     ("given", "name"),
     [
-        ({"planning_budget": -1.0}, "planning_budget"),
         ({"frame_rate": 0.0}, "frame_rate"),
         ({"perception": True, "delay": 0.1}, "delay"),
-        ({"perception": True, "planning_budget": 0.1}, "planning_budget"),
-        ({"perception": True, "replan": 20.0, "observe_longer": 0.1}, "observe_longer"),
     ],
 )
 def test_contradictory_settings_are_rejected(given, name):
@@ -146,15 +131,10 @@ def test_contradictory_settings_are_rejected(given, name):
 
 
 @pytest.mark.slow
-def test_sweeps_report_observations_and_planning_times(tmp_path):
-    def sweep(name, **options):
-        settings = BlockSettings(planner="direct", regime="R1", num=4, **options)
-        return start_sweep(TASK, settings, tmp_path / name, progress=False)["summary"]
-
-    assert 0.0 < sweep("seen", wide=True, perception=True)["fit_error_median"] < 0.3
-    counted = sweep("counted", planning_budget=0.0)
-    assert 0.0 < counted["planning_p50"] <= counted["planning_p99"]
-    assert sweep("late", planning_budget=5.0)["successes"] == 0  # The ball arrives earlier.
+def test_sweeps_report_errors_of_fits(tmp_path):
+    settings = BlockSettings(planner="direct", regime="R1", num=4, wide=True, perception=True)
+    found = start_sweep(TASK, settings, tmp_path / "seen", progress=False)
+    assert 0.0 < found["summary"]["fit_error_median"] < 0.3
 
 
 def test_a_replanned_case_has_the_ball_of_the_original_case(cases):

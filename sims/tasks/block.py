@@ -131,7 +131,6 @@ class BlockFlight(FlightTask):
                 observe=settings.until_known,
                 overhead=settings.until_set,
                 replan=settings.rate,
-                observe_longer=0.0,
                 noise=settings.noise,
                 frame_rate=settings.frame_rate,
                 seed=settings.seed,

@@ -9,7 +9,6 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array, lax
 
 from planner_jax.ball.flight import drag_free_flight
@@ -41,37 +40,6 @@ def end_at_contact(cases: BlockCase, plans: BlockPlan) -> BlockPlan:
         Plans with one more piece for braking, of zero duration if the contact is before braking.
     """
     return _end_each_at_contact(cases, plans)
-
-
-def delay_motion(cases: BlockCase, plans: BlockPlan, late: np.ndarray) -> BlockPlan:
-    """Return the plans with later starts, cut at their contacts as `end_at_contact` does.
-
-    Args:
-        cases: a batch of B cases in which the arms start at rest.
-        plans: plans of these cases.
-        late: (B,) [s], time >= 0 by which each motion starts later; 0 changes no motion.
-
-    Returns:
-        Plans with two more pieces: one for waiting before the motion, one for braking after it.
-    """
-    return _delay_each(cases, plans, late)
-
-
-@jax.jit
-@jax.vmap
-def _delay_each(case: BlockCase, plan: BlockPlan, late: Array) -> BlockPlan:
-    motion = plan.motion
-    still = jnp.zeros_like(motion.coeffs[:1]).at[0, 0].set(case.angles)
-    waited = PiecewisePolynomial(
-        coeffs=jnp.concatenate([still, motion.coeffs]),
-        durations=jnp.concatenate([late[None], motion.durations]),
-    )
-    whole = append_braking(case, waited)
-    in_time = dataclasses.replace(
-        plan, motion=dataclasses.replace(whole, durations=whole.durations.at[-1].set(0.0))
-    )
-    met = _find_contact(case, dataclasses.replace(plan, motion=waited))
-    return jax.tree.map(lambda ours, theirs: jnp.where(late > 0.0, ours, theirs), met, in_time)
 
 
 def _find_contact(case: BlockCase, plan: BlockPlan) -> BlockPlan:

@@ -46,7 +46,6 @@ class SeeingArms(Planner[BlockCase, SeenPlan]):
     observe: float  # [s] time from a case's time 0 until a flight is first fitted to observations
     overhead: float  # [s] time from a fit until a motion that is planned from it may start
     replan: float  # [Hz] rate at which flights are fitted and motions planned again; 0 plans once
-    observe_longer: float  # [s] greatest delay of the first motion to collect more observations
     noise: float  # [m] standard deviation of isotropic noise; 0 selects a stereo camera's noise
     frame_rate: float  # [Hz] frame rate of the camera
     seed: int  # seed of the noise
@@ -79,16 +78,12 @@ class SeeingArms(Planner[BlockCase, SeenPlan]):
             self.moments(cases),
             overhead=self.overhead,
             seed=self._seeds(cases),
-            patient=self.observe_longer > 0.0,
             again=self.replan > 0.0,
         )
 
     def moments(self, cases: BlockCase) -> list[float]:
         """Return the times [s] at which flights are fitted, while a ball can still be blocked."""
         moments = [self.observe]
-        if self.observe_longer:
-            num = int(self.observe_longer * self.frame_rate + 1e-6)
-            moments += [self.observe + k / self.frame_rate for k in range(1, num + 1)]
         if self.replan:
             latest = float(np.max(jax.jit(jax.vmap(flight_of))(cases).latest))
             step = 1.0 / self.replan

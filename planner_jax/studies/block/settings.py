@@ -1,4 +1,4 @@
-"""Settings of runs over many cases that simulate a camera or planning times; without JAX."""
+"""Settings of runs over many cases that simulate a camera; without JAX."""
 
 import dataclasses
 import math
@@ -25,14 +25,8 @@ def require_frame_rate(value: float) -> None:
 
 @dataclasses.dataclass(frozen=True)
 class StudySettings(SweepSettings):
-    """Settings of a sweep (run over many cases) that simulates a camera or the planning time."""
+    """Settings of a sweep (run over many cases) that may simulate a camera."""
 
-    planning_budget: float | None = option(
-        None,
-        "S",
-        "seconds after the delay at which motions start; cases are planned one after another, and "
-        "a motion starts later if planning takes longer than this budget, by the excess",
-    )
     perception: bool = option(
         False, "", "plan with a camera's observations of the ball; the referee uses the true ball"
     )
@@ -41,12 +35,6 @@ class StudySettings(SweepSettings):
         0.05, "S", "with --perception: seconds from a fit until its motion may start"
     )
     replan: float = option(0.0, "HZ", "with --perception: rate of planning again; 0 plans once")
-    observe_longer: float = option(
-        0.0,
-        "S",
-        "with --perception: seconds beyond --observe in which an arm may continue to observe, "
-        "frame by frame while it could still meet the ball",
-    )
     noise: float = option(
         0.02,
         "M",
@@ -56,24 +44,12 @@ class StudySettings(SweepSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name in ("planning_budget", "observe", "overhead", "observe_longer", "noise"):
+        for name in ("observe", "overhead", "noise"):
             require_moderate(name, vars(self)[name])
         require_moderate("replan", self.replan, _FASTEST)
         require_frame_rate(self.frame_rate)
-        if self.perception:
-            once = self.replan == 0.0 or self.observe_longer == 0.0
-            require(once, "observe_longer", "0 with replan", self.observe_longer)
-            rule, budget = "left out with perception", self.planning_budget
-            require(budget is None, "planning_budget", rule, budget)
-
-    @property
-    def is_study(self) -> bool:
-        """True if the run simulates a camera or the planning time."""
-        return self.perception or self.planning_budget is not None
 
     @property
     def first_motion(self) -> float:
         """Time [s] for observing and planning, before which no arm can start its first motion."""
-        if self.perception:
-            return self.observe + self.overhead
-        return self.planning_budget or 0.0
+        return self.observe + self.overhead if self.perception else 0.0
