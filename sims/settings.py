@@ -13,8 +13,7 @@ from planner_jax.core.registry import Task, all_tasks, split_name
 from planner_jax.runs.settings import option, require_count
 from planner_jax.sims.noise import NOISES, PLANE_NOISES, PlaneSensing, Sensing, require_whole
 from planner_jax.sims.robots.arm.drives import ENCODERS, TORQUES, Drives
-from planner_jax.studies.block.settings import require_frame_rate, require_moderate
-from planner_jax.sweep.block.settings import REGIMES
+from planner_jax.sweep.block.settings import REGIMES, require_moderate
 from planner_jax.sweep.quadrotor_settings import resolve_robot, robot_option
 from planner_jax.task.block.spec import TASK as BLOCK
 from planner_jax.task.catch.spec import DECISIONS, TRAINED
@@ -29,6 +28,7 @@ _AT_ONCE = 4096  # greatest default number of flights per batch
 # Estimated memory [bytes] of a flight during its simulation, and of its results afterwards.
 _FLIGHT_BYTES, _FLOWN_BYTES = 1_000_000, 4_000
 _FASTEST = 10_000.0  # [Hz], greatest replanning rate
+_FASTEST_CAMERA = 1000.0  # [Hz], greatest frame rate
 # Greatest number of balls of a flight, chosen because compile time grows with every ball.
 _MOST_BALLS = 12
 INTERVAL = 0.8  # [s], time between two throws [Yu2023catch, Fig. 1]
@@ -325,7 +325,9 @@ class BlockFly(FlySettings):
         for name in ("observe", "planning_budget", "noise", "lag", "latency"):
             require_moderate(name, getattr(self, name))
         require(abs(self.mass_error) < 1.0, "mass_error", "> -1 and < 1", self.mass_error)
-        require_frame_rate(self.frame_rate)
+        require(0.0 < self.frame_rate < math.inf, "frame_rate", "finite and > 0", self.frame_rate)
+        rule = f"from 1 to {_FASTEST_CAMERA:g}"
+        require(1.0 <= self.frame_rate <= _FASTEST_CAMERA, "frame_rate", rule, self.frame_rate)
         own = self.planner.partition(":")[0] != "library"
         require(
             own or not self.perception,

@@ -9,17 +9,13 @@ from test_block import SMALL
 
 import planner_jax as pj
 from planner_jax.ball.flight import drag_free_flight
-from planner_jax.core.errors import ArgumentError
 from planner_jax.core.protocol import Status, take
 from planner_jax.studies.block.camera import looking_at
 from planner_jax.studies.block.contact_check import end_at_contact
 from planner_jax.studies.block.flight_fit import Sight
 from planner_jax.studies.block.observation import cautious, eye
 from planner_jax.studies.block.receding import Aim, decide
-from planner_jax.sweep.block.settings import BlockSettings
-from planner_jax.sweep.run import start_sweep
 from planner_jax.task.block.replan import ReplanBlock, WarmBlock
-from planner_jax.task.block.spec import TASK
 
 AIMS = (Aim(0.02), Aim(0.09))
 AGAIN = ReplanBlock(warm=WarmBlock(planner=SMALL), planner=SMALL)
@@ -116,25 +112,6 @@ def test_invalid_decisions_are_rejected(cases, change, error, message):
     given = {"planner": SMALL, "moments": [0.2, 0.3], **change}
     with pytest.raises(error, match=message):
         decide(given.pop("planner"), cases, eye(), **given)
-
-
-@pytest.mark.parametrize(
-    ("given", "name"),
-    [
-        ({"frame_rate": 0.0}, "frame_rate"),
-        ({"perception": True, "delay": 0.1}, "delay"),
-    ],
-)
-def test_contradictory_settings_are_rejected(given, name):
-    with pytest.raises(ArgumentError, match=f"^{name} must be"):
-        BlockSettings(**given)
-
-
-@pytest.mark.slow
-def test_sweeps_report_errors_of_fits(tmp_path):
-    settings = BlockSettings(planner="direct", regime="R1", num=4, wide=True, perception=True)
-    found = start_sweep(TASK, settings, tmp_path / "seen", progress=False)
-    assert 0.0 < found["summary"]["fit_error_median"] < 0.3
 
 
 def test_a_replanned_case_has_the_ball_of_the_original_case(cases):

@@ -1,12 +1,15 @@
 """Simulated blocks, in which an arm moves a shield into balls' paths: table, recordings, report."""
 
 import dataclasses
+import zlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 
+from planner_jax.core.planner import Planner
 from planner_jax.referee.arm_clearance import links_of, shield_middle
 from planner_jax.runs.columns import BOOL, LIST, NUMBER, TEXT, Column, leaves_of
 from planner_jax.runs.style import draw
@@ -37,9 +40,11 @@ from planner_jax.sims.tasks.block_shown import (
     joint_table,
     scenery,
 )
-from planner_jax.studies.block.seeing import SeeingArms
+from planner_jax.studies.block.observation import eye
+from planner_jax.studies.block.receding import Decided, decide
 from planner_jax.task.block.api import planner as block_planner
 from planner_jax.task.block.case import BlockCase
+from planner_jax.task.block.end_poses import flight_of
 from planner_jax.task.block.scene import FLOOR
 from planner_jax.task.block.spec import SUITES
 from planner_jax.task.block.suites import BALL_RADIUS
@@ -126,16 +131,7 @@ class BlockFlight(FlightTask):
         settings, planner = self.settings, block_planner(self.settings.planner)
         decided, seconds = None, 0.0
         if settings.perception:
-            arms = SeeingArms(
-                planner,
-                observe=settings.until_known,
-                overhead=settings.until_set,
-                replan=settings.rate,
-                noise=settings.noise,
-                frame_rate=settings.frame_rate,
-                seed=settings.seed,
-            )
-            decided, seconds, _ = measure(lambda: arms.decide_batch(cases.cases))
+            decided, seconds, _ = measure(lambda: self._observe_and_plan(planner, cases.cases))
         flights = fly_blocks(
             BLOCK_WORLD,
             cases,
@@ -146,6 +142,27 @@ class BlockFlight(FlightTask):
             decided=decided,
         )
         return dataclasses.replace(flights, planning_seconds=flights.planning_seconds + seconds)
+
+    def _observe_and_plan(self, planner: Planner, cases: BlockCase) -> Decided:
+        """Return the motions of arms that observe their balls, not yet cut at the contacts."""
+        settings = self.settings
+        moments, overhead = [settings.until_known], settings.until_set
+        if settings.rate:
+            latest = float(np.max(jax.jit(jax.vmap(flight_of))(cases).latest))
+            step = 1.0 / settings.rate
+            moments += list(np.arange(moments[0] + step, latest - overhead, step))
+        # The noise of a ball depends on the ball alone, and not on the other balls.
+        balls = np.concatenate([cases.ball.pos, cases.ball.vel], axis=1).astype(np.float32)
+        seeds = [zlib.crc32(ball.tobytes(), settings.seed) for ball in balls]
+        return decide(
+            planner,
+            cases,
+            eye(rate=settings.frame_rate, std=settings.noise or None),
+            moments,
+            overhead=overhead,
+            seed=np.array(seeds, np.uint32),
+            again=settings.rate > 0.0,
+        )
 
     def recording(
         self, cases: Throws, flights: BlockFlights, lanes: Sequence[int] | np.ndarray

@@ -43,8 +43,7 @@ sweep catch --decide later     | --decide must be one of best, greedy, random ..
 sweep catch --decide best:x                  | --decide must be best without a file
 sweep catch --tolerance -1                   | --tolerance must be finite and >= 0
 sweep catch --net-test box                   | --net-test must be one of plane
-sweep block --overhead -1                    | --overhead must
-sweep block --frame-rate 1e300               | --frame-rate must
+fly block --frame-rate 1e300                 | --frame-rate must
 sweep block --regime R9                      | --regime must be one of R1
 fly hit --num 0                              | --num must be >= 1
 fly catch --balls 13                         | --balls must be <=
@@ -115,7 +114,7 @@ WHOLE = (
 )
 NUMBERS = (
     *(("sweep hit", "--delay"), ("sweep hit", "--limit-scale"), ("sweep catch", "--tolerance")),
-    *(("sweep block", "--noise"), ("fly hit", "--drag-error"), ("fly block", "--torque")),
+    *(("fly block", "--noise"), ("fly hit", "--drag-error"), ("fly block", "--torque")),
     *((f"{HIT} --pos 4 0 1", option) for option in ("--speed", "--gravity", "--min-height")),
     *((CATCH, "--horizon"), ("export junk --to csv", "--rate"), ("serve hit", "--rate")),
     *(("fly intercept", "--latency"), ("library build new", "--home"), ("train", "--decisions")),

@@ -1,19 +1,26 @@
 """Settings of sweeps, that is runs over many cases, of an arm that blocks a thrown ball."""
 
 import dataclasses
+import math
 from typing import ClassVar
 
 from planner_jax.core.choices import require, require_one_of
-from planner_jax.runs.manifest import Entries
-from planner_jax.runs.settings import option
-from planner_jax.studies.block.settings import StudySettings, require_moderate
+from planner_jax.runs.settings import SweepSettings, option
 
 # Names of the sets of joint limits. They are repeated here, since `robot.arm` would import JAX.
 REGIMES = ("R1", "R2", "R3")
+_LONGEST = 60.0  # greatest accepted value of a time [s] or of the noise [m]
+
+
+def require_moderate(name: str, value: float | None, most: float = _LONGEST) -> None:
+    """Raise `ArgumentError` unless the setting `name` is None or a number from 0 to `most`."""
+    if value is not None:
+        require(0.0 <= value < math.inf, name, "finite and >= 0", value)
+        require(value <= most, name, f"<= {most:g}", value)
 
 
 @dataclasses.dataclass(frozen=True)
-class BlockSettings(StudySettings):
+class BlockSettings(SweepSettings):
     """Settings and command-line options of a run over many cases of an arm that blocks a ball."""
 
     regime: str = option(
@@ -38,10 +45,3 @@ class BlockSettings(StudySettings):
         super().__post_init__()
         require_one_of(REGIMES, "regime", self.regime)
         require_moderate("delay", self.delay)
-        if self.perception:
-            rule = "0 with perception, which sets it by observe and overhead"
-            require(self.delay == 0.0, "delay", rule, self.delay)
-
-    def draw_options(self) -> Entries:
-        """Return the arguments for drawing cases, also `delay`, the time before arms may move."""
-        return {**super().draw_options(), "delay": self.delay + self.first_motion}
