@@ -52,12 +52,11 @@ from planner_jax.benchmarks.run import Bench, argument_parser, begin, parse_name
 from planner_jax.robot.arm_mjcf import irb1600
 from planner_jax.runs.summary import percent, wilson_interval
 from planner_jax.runs.timing import measure_warm
-from planner_jax.sims.segment import ball_thresholds, noisy_depth, sighting
-from planner_jax.studies.block.camera import project
-from planner_jax.studies.block.contact_check import end_at_contact
-from planner_jax.studies.block.flight_fit import across_std, belief_at, error_across, fit_flight
-from planner_jax.studies.block.noise import StereoNoise, depth_std, information
-from planner_jax.studies.block.observation import (
+from planner_jax.sims.perception.camera import project
+from planner_jax.sims.perception.contact_check import end_at_contact
+from planner_jax.sims.perception.flight_fit import across_std, belief_at, error_across, fit_flight
+from planner_jax.sims.perception.noise import StereoNoise, depth_std, information
+from planner_jax.sims.perception.observation import (
     Eye,
     cautious,
     eye,
@@ -67,7 +66,8 @@ from planner_jax.studies.block.observation import (
     see,
     watch,
 )
-from planner_jax.studies.block.receding import AIMS, decide
+from planner_jax.sims.perception.receding import AIMS, decide
+from planner_jax.sims.segment import ball_thresholds, noisy_depth, sighting
 from planner_jax.task.block.case import ANYWHERE
 from planner_jax.task.block.end_poses import flight_of
 from planner_jax.task.block.replan import ReplanBlock

@@ -13,8 +13,8 @@ import numpy as np
 
 from planner_jax.robot.arm import Arm, link_frames
 from planner_jax.sims.calibrate import Calibration, calibrate, pose
-from planner_jax.studies.block.camera import Camera, in_view, move_camera, to_camera
-from planner_jax.studies.block.noise import StereoNoise, depth_std
+from planner_jax.sims.perception.camera import Camera, in_view, move_camera, to_camera
+from planner_jax.sims.perception.noise import StereoNoise, depth_std
 
 _CORNERS = 6  # number of grid corners along each edge of the board
 _FACING = 0.5  # least cosine between the board's normal and the direction to the camera

@@ -11,8 +11,8 @@ import numpy as np
 from flax import struct
 from jax import Array, lax
 
-from planner_jax.studies.block.camera import Camera, back_project, from_numbers
-from planner_jax.studies.block.noise import StereoNoise
+from planner_jax.sims.perception.camera import Camera, back_project, from_numbers
+from planner_jax.sims.perception.noise import StereoNoise
 
 WINDOW = 64  # [px], edge of the evaluated square around the median of the mask's pixels
 # Mean distance of a sphere's visible surface from the plane through its centre that faces a distant

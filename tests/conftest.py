@@ -76,8 +76,8 @@ def finished(request, tmp_path_factory):
     return out, start_sweep(module.TASK, module.SETTINGS, out, progress=False)
 
 
-# Test modules, without "test_", of baselines, studies, policies, clusters and benchmarks, which
-# only `make test-slow` runs.
+# Test modules, without "test_", of baselines, observed balls, policies, clusters and benchmarks,
+# which only `make test-slow` runs.
 SLOW = (
     *("b_spline", "baselines", "bezier", "block_adapt", "block_library", "block_peers"),
     *("catch_peer", "hybrid_astar", "minimum_jerk", "mpp", "paper_catch", "path_smoothing"),

@@ -23,7 +23,7 @@ LAYERS = (
     *("host", "core", "lanes", "referee"),
     *("ball", "trajectory", "robot", "space", "plane"),
     *("cost", "optimise", "planning", "recovery"),
-    *("runs", "task", "baselines", "studies"),
+    *("runs", "task", "baselines"),
     *("export", "sweep", "live", "__init__"),
     *("sims", "policies", "cli", "benchmarks", "__main__"),
 )

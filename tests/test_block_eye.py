@@ -10,10 +10,10 @@ from test_block import SMALL
 
 import planner_jax as pj
 from planner_jax.ball.flight import drag_free_flight
-from planner_jax.studies.block.camera import in_view, looking_at
-from planner_jax.studies.block.contact_check import end_at_contact
-from planner_jax.studies.block.flight_fit import Sight, belief_at, error_across
-from planner_jax.studies.block.observation import cautious, eye, frame_times, mast_camera, see
+from planner_jax.sims.perception.camera import in_view, looking_at
+from planner_jax.sims.perception.contact_check import end_at_contact
+from planner_jax.sims.perception.flight_fit import Sight, belief_at, error_across
+from planner_jax.sims.perception.observation import cautious, eye, frame_times, mast_camera, see
 from planner_jax.task.block.end_poses import flight_of
 
 

@@ -10,11 +10,11 @@ from test_block import SMALL
 import planner_jax as pj
 from planner_jax.ball.flight import drag_free_flight
 from planner_jax.core.protocol import Status, take
-from planner_jax.studies.block.camera import looking_at
-from planner_jax.studies.block.contact_check import end_at_contact
-from planner_jax.studies.block.flight_fit import Sight
-from planner_jax.studies.block.observation import cautious, eye
-from planner_jax.studies.block.receding import Aim, decide
+from planner_jax.sims.perception.camera import looking_at
+from planner_jax.sims.perception.contact_check import end_at_contact
+from planner_jax.sims.perception.flight_fit import Sight
+from planner_jax.sims.perception.observation import cautious, eye
+from planner_jax.sims.perception.receding import Aim, decide
 from planner_jax.task.block.replan import ReplanBlock, WarmBlock
 
 AIMS = (Aim(0.02), Aim(0.09))

@@ -20,6 +20,8 @@ from planner_jax.robot.arm_mjcf import irb1600
 from planner_jax.sims.execution import FRAME, TIMESTEP, Executed, execute
 from planner_jax.sims.film import draw_flight
 from planner_jax.sims.launch import flight_keys
+from planner_jax.sims.perception.observation import eye, see
+from planner_jax.sims.perception.receding import Decided
 from planner_jax.sims.robot import rotation
 from planner_jax.sims.robots.arm.control import Course, reference_at
 from planner_jax.sims.robots.arm.drives import IDEAL, TORQUES, Drives
@@ -39,8 +41,6 @@ from planner_jax.sims.tasks.block_flights import (
 )
 from planner_jax.sims.tasks.intercept import CAR_WORLD
 from planner_jax.sims.view import Viewer
-from planner_jax.studies.block.observation import eye, see
-from planner_jax.studies.block.receding import Decided
 from planner_jax.task.block.motion import polynomial, profiles
 
 HOME, LANES = np.asarray(irb1600().home), 4  # all batches are of one size: one program

@@ -18,6 +18,8 @@ from planner_jax.runs.table import RateTable
 from planner_jax.runs.timing import measure
 from planner_jax.sims.execution import FRAME
 from planner_jax.sims.model import World
+from planner_jax.sims.perception.observation import eye
+from planner_jax.sims.perception.receding import Decided, decide
 from planner_jax.sims.recording import Recording
 from planner_jax.sims.settings import BlockFly
 from planner_jax.sims.task import FlightTask
@@ -40,8 +42,6 @@ from planner_jax.sims.tasks.block_shown import (
     joint_table,
     scenery,
 )
-from planner_jax.studies.block.observation import eye
-from planner_jax.studies.block.receding import Decided, decide
 from planner_jax.task.block.api import planner as block_planner
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.end_poses import flight_of

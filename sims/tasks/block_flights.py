@@ -25,11 +25,11 @@ from planner_jax.runs.timing import measure_plans
 from planner_jax.sims.execution import FRAME, TIMESTEP, Executed, execute
 from planner_jax.sims.launch import flight_keys
 from planner_jax.sims.model import World
+from planner_jax.sims.perception.receding import Decided
 from planner_jax.sims.robots.arm.control import Course
 from planner_jax.sims.robots.arm.drives import IDEAL, Drives
 from planner_jax.sims.robots.arm.robot import ShieldArm
 from planner_jax.sims.task import FlightCases, Flights
-from planner_jax.studies.block.receding import Decided
 from planner_jax.task.block.api import planner as block_planner
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.plan import BlockPlan

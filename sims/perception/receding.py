@@ -25,9 +25,9 @@ from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import Status, is_solved, select_into, take
 from planner_jax.planning.plan import plan
 from planner_jax.planning.replan import Replanning
-from planner_jax.studies.block.contact_check import end_at_contact
-from planner_jax.studies.block.flight_fit import FlightFit, Sight
-from planner_jax.studies.block.observation import (
+from planner_jax.sims.perception.contact_check import end_at_contact
+from planner_jax.sims.perception.flight_fit import FlightFit, Sight
+from planner_jax.sims.perception.observation import (
     Eye,
     cautious,
     fit_errors,

@@ -17,15 +17,15 @@ from jax import Array
 from planner_jax.ball.flight import BallState, drag_free_flight
 from planner_jax.core.arithmetic import host_leaf
 from planner_jax.core.choices import require
-from planner_jax.studies.block.camera import Camera, looking_at
-from planner_jax.studies.block.flight_fit import (
+from planner_jax.sims.perception.camera import Camera, looking_at
+from planner_jax.sims.perception.flight_fit import (
     FlightFit,
     across_std,
     belief_at,
     error_across,
     fit_flight,
 )
-from planner_jax.studies.block.noise import (
+from planner_jax.sims.perception.noise import (
     IsotropicNoise,
     Noise,
     information,
@@ -153,7 +153,7 @@ def see(
 
     Pass the returned cases through `cautious` and then to a planner. To judge the plans, copy the
     field `delay` of the returned cases to the true cases, and pass true cases and plans to
-    `studies.block.contact_check.end_at_contact`. A ball that was seen at fewer than two times is
+    `sims.perception.contact_check.end_at_contact`. A ball that was seen at fewer than two times is
     NaN, and `fits.status` states the reason.
 
     Args:

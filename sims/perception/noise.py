@@ -13,7 +13,7 @@ from flax import struct
 from jax import Array, lax
 
 from planner_jax.core.choices import require
-from planner_jax.studies.block.camera import (
+from planner_jax.sims.perception.camera import (
     Camera,
     back_project,
     from_numbers,
