@@ -7,15 +7,16 @@ Positions are predicted 3 s ahead. A pedestrian is observed 8 times within 2.8 s
 within 1 s. The table has the root mean square of the errors of three predictors: `predict`, the
 least-squares line through the observations, and the line through the last two observations. It also
 has the share of true positions within the discs that `predict` states with a probability of 90 %,
-and the median radius of these discs.
+and the median radius of these discs. The last two columns are the share and the radius if `predict`
+gets the usual speed: 1.3 m/s for pedestrians and simulated targets, and 10 m/s for vehicles.
 
 The folder of --pedestrians has text files of the collections ETH and UCY: each row has the frame
 (10 frames are 0.4 s), the person, x [m] and y [m]. The folder of --vehicles has scenarios of
 CommonRoad 2018b, whose dynamic obstacles have recorded positions. A recorded track that occurs in
 several files is used once, and tracks shorter than 4 s are ignored. The constants of `predict` were
-selected with `biwi_eth.txt` and with every second scenario in alphabetical order; the other files
-only check them. A collection without its folder is skipped. The program always measures `--num`
-simulated targets, which change their velocity at random times, once in 10 s on average.
+selected with both files `biwi` and with every second scenario in alphabetical order. A collection
+without its folder is skipped. The program always measures `--num` simulated targets, which change
+their velocity at random times, once in 10 s on average.
 """
 
 import xml.etree.ElementTree as ElementTree
@@ -32,11 +33,12 @@ from planner_jax.plane.target import PlanePath
 AHEAD = 3.0  # [s] Time from the last observation to the predicted position.
 SHARE = 0.9  # Probability of the stated discs.
 FRAME = 0.04  # [s] Duration of a frame of the pedestrians.
-DEVELOPED = "biwi_eth"  # Pedestrians with which the constants of `predict` were selected.
+DEVELOPED = "biwi"  # Pedestrians with which the constants of `predict` were selected.
+WALK, DRIVE = 1.3, 10.0  # [m/s] Usual speeds of pedestrians and vehicles.
 Track = tuple[np.ndarray, np.ndarray]  # Times (L,) [s] and positions (L, 2) [m].
 HEADS = (
     *("targets", "predictions", "`predict`, rms", "line, rms", "last two, rms"),
-    *("in 90 % disc", "radius, median"),
+    *("in 90 % disc", "radius, median", "in 90 % disc, usual speed", "radius, usual speed"),
 )
 
 
@@ -107,21 +109,27 @@ def windows(
     return times, seen, truth
 
 
-def report(bench: Bench, name: str, tracks: Iterable[Track], count: int, stride: int) -> None:
-    """Predict all windows of tracks, and print a row of the table."""
+def report(
+    bench: Bench, name: str, tracks: Iterable[Track], count: int, stride: int, speed: float
+) -> None:
+    """Predict all windows of tracks of a usual speed [m/s], and print a row of the table."""
     times, seen, truth = windows(tracks, count, stride)
     if not len(times):
         bench.say(f"| {name} | 0 |" + " |" * (len(HEADS) - 2))
         return
-    off, radius = [], []
+    off, radii = [], []
     for k in range(0, len(times), 500):
         part = slice(k, k + 500)
         start = seen[part, -1]
-        found = pj.intercept.predict(times[part], seen[part] - start[:, None])
+        near = seen[part] - start[:, None]
+        found, informed = (
+            pj.intercept.predict(times[part], near, speed=each) for each in (None, speed)
+        )
         here = np.asarray(places(found.path, AHEAD), float) + start
         off.append(np.linalg.norm(here - truth[part], axis=-1))
-        radius.append(found.radius(np.full(len(start), AHEAD), SHARE))
-    off, radius = np.concatenate(off), np.concatenate(radius)
+        ahead = np.full(len(start), AHEAD)
+        radii.append([each.radius(ahead, SHARE) for each in (found, informed)])
+    off, radii = np.concatenate(off), np.concatenate(radii, axis=1)
     after = times - times.mean(axis=1, keepdims=True)
     middle = seen.mean(axis=1)
     slope = np.einsum("bl,bli->bi", after, seen) / np.sum(after**2, axis=1)[:, None]
@@ -130,12 +138,17 @@ def report(bench: Bench, name: str, tracks: Iterable[Track], count: int, stride:
     lines = (line, seen[:, -1] + AHEAD * last)
     errors = (off, *(np.linalg.norm(each - truth, axis=-1) for each in lines))
     rms = [float(np.sqrt(np.mean(error**2))) for error in errors]
-    inside = off <= radius
-    cells = [*(f"{each:.2f} m" for each in rms), f"{100 * inside.mean():.1f} %"]
-    bench.say(f"| {name} | {len(off)} | {' | '.join(cells)} | {np.median(radius):.2f} m |")
+    inside = off <= radii
+    shares, sizes = inside.mean(axis=1), np.median(radii, axis=1)
+    cells = [f"{each:.2f} m" for each in rms]
+    for share, size in zip(shares, sizes, strict=True):
+        cells += [f"{100 * share:.1f} %", f"{size:.2f} m"]
+    bench.say(f"| {name} | {len(off)} | {' | '.join(cells)} |")
     figures = dict(zip(("predict", "line", "last_two"), rms, strict=True))
-    bench.row(name=name, num=len(off), in_disc=inside.mean(), radius=np.median(radius), **figures)
-    bench.count(inside)
+    for kind, share, size in zip(("", "_usual_speed"), shares, sizes, strict=True):
+        figures |= {f"in_disc{kind}": share, f"radius{kind}": size}
+    bench.row(name=name, num=len(off), **figures)
+    bench.count(inside[0])
 
 
 def main() -> None:
@@ -145,7 +158,7 @@ def main() -> None:
     options = parser.parse_args()
     with begin(parser, options) as bench:
         bench.say(f"| {' | '.join(HEADS)} |", "|---" * len(HEADS) + "|")
-        report(bench, "simulated", simulate(options.num, options.seed), 8, 5)
+        report(bench, "simulated", simulate(options.num, options.seed), 8, 5, WALK)
         missing = []
         for kind, ending in (("pedestrians", "*.txt"), ("vehicles", "*.xml")):
             folder = getattr(options, kind)
@@ -154,8 +167,8 @@ def main() -> None:
                 missing.append(f"no {kind}: {folder or f'no folder --{kind}'} has no {ending} file")
             elif kind == "pedestrians":
                 for file in files:
-                    used = ", development" if file.stem == DEVELOPED else ""
-                    report(bench, f"{file.stem}{used}", read_pedestrians(file), 8, 1)
+                    used = ", development" if file.stem.startswith(DEVELOPED) else ""
+                    report(bench, f"{file.stem}{used}", read_pedestrians(file), 8, 1, WALK)
             else:
                 known: set[bytes] = set()
                 for name, some in (("development", files[::2]), ("check", files[1::2])):
@@ -163,7 +176,7 @@ def main() -> None:
                     new = [track for track in tracks if track[1].tobytes() not in known]
                     new = list({track[1].tobytes(): track for track in new}.values())
                     known |= {track[1].tobytes() for track in new}
-                    report(bench, f"vehicles, {name}", new, 11, 5)
+                    report(bench, f"vehicles, {name}", new, 11, 5, DRIVE)
         if missing:
             bench.say("", *missing)
 

@@ -121,6 +121,32 @@ def test_a_batch_equals_a_loop_over_its_targets():
             np.testing.assert_allclose(leaf[k], other, rtol=1e-9, atol=1e-12)
 
 
+def test_a_turn_is_expected_to_last_as_long_again():
+    rate, after, vel = 0.4, 5.0, SPEED[0]
+    decay = 1.0 / 14.0 - 1j * rate  # the turn has lasted for 14 s
+    ended = (1.0 / 14.0) / decay
+    expected = vel * (ended * after + (1.0 - ended) * (1.0 - np.exp(-decay * after)) / decay)
+    found = places(predict(TIMES, turn(TIMES, rate), 1e-3).path, after)
+    np.testing.assert_allclose(found, [expected.real, expected.imag], atol=0.02)
+
+
+def test_a_sudden_start_after_calm_motion_is_no_outlier():
+    positions = straight() + np.maximum(TIMES + 1.0, 0.0)[:, None] * 2.0 * SPEED[::-1]
+    found = predict(TIMES, positions)
+    assert found.has_changed and found.path.at(0.0).vel[1] > 0.3 * 2.0 * SPEED[0]
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e3])
+def test_a_usual_speed_widens_the_disc_of_a_slow_target_alone(scale):
+    still, moving = scale * observe(np.zeros((15, 2))), scale * observe(straight())
+    radii = [
+        [float(predict(TIMES, seen, speed=speed).radius(3.0)) for speed in (None, 0.3 * scale)]
+        for seen in (still, moving)
+    ]
+    assert radii[0][1] > 1.5 * radii[0][0]
+    assert radii[1][1] < radii[1][0]  # the usual speed is known not to exceed the observed one
+
+
 def test_discs_hold_their_share_of_targets_with_random_accelerations():
     rng, num, step = np.random.default_rng(2), 300, 0.4
     volatility = rng.choice([0.03, 0.1, 0.3], (num, 1, 1))
@@ -199,5 +225,7 @@ def test_wrong_arguments_are_named(arguments, message):
 def test_times_and_shares_out_of_range_are_named():
     with pytest.raises(ArgumentError, match="now must be finite, got nan"):
         predict(TIMES, SEEN, now=np.nan)
+    with pytest.raises(ArgumentError, match="speed must be > 0 and finite, got 0"):
+        predict(TIMES, SEEN, speed=0.0)
     with pytest.raises(ArgumentError, match="share must be > 0 and < 1, got 1"):
         predict(TIMES, SEEN).radius(1.0, share=1.0)

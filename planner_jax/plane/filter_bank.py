@@ -4,10 +4,10 @@ One Kalman filter runs for each hypothesis about a target. Bayes' rule weighs th
 their likelihoods, so that the state of the target is a mixture of Gaussians. A hypothesis specifies
 four things:
 
-* The volatility s [1/sqrt(s)] of the velocity. The velocity is an Ornstein-Uhlenbeck process with
-  the observed speed as standard deviation on each axis and the decorrelation time 2 / s^2. A target
-  of small volatility keeps its velocity, and a target of large volatility manoeuvres. The random
-  acceleration is correlated in time [Singer1970].
+* The volatility s [1/sqrt(s)]: within a time t, the velocity on each axis changes by s sqrt(t)
+  times the observed speed (standard deviation), and fades at the rate min(s^2 / 2, 0.05 / s). A
+  target of small volatility keeps its velocity, and a target of large volatility manoeuvres. The
+  random acceleration is correlated in time [Singer1970].
 * A constant turn rate, which is usually zero.
 * One change of the motion after an observation, or none. After the change the target stands, has
   another velocity, or manoeuvres.
@@ -47,7 +47,9 @@ class Mixture(NamedTuple):
     chance: np.ndarray  # (N, K), probabilities; the sum of each row is 1
     volatility: np.ndarray  # (N, K), indices into the volatilities
     settle: np.ndarray  # (N, K), indices into the correlation times of the acceleration
+    has_changed: np.ndarray  # (N, K) bool, whether the motion has changed, or turns
     turn: np.ndarray  # (N, K) [rad/s], constant turn rate
+    end: np.ndarray  # (N, 1) [1/s], rate at which turns end after the last observation
     # (N, K, 3) complex [m, m/s, m/s^2], position relative to the last one, velocity, acceleration
     state: np.ndarray
     covariance: np.ndarray  # (N, K, 3, 3), Hermitian: half of the covariance of the complex state
@@ -113,14 +115,18 @@ def fit_bank(times: np.ndarray, places: np.ndarray, noise: float | None) -> Fit:
     sum_changed = changed.sum(axis=1)
     when = 0.5 * (times[:, among.change] + times[:, among.change + 1]) - times[:, -1:]
     since = (changed * when).sum(axis=1) / np.where(sum_changed > 0.0, sum_changed, 1.0)
+    # A turn that has lasted for all observations is expected to last as long again.
+    span = times[:, -1:] - times[:, :1]
+    end = np.divide(1.0, span, out=np.zeros_like(span), where=span > 0.0)
     best = np.argsort(-chance, axis=1, kind="stable")[:, :_KEPT]
     kept = best.shape[1]
     best = np.pad(best, ((0, 0), (0, _KEPT - kept)), mode="edge")
-    row, known = np.arange(len(best))[:, None], times[:, -1] > times[:, 0]
+    row, known = np.arange(len(best))[:, None], span[:, 0] > 0.0
     best_chance = np.where(np.arange(_KEPT) < kept, chance[row, best], 0.0)
     best_chance = best_chance / best_chance.sum(axis=1, keepdims=True)
-    indices = among.later[best], among.settle[best], among.turn[best]
-    mixture = Mixture(known, speed, best_chance, *indices, state[row, best], covariance[row, best])
+    indices = among.later[best], among.settle[best], among.kind[best] > 0, among.turn[best]
+    last = state[row, best], covariance[row, best]
+    mixture = Mixture(known, speed, best_chance, *indices, end, *last)
     return Fit(mixture, sum_changed, since, np.sqrt((chance * variance).sum(axis=1)))
 
 
@@ -161,10 +167,13 @@ class _Hypotheses(NamedTuple):
 def _hypotheses(num: int, factors: tuple[float, ...]) -> _Hypotheses:
     """List the hypotheses about a target with `num` observations."""
     changes = num - 1 - _BEFORE[num - 1 - _BEFORE >= 1]
-    levels, kinds = range(len(VOLATILITY)), ((_STAND, _CALM), (_GO, _CALM), (_BUSY, _WILD))
+    levels = range(len(VOLATILITY))
+    # Kinds of changes, with the volatilities before and after the change. A sudden start is
+    # distinguished from an outlier only if the calm motion before it is explained too.
+    kinds = ((_STAND, _CALM, _CALM), (_GO, _CALM, _CALM), (_GO, 0, _CALM), (_BUSY, _CALM, _WILD))
     # Rows: volatility, later volatility, correlation time, turn rate, kind of change, change.
     steady = [(i, i, j, 0.0, 0, -1) for i in levels for j in range(len(SETTLE))]
-    changing = [(_CALM, later, 0, 0.0, kind, k) for kind, later in kinds for k in changes]
+    changing = [(*pair, 0, 0.0, kind, k) for kind, *pair in kinds for k in changes]
     turning = [(i, i, 0, turn, _TURN, 0) for i in (_CALM, _CALM + 1) for turn in _TURNS]
     parts = [(1.0 - _CHANGE - _TURNING, steady), (_CHANGE, changing), (_TURNING, turning)]
     if num < 3:
@@ -216,15 +225,20 @@ def _acceleration(speed: np.ndarray, volatility: np.ndarray, settle: np.ndarray)
     return speed * volatility / np.sqrt(2.0 * settle)
 
 
+def fading(volatility: np.ndarray) -> np.ndarray:
+    """Return the rate [1/s] at which the velocity fades, bounded since a manoeuvre is no stop."""
+    return np.minimum(0.5 * volatility**2, 0.05)
+
+
 def transition(
     time: np.ndarray, volatility: np.ndarray, settle: np.ndarray, turn: np.ndarray
 ) -> np.ndarray:
     """Return matrices (..., 3, 3) that move position, velocity and acceleration on by a time [s].
 
-    The velocity turns, and decays at the rate volatility^2 / 2. The acceleration turns with the
-    velocity, and decays within `settle`.
+    The velocity turns, and fades. The acceleration turns with the velocity, and decays within
+    `settle`.
     """
-    decay = 0.5 * volatility**2 - 1j * turn + 0.0 * time
+    decay = fading(volatility) - 1j * turn + 0.0 * time
     slow, fast = _reach(decay, time), _reach(decay + 1.0 / settle, time)
     left, quick = np.exp(-decay * time), np.exp(-time / settle)
     along = np.zeros((*decay.shape, 3, 3), complex)

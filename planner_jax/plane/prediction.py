@@ -20,14 +20,20 @@ from planner_jax.plane.filter_bank import (
     VOLATILITY,
     Mixture,
     diffusion,
+    fading,
     fit_bank,
     transition,
 )
 from planner_jax.plane.target import FadingPath
 
 _MOST = 60  # greatest number of observations that are used, the latest ones
-# Volatilities after the last observation: factor, least value [1/sqrt(s)], and probability.
-_FUTURE = ((1.0, 0.0, 0.6), (3.0, 0.1, 0.2), (10.0, 0.3, 0.2))
+# After the last observation the volatility is drawn anew. Columns: probabilities of the squared
+# volatilities 1e-4, 1e-3, 1e-2 and 1e-1 [1/s]. Rows: the motion was steady, with a volatility of
+# less than 0.1, 0.1, or more; the motion has changed, or turns.
+_STEADY = ((0.70, 0.05, 0.14, 0.11), (0.26, 0.27, 0.39, 0.08), (0.47, 0.08, 0.19, 0.26))
+_FUTURE = np.array([*_STEADY, (0.41, 0.24, 0.02, 0.33)])
+# Probabilities of squared usual speeds, if unknown: 1, 10, 100 and 1000 observed squared speeds.
+_FASTER = np.array([0.75, 0.19, 0.05, 0.01])
 
 
 @dataclass(frozen=True)
@@ -44,6 +50,7 @@ class Prediction:
     chance_changed: np.ndarray  # probability that the motion changed during the observations
     noise: np.ndarray  # [m], standard deviation of an observed coordinate, passed or estimated
     mixture: Mixture
+    speed: float | None  # [m/s], usual speed of the targets, if it was passed
 
     def radius(self, time: float | ArrayLike, share: float = 0.9) -> np.ndarray:
         """Return the radius [m] of the disc around the path that holds the target.
@@ -58,12 +65,17 @@ class Prediction:
         """
         require(0.0 < share < 1.0, "share", "> 0 and < 1", share)
         after = np.maximum(np.asarray(time, float) + np.asarray(self.path.ahead), 0.0)
-        found = _radius(*_forecast(self.mixture, after.reshape(-1, 1)), share)
+        found = _radius(*_forecast(self.mixture, after.reshape(-1, 1), self.speed), share)
         return np.where(self.mixture.is_known, found, np.inf).reshape(after.shape)
 
 
 def predict(
-    times: ArrayLike, positions: ArrayLike, noise: float | None = None, *, now: float | None = None
+    times: ArrayLike,
+    positions: ArrayLike,
+    noise: float | None = None,
+    *,
+    now: float | None = None,
+    speed: float | None = None,
 ) -> Prediction:
     """Predict where one target, or each of B targets, will be, and how uncertain that is.
 
@@ -80,10 +92,13 @@ def predict(
             for two observations it is assumed to be a tenth of their distance.
         now: [s], time on the clock of `times` at which the path has its time 0. By default this is
             the time of each target's last observation.
+        speed: [m/s] > 0, usual speed of such targets, such as 1.3 m/s for pedestrians. The discs of
+            slower targets allow for this speed. If it is unknown, it may exceed the observed speed,
+            but a target that stands is expected to stand on.
 
     Raises:
-        ArgumentError: the shapes do not match, a number is infinite, the noise is not positive, or
-            a target has no observation.
+        ArgumentError: the shapes do not match, a number is infinite, the noise or the speed is not
+            positive, or a target has no observation.
     """
     for name, value in (("times", times), ("positions", positions)):
         shape_of(name, value)
@@ -97,6 +112,7 @@ def predict(
     for name, array in (("times", clock), ("positions", points)):
         require(not np.isinf(array).any(), name, "finite, or NaN if absent", np.inf)
     require(noise is None or 0.0 < noise < np.inf, "noise", "> 0 and finite", noise)
+    require(speed is None or 0.0 < speed < np.inf, "speed", "> 0 and finite", speed)
     require(now is None or bool(np.isfinite(now)), "now", "finite", now)
     require(points.size > 0, "positions", "of at least one observation", shown="none")
     clock = np.broadcast_to(clock, shape).reshape(-1, shape[-1])
@@ -124,50 +140,61 @@ def predict(
     found |= {"chance_changed": fit.chance_changed, "noise": fit.noise}
     outer = shape[:-1]
     path, found = jax.tree.map(lambda each: each.reshape((*outer, *each.shape[1:])), (path, found))
-    return Prediction(path=FadingPath(*path), mixture=fit.mixture, **found)
+    return Prediction(path=FadingPath(*path), mixture=fit.mixture, speed=speed, **found)
 
 
-def _forecast(mixture: Mixture, time: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _forecast(
+    mixture: Mixture, time: np.ndarray, speed: float | None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return chances, distances from the path, and variances of positions at times (T, 1) [s].
 
-    Each array has the shape (T, 3 K), since three volatilities after the last observation are
-    possible: the present one and two greater ones.
+    The arrays broadcast to the shape (T, K, J), for J volatilities after the last observation.
+    These are relative to the observed speed, and may be greater if the usual speed is unknown.
     """
-    level, settle = VOLATILITY[mixture.volatility], SETTLE[mixture.settle]
-    along = transition(time, level, settle, mixture.turn)[..., 0, :]
+    along = _transition(mixture, time, mixture.turn)
     mean = (along * mixture.state).sum(axis=-1)
     variance = along[..., None, :] @ mixture.covariance @ np.conj(along[..., None])
     variance = np.real(variance[..., 0, 0])
-    expected = transition(time, level, settle, _mean_turn(mixture))[..., 0, :]
-    centre = (mixture.chance * (expected * mixture.state).sum(axis=-1)).sum(axis=1, keepdims=True)
-    distance = np.abs(mean - centre)
-    parts = []
-    for factor, least, chance in _FUTURE:
-        future = np.maximum(factor * level, least)
-        spread = diffusion(time, future, settle, mixture.speed, mixture.turn)
-        shape = spread.shape[:-2]
-        parts.append(
-            (
-                np.broadcast_to(chance * mixture.chance, shape),
-                np.broadcast_to(distance, shape),
-                variance + np.real(spread[..., 0, 0]),
-            )
-        )
-    chance, distance, variance = (np.concatenate(each, axis=1) for each in zip(*parts, strict=True))
-    return chance, distance, variance
+    expected = (_transition(mixture, time, _mean_turn(mixture)) * mixture.state).sum(axis=-1)
+    distance = np.abs(mean - (mixture.chance * expected).sum(axis=1, keepdims=True))
+    usual, faster = np.maximum(mixture.speed, speed or 0.0), np.ones(1) if speed else _FASTER
+    unit = np.ones_like(mixture.turn), SETTLE[mixture.settle], usual, mixture.turn
+    spread = np.real(diffusion(time, *unit)[..., 0, 0])
+    future = np.stack([np.convolve(row, faster) for row in _FUTURE])
+    variance = variance[..., None] + spread[..., None] * 10.0 ** (np.arange(future.shape[1]) - 4.0)
+    kind = np.where(mixture.has_changed, 3, np.clip(mixture.volatility - 1, 0, 2))
+    return mixture.chance[..., None] * future[kind], distance[..., None], variance
+
+
+def _transition(mixture: Mixture, time: np.ndarray, turn: np.ndarray) -> np.ndarray:
+    """Return the expected first rows (..., 3) of the transitions within times (T, 1) [s].
+
+    A turn ends at a random time t with the density r exp(-r t). The expectation of the velocity is
+    a sum of two velocities: one keeps its direction, and one turns and decays at the rate r.
+    """
+    level, settle = VOLATILITY[mixture.volatility], SETTLE[mixture.settle]
+    turning = transition(time, level, settle, turn + 1j * mixture.end)[..., 0, :]
+    straight = transition(time, level, settle, np.zeros_like(turn))[..., 0, :]
+    return turning + _share_straight(mixture, turn)[..., None] * (straight - turning)
+
+
+def _share_straight(mixture: Mixture, turn: np.ndarray) -> np.ndarray:
+    """Return the complex share (N, K) of a velocity that remains when a turn has ended."""
+    rate = np.where(turn == 0.0, 1.0, mixture.end)
+    return rate / (rate - 1j * turn)
 
 
 def _radius(
     chance: np.ndarray, distance: np.ndarray, variance: np.ndarray, share: float
 ) -> np.ndarray:
-    """Return radii (T,) of discs that hold the share of a mixture of M Gaussians, each (T, M)."""
+    """Return radii (T,) of discs that hold the share of a mixture of Gaussians, each (T, K, J)."""
     deviation = np.maximum(np.sqrt(variance), np.maximum(1e-2 * distance, 1e-100))
     offset = (distance / deviation) ** 2
-    low, high = np.zeros(len(chance)), (distance + 6.0 * deviation).max(axis=1)
+    low, high = np.zeros(len(variance)), (distance + 6.0 * deviation).max(axis=(1, 2))
     for _ in range(40):
         radius = 0.5 * (low + high)
-        inside = chndtr((radius[:, None] / deviation) ** 2, 2.0, offset)
-        is_large = (chance * inside).sum(axis=1) > share
+        inside = chndtr((radius[:, None, None] / deviation) ** 2, 2.0, offset)
+        is_large = (chance * inside).sum(axis=(1, 2)) > share
         low, high = np.where(is_large, low, radius), np.where(is_large, radius, high)
     return high
 
@@ -175,9 +202,8 @@ def _radius(
 def _mean_turn(mixture: Mixture) -> np.ndarray:
     """Return turn rates (N, K) [rad/s], with the mean turn rate of all hypotheses that turn."""
     turns = mixture.chance * (mixture.turn != 0.0)
-    total = turns.sum(axis=1, keepdims=True)
-    mean = (turns * mixture.turn).sum(axis=1, keepdims=True) / np.where(total > 0.0, total, 1.0)
-    return np.where(mixture.turn != 0.0, mean, 0.0)
+    mean = (turns * mixture.turn).sum(axis=1) / np.maximum(turns.sum(axis=1), 1e-300)
+    return np.where(mixture.turn != 0.0, mean[:, None], 0.0)
 
 
 def _mean_path(mixture: Mixture, last: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -189,19 +215,19 @@ def _mean_path(mixture: Mixture, last: np.ndarray) -> tuple[np.ndarray, ...]:
     num, row = len(last), np.arange(len(last))[:, None]
     share = mixture.chance[..., None] * mixture.state
     # An acceleration a that decays within s displaces like velocities a s and -a s that decay at
-    # different rates: without s, and with it. The axes of `vel` are: target, turn or not,
+    # different rates: without s, and with it. The columns of `flat` stand for: turn or not,
     # volatility, and no correlation time or one of them.
     extra = share[..., 2] * SETTLE[mixture.settle]
-    turn, turns = _mean_turn(mixture), (mixture.turn != 0.0).astype(int)
-    vel = np.zeros((num, 2, len(VOLATILITY), 1 + len(SETTLE)), complex)
-    column = (turns * len(VOLATILITY) + mixture.volatility) * (1 + len(SETTLE))
-    flat = vel.reshape(num, -1)
-    np.add.at(flat, (row, column), share[..., 1] + extra)
-    np.add.at(flat, (row, column + 1 + mixture.settle), -extra)
-    rate = 0.5 * VOLATILITY[:, None] ** 2 + np.array([0.0, *1.0 / SETTLE])
-    rate = np.broadcast_to(rate, vel.shape).reshape(num, -1)
+    turn, ended = _mean_turn(mixture), _share_straight(mixture, _mean_turn(mixture))
+    flat = np.zeros((num, 2 * len(VOLATILITY) * (1 + len(SETTLE))), complex)
+    for turns, part in enumerate((ended, 1.0 - ended)):
+        column = (turns * len(VOLATILITY) + mixture.volatility) * (1 + len(SETTLE))
+        np.add.at(flat, (row, column), part * (share[..., 1] + extra))
+        np.add.at(flat, (row, column + 1 + mixture.settle), -part * extra)
+    rate = fading(VOLATILITY)[:, None] + np.array([0.0, *1.0 / SETTLE])
+    rate = (rate + np.stack([0.0 * mixture.end, mixture.end], axis=1)[..., None]).reshape(num, -1)
     turn = np.stack([np.zeros(num), turn[row[:, 0], np.abs(turn).argmax(axis=1)]], axis=1)
-    turn = np.repeat(turn, vel[0, 0].size, axis=1)
-    pos, vel = last + share[..., 0].sum(axis=1), flat
-    pos, vel = (np.stack([np.real(each), np.imag(each)], axis=-1) for each in (pos, vel))
+    turn = np.repeat(turn, flat.shape[1] // 2, axis=1)
+    both = last + share[..., 0].sum(axis=1), flat
+    pos, vel = (np.stack([np.real(each), np.imag(each)], axis=-1) for each in both)
     return pos, vel, rate, turn
