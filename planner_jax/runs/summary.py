@@ -1,7 +1,7 @@
 """Success rates and other counts of a run over many cases, computed from its stored rows."""
 
 from collections import Counter
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import pyarrow as pa
@@ -35,7 +35,6 @@ class Tally:
 
     READS: ClassVar[tuple[str, ...]] = ()  # columns that are read; () stands for all columns
     MEANS: ClassVar[tuple[str, ...]] = ()  # columns whose mean over the successes is reported
-    MORE: ClassVar[tuple[type, ...]] = ()  # classes of further counts, with `add` and `summary`
 
     def __init__(self) -> None:
         self.num = 0
@@ -45,7 +44,6 @@ class Tally:
         self.example = 0  # index of the case whose plan the report's figures show
         self._example_rank: int | None = None
         self._sums = dict.fromkeys(self.MEANS, 0.0)
-        self._more: list[Any] = [kind() for kind in self.MORE]
 
     def add(self, rows: pa.Table) -> None:
         """Add rows, one for each planned and judged case, to the counts."""
@@ -61,8 +59,6 @@ class Tally:
             better = self._example_rank is None or rank < self._example_rank
             if better and there.any():
                 self._example_rank, self.example = rank, int(index[there][0])
-        for more in self._more:
-            more.add(rows)
 
     def examples(self, rows: pa.Table, success: np.ndarray) -> list[np.ndarray]:
         """Return masks (B,) over B rows, by which the case in the report's figures is chosen.
@@ -78,8 +74,6 @@ class Tally:
         others = {
             f"mean_{name}": total / num if num else None for name, total in self._sums.items()
         }
-        for more in self._more:
-            others |= more.summary()
         return {
             "success_rate": self.successes / self.num,
             "num": self.num,

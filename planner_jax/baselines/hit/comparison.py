@@ -10,6 +10,7 @@ import pyarrow as pa
 from planner_jax.baselines.hit.published import read_published_rates
 from planner_jax.runs.columns import BOOL, Column, RefereedBatch
 from planner_jax.runs.manifest import Entries
+from planner_jax.runs.summary import COUNTED, Tally
 from planner_jax.runs.table import RateTable, rate_cells
 from planner_jax.task.hit import court
 from planner_jax.task.hit.suites import Serves
@@ -41,19 +42,21 @@ def _outcome_column(index: int, planner: str) -> Column:
 OUTCOMES = [_outcome_column(*numbered) for numbered in enumerate(court.PLANNERS)]
 
 
-class ScenarioCounts:
-    """Numbers of successes of a run and of published planners on the run's serves, by scenario."""
+class ScenarioTally(Tally):
+    """Counts of successes, also of published planners on the run's serves, by scenario."""
 
-    READS = ("scenario", *(column.name for column in OUTCOMES))
+    READS = (*COUNTED, "scenario", *(column.name for column in OUTCOMES))
 
     def __init__(self) -> None:
+        super().__init__()
         self._num: Counter[str] = Counter()  # number of cases of each scenario
         self._successes: Counter[str] = Counter()
         self._published: Counter[tuple[str, str]] = Counter()  # successes, by (planner, scenario)
         self._num_published: Counter[tuple[str, str]] = Counter()
 
     def add(self, rows: pa.Table) -> None:
-        """Count the successes in some rows of the run's table."""
+        """Add rows, one for each planned and judged case, to the counts."""
+        super().add(rows)
         scenario = rows["scenario"].to_numpy()
         self._num.update(scenario)
         self._successes.update(scenario[rows["success"].to_numpy().astype(bool)])
@@ -65,7 +68,7 @@ class ScenarioCounts:
             self._published.update((planner, name) for name in scenario[solved])
 
     def summary(self) -> Entries:
-        """Return the entry `per_scenario`: success rates of the run and of published planners."""
+        """Return the counts, and by scenario success rates of the run and published planners."""
         found = {
             name: {
                 "num": self._num[name],
@@ -80,7 +83,7 @@ class ScenarioCounts:
             for name in court.SCENARIOS
             if self._num[name]
         }
-        return {"per_scenario": found}
+        return {**super().summary(), "per_scenario": found}
 
 
 def make_table(manifest: Entries) -> RateTable:

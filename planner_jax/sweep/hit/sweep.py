@@ -8,12 +8,11 @@ import pyarrow as pa
 from jaxtyping import PyTree
 
 from planner_jax.baselines.hit import comparison
-from planner_jax.baselines.hit.comparison import ScenarioCounts
+from planner_jax.baselines.hit.comparison import ScenarioTally
 from planner_jax.core.choices import require, require_one_of
 from planner_jax.core.errors import ArgumentError, CaseError
 from planner_jax.runs.manifest import Entries
 from planner_jax.runs.source import Chunk, Source, fill_in
-from planner_jax.runs.summary import COUNTED, Tally
 from planner_jax.runs.table import RateTable
 from planner_jax.sweep.figures import CAPTION as MOTION
 from planner_jax.sweep.hit.columns import COLUMNS, FRAME, SINGLE_COLUMNS
@@ -65,10 +64,8 @@ class ServeSource(Source):
         return {"serves": {"source": self.settings.serves, **described}}
 
 
-class HitTally(Tally):
+class HitTally(ScenarioTally):
     """Counts of successes by court scenario: where a serve comes from, and where it goes."""
-
-    MORE, READS = (ScenarioCounts,), (*COUNTED, *ScenarioCounts.READS)
 
     def examples(self, rows: pa.Table, success: np.ndarray) -> list[np.ndarray]:
         """Return masks (B,) over B rows, by which the case in the report's figures is chosen.
