@@ -128,30 +128,51 @@ def search_row(cases: list, meetings: np.ndarray, headings: list[float | None]) 
     return row_of(cases, list(paths), np.array(ms))
 
 
+def measure_cells(case: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Compute the distances [m] of square cells of the side `CELL` from the walls of one case.
+
+    Returns:
+        corner: (2,) [m], the lower corner of the grid, `PAD` beyond the case's map.
+        distance: (Y, X) [m], of the cells' centres, negative in a wall.
+    """
+    corner = case.lower.astype(float) - PAD
+    size = np.ceil((case.upper + PAD - corner) / CELL - 1e-6).astype(int)
+    x, y = (corner[k] + CELL * (np.arange(size[k]) + 0.5) for k in range(2))
+    east, north = (jnp.asarray(each, jnp.float32).reshape(1, -1) for each in np.meshgrid(x, y))
+    far = distances(case.walls.vertices(np.float32(0.0)), case.walls.present, east, north)[0]
+    far = np.asarray(far) - case.walls.radius[:, None]
+    return corner, far.min(axis=0).reshape(size[::-1])
+
+
+def describe_search(
+    case: Any, meeting: np.ndarray, heading: float, margin: float = 0.0
+) -> dict[str, Any]:
+    """Return a path problem of `run_searches`; the body is enlarged by `margin` [m] on all sides.
+
+    `heading` [rad] is prescribed at the meeting point (2,) [m] of the body's middle.
+    """
+    (behind, ahead, half), (corner, distance) = body_of(case), measure_cells(case)
+    direction = np.array([np.cos(heading), np.sin(heading)])
+    rear, front, side = behind - margin, ahead + margin, half + margin
+    return {
+        "start": case.start.tolist(),
+        "goal": [*(meeting - 0.5 * (behind + ahead) * direction), heading],
+        "distance": distance.tolist(),
+        "corner": corner.tolist(),
+        "curvature": float(case.limits.curvature),
+        "body": [[rear, -side], [front, -side], [front, side], [rear, side]],
+    }
+
+
 def peer_row(cases: list, meetings: np.ndarray, headings: list[float]) -> Row:
     """Search a path to each meeting point with fastsim-navigation, and return the results.
 
     `headings` are the prescribed headings [rad] at the meeting points, one for each case.
     """
-    searches = []
-    for case, meeting, heading in zip(cases, meetings, headings, strict=True):
-        behind, ahead, half = body_of(case)
-        direction = np.array([np.cos(heading), np.sin(heading)])
-        corner = case.lower.astype(float) - PAD
-        size = np.ceil((case.upper + PAD - corner) / CELL - 1e-6).astype(int)
-        x, y = (corner[k] + CELL * (np.arange(size[k]) + 0.5) for k in range(2))
-        east, north = (jnp.asarray(each, jnp.float32).reshape(1, -1) for each in np.meshgrid(x, y))
-        far = distances(case.walls.vertices(np.float32(0.0)), case.walls.present, east, north)[0]
-        searches.append(
-            {
-                "start": case.start.tolist(),
-                "goal": [*(meeting - 0.5 * (behind + ahead) * direction), heading],
-                "distance": np.asarray(far).min(axis=0).reshape(size[::-1]).tolist(),
-                "corner": corner.tolist(),
-                "curvature": float(case.limits.curvature),
-                "body": [[behind, -half], [ahead, -half], [ahead, half], [behind, half]],
-            }
-        )
+    searches = [
+        describe_search(case, meeting, heading)
+        for case, meeting, heading in zip(cases, meetings, headings, strict=True)
+    ]
     with tempfile.TemporaryDirectory() as folder:
         results = run_searches(searches, Path(folder))
     found = np.array([each["found"] for each in results])
