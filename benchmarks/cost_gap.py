@@ -65,9 +65,9 @@ def cost_gaps(
 def _reference_planner(planner: Any, cases: Any, card: Task | None) -> Any:
     if isinstance(planner, OptimisedPlanner):
         return with_long_search(planner)
-    if card is None or card.yardstick is None:
+    if card is None or not card.yardstick:
         return None
-    yardstick = card.planner(card.yardstick)
+    yardstick = card.planner(**card.yardstick)
     return yardstick if isinstance(cases, yardstick.case_type) else None
 
 

@@ -44,7 +44,7 @@ BASELINES = "numba not installed: pip install 'planner-jax[baselines]' for the p
 SOFT_END = 3.0 * 10.0**3 / 10.0
 PAIRS = (
     ("spacetime", "em"),
-    ("best", "lattice"),
+    ("effort best", "lattice"),
     ("lattice, best path", "em"),
     ("lattice, best path", "constant"),
     ("lattice", "em"),
@@ -63,7 +63,8 @@ TABLE_III = {
 def planners() -> dict[str, Any]:
     """Return the planners of interceptions by name, with `paper` only if numba is installed."""
     named = {
-        **{name: pj.intercept.planner(name) for name in ("spacetime", "best", "quick")},
+        **{name: pj.intercept.planner(name) for name in ("spacetime", "quick")},
+        "effort best": pj.intercept.planner(effort="best"),
         "lattice": pj.intercept.planner("lattice"),
         "lattice, best path": pj.intercept.planner("lattice", tries=1),
         "em": pj.intercept.planner("em"),

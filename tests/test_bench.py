@@ -156,7 +156,9 @@ def test_throughput_is_measured_of_any_task(halving, tmp_path, capsys):
 
 
 def test_costs_without_rounds_are_compared_with_those_of_the_tasks_yardstick():
-    card = registry.Task("halve", "halves numbers", __name__, {"half": ""}, {}, yardstick="third")
+    card = registry.Task(
+        "halve", "halves numbers", __name__, {"half": ""}, {}, yardstick={"name": "third"}
+    )
     cases = draw(4, first=1)
     plans = pj.plan(Half(), cases)
     # Both `Half` and `Third` solve only the cases 1 and 2, so costs are compared only there.

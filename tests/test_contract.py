@@ -159,7 +159,7 @@ def test_a_second_batch_of_the_same_bucket_is_not_traced_again(entry, traces):
 )
 def test_the_attempts_of_a_planner_share_programs(planner, case, num):
     loaded = []
-    for attempt in planner.attempts:
+    for attempt in planner.attempts_for(case):
         if planner.divides(attempt):
             loaded += [load_stage(stage, False) for stage in attempt.all_stages]
         else:

@@ -141,9 +141,10 @@ def test_the_referee_confirms_the_planner(planned):
 
 
 @pytest.mark.slow
-def test_best_also_solves_starts_beside_walls_without_space_for_margins():
+def test_effort_best_also_solves_starts_beside_walls_without_space_for_margins():
     cases = pj.take(pj.intercept.draw(600, "hard", 1), np.array([20, 176, 291, 506]))
-    usual, best = (pj.plan(pj.intercept.planner(name), cases) for name in ("spacetime", "best"))
+    efforts = ("feasible", "best")
+    usual, best = (pj.plan(pj.intercept.planner(effort=each), cases) for each in efforts)
     success = pj.intercept.judge(cases, best).success
     assert success.sum() > pj.are_solved(usual).sum() and (success | ~pj.are_solved(best)).all()
 

@@ -175,7 +175,7 @@ def test_the_vector_from_a_region_is_exact_and_its_slope_is_the_derivative(float
         ({"movers": [BOX], "mover_growth": -1.0}, "mover_growth must be >= 0"),
         ({"walls": [pj.intercept.Circle(1.0, 1.0, 0.0)]}, "walls"),
         ({"margin": -0.1}, "margin must be >= 0"),
-        ({"end_speed": (-1.0, 1.0)}, "end_speed must be >= 0"),
+        ({"end_speed": (np.nan, 1.0)}, "end_speed must be a number"),
         ({"origin": (0.0, 0.0, 0.0)}, "origin must have the shape"),
         ({"start": (5e5, 4e6, 0.0)}, "target must be relative to the argument origin"),
     ],

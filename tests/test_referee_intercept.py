@@ -63,6 +63,7 @@ def good(speed=SPEED, curvature=0.0, time=TIME, start=START, end=None, walls=(),
         **{"body.wheelbase": WHEELBASE, "body.rear_overhang": REAR},
         **{"limits.speed": 1.5, "limits.acceleration": 1.0, "limits.curvature": 2.0},
         **{"limits.lateral_acceleration": 0.8, "limits.steering_rate": 2.0},
+        **{"limits.reverse_speed": 0.0},
     }
     leaves = {name: np.array(leaf, float)[None] for name, leaf in leaves.items()}
     for name, (polygons, velocities) in {"walls": (walls, ()), "movers": movers}.items():

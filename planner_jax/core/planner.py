@@ -97,6 +97,13 @@ class Planner(Generic[CaseT, PlanT]):
         """The attempts (settings of a search), in order; each is for cases still unsolved."""
         return (Attempt(),)
 
+    def attempts_for(self, cases: CaseT) -> Sequence[Attempt]:
+        """Return the attempts that are useful for these cases, by default all `attempts`.
+
+        The cases are in arrays, or traced inside compiled functions.
+        """
+        return self.attempts
+
     def load_attempt(self, attempt: PyTree, cases: CaseT, /) -> PyTree:
         """Convert an attempt (settings of a search) to the second argument of the compiled `solve`.
 

@@ -43,20 +43,19 @@ def draw_noise(lattice: Lattice, num: int, seed: int, candidates: int) -> PathNo
     numbers of time steps, speed levels and headings.
     """
     rng = np.random.default_rng(seed)
-    ends = rng.gumbel(size=(num, candidates, lattice.levels, lattice.headings, 9))
+    ends = rng.gumbel(size=(num, candidates, lattice.num_speeds, lattice.headings, 9))
     steps = rng.gumbel(size=(num, candidates, lattice.layers, 3 * (2 * SPAN + 1)))
     layers = rng.gumbel(size=(num, lattice.layers + 1))
     return PathNoise(*(host_leaf(each, np.float32) for each in (layers, ends, steps)))
 
 
-def _velocity(level: Array, heading: Array, grid: Grid) -> Array:
-    dtype = grid.cell.dtype
-    angle = (2.0 * np.pi / grid.lattice.headings) * heading.astype(dtype)
-    return level[..., None].astype(dtype) * jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)
+def _velocity(speed: Array, heading: Array, grid: Grid) -> Array:
+    angle = (2.0 * np.pi / grid.lattice.headings) * heading.astype(grid.cell.dtype)
+    return speed[..., None] * jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)
 
 
-def _roughness(path: CellPath, grid: Grid, num: Array) -> Array:
-    velocity = _velocity(path.level, path.bin, grid)
+def _roughness(path: CellPath, speeds: Array, grid: Grid, num: Array) -> Array:
+    velocity = _velocity(speeds[path.level], path.bin, grid)
     change = jnp.sum((velocity[2:] - velocity[:-2]) ** 2, axis=1)
     return jnp.sum(jnp.where(jnp.arange(2, grid.lattice.layers) < num, change, 0.0))
 
@@ -80,9 +79,9 @@ def draw_path(
         is_reached: (levels, headings, 9) bool, whether the car can be in these cells. If no entry
             is true, the returned path is meaningless.
         noise: noise of one call, without the leading axis of the result of `draw_noise`.
-        directness: weight of the squared difference, in levels of speed, between the velocity at a
-            cell and the mean velocity from the start to this cell. With a greater weight, paths are
-            straighter and their speed is more even.
+        directness: weight of the squared difference, in forward levels of speed, between the
+            velocity at a cell and the mean velocity from the start to this cell. With a greater
+            weight, paths are straighter and their speed is more even.
     """
     lattice, dtype = grid.lattice, grid.cell.dtype
     choices = np.meshgrid([-1, 0, 1], np.arange(-SPAN, SPAN + 1), indexing="ij")
@@ -90,7 +89,9 @@ def draw_path(
 
     cosine, sine = jnp.cos(grid.heading), jnp.sin(grid.heading)
     along = jnp.stack([jnp.stack([cosine, sine]), jnp.stack([-sine, cosine])])
-    along /= reach.speeds[-1] - reach.speeds[-2]
+    gap = reach.speeds[-1] - reach.speeds[-2]
+    along /= gap
+    speeds = reach.speeds / gap  # in forward levels
 
     def draw(ends: Array, steps: Array) -> CellPath:
         score = ends + jnp.where(jnp.arange(9) == 0, 1.0, 0.0)[None, None]
@@ -112,7 +113,7 @@ def draw_path(
             away = (before - grid.start).astype(dtype) * grid.cell
             rate = away / ((n.astype(dtype) + 0.5) * grid.step)
             mean = jnp.dot(along, rate, precision=lax.Precision.HIGHEST)
-            velocity = _velocity(from_level, heading - turn, grid)
+            velocity = _velocity(speeds[from_level], heading - turn, grid)
             rough += directness * jnp.sum((velocity - mean[None]) ** 2, axis=-1)
             chosen = jnp.argmax(jnp.where(is_step, steps[n].astype(dtype) - rough, -jnp.inf))
             after = (from_level[chosen], heading - turn[chosen], before, turn[chosen])
@@ -125,5 +126,5 @@ def draw_path(
         return CellPath(level=levels, bin=bins, cell=passed)
 
     paths = jax.vmap(draw)(noise.ends, noise.steps)
-    best = jnp.argmin(jax.vmap(lambda path: _roughness(path, grid, num))(paths))
+    best = jnp.argmin(jax.vmap(lambda path: _roughness(path, speeds, grid, num))(paths))
     return jax.tree.map(lambda leaf: leaf[best], paths)

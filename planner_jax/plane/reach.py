@@ -40,9 +40,15 @@ class Lattice:
 
     cells: tuple[int, int] = (64, 64)  # numbers of cells along x, a multiple of 32, and y
     layers: int = 30  # greatest number of layers in time
-    levels: int = 4  # number of speed levels; level 0 is standstill
+    levels: int = 4  # number of speed levels from standstill to the greatest speed
     headings: int = 32  # number of heading bins in one revolution
     pace: float = 6.0  # number of cells along x between two layers at the greatest speed
+    reverse_levels: int = 0  # number of speed levels in reverse, below standstill
+
+    @property
+    def num_speeds(self) -> int:
+        """Number of all speed levels, in both gears."""
+        return self.reverse_levels + self.levels
 
 
 @struct.dataclass
@@ -60,11 +66,13 @@ class Grid:
 
 @struct.dataclass
 class Vehicle:
-    """Sizes and limits of a vehicle, whose body is covered by two discs."""
+    """Sizes and limits of a vehicle, whose body is covered by discs."""
 
     radius: Array  # () [m], radius of the discs
-    ahead: Array  # (2,) [m], distances of the discs' middles ahead of the rear axle
-    speeds: Array  # (levels,) [m/s], speeds of the levels, equally spaced
+    ahead: Array  # (discs,) [m], distances of the discs' middles ahead of the rear axle
+    # Speeds of the levels, increasing, with one standstill. The levels of each gear are equally
+    # spaced; negative speeds are in reverse.
+    speeds: Array  # (levels,) [m/s]
     turn_rates: Array  # (levels,) [rad/s], greatest turn rate at each level of speed
     acceleration: Array  # () [m/s^2], greatest acceleration; inf: any change by one level
 
@@ -73,7 +81,8 @@ class Vehicle:
 class ReachSet:
     """The states that a car can reach at equally spaced times (layers), and its possible steps."""
 
-    # Bitmaps of the reachable states, (layers + 1, words, levels, headings, cells) uint32. The last
+    # Bitmaps of the reachable states, (layers + 1, words, levels, headings, cells) uint32. Here and
+    # below, "levels" stands for the number of all speed levels, in both gears. The last
     # axis is over cells along y. The bits of the words on the second axis are cells along x.
     bits: Array
     # (layers, levels, headings, 2, 2) int32. The last axis is the number of cells along x and y
@@ -221,7 +230,7 @@ def reach_set(
         needed: () int32, number of layers to compute, equal for all cases of a batch.
     """
     lattice, speeds = grid.lattice, vehicle.speeds
-    levels, headings, (columns, rows) = lattice.levels, lattice.headings, lattice.cells
+    levels, headings, (columns, rows) = lattice.num_speeds, lattice.headings, lattice.cells
     dtype = grid.corner.dtype
     width = 2.0 * np.pi / headings
     angle = grid.heading + width * jnp.arange(headings, dtype=dtype)
@@ -239,7 +248,7 @@ def reach_set(
     before = jnp.arange(lattice.layers + 1, dtype=dtype)[:, None]
     whole = jnp.diff(jnp.floor(before * most[None] + 0.1), axis=0)  # (layers, levels)
     turns = jnp.abs(jnp.arange(-SPAN, SPAN + 1, dtype=dtype))[None, None] <= whole[..., None]
-    gap = speeds[-1] - speeds[-2]
+    gap = jnp.maximum(speeds[-1] - speeds[-2], speeds[1] - speeds[0])
     change = vehicle.acceleration * grid.step / jnp.maximum(gap, 1e-6)
     layer_ends = jnp.arange(lattice.layers + 1, dtype=dtype)
     changes = jnp.diff(jnp.floor(layer_ends * jnp.minimum(change, 1.0) + 0.1)) >= 1.0
@@ -263,17 +272,21 @@ def reach_set(
 
     def find_free(blocked: Array) -> Array:
         each = jnp.broadcast_to(blocked[:, None], (columns // 32, headings, rows))
-        return packed & ~(_shift(each, discs[0]) | _shift(each, discs[1]))
+        touched = functools.reduce(jnp.bitwise_or, (_shift(each, disc) for disc in discs))
+        return packed & ~touched
 
     free = _map_needed(find_free, blocked, halves_needed)  # for every half step between layers
 
+    # Without reverse, level 0 is standstill and does not move.
+    lowest = 0 if lattice.reverse_levels else 1
+
     def move_y(bits: Array, n: Array, half: int) -> Array:
-        moved = _move_y(bits[:, 1:], moves[n, 1:, :, half, 1])
-        return jnp.concatenate([bits[:, :1], moved], axis=1)
+        moved = _move_y(bits[:, lowest:], moves[n, lowest:, :, half, 1])
+        return jnp.concatenate([bits[:, :lowest], moved], axis=1)
 
     def move_x(bits: Array, n: Array, half: int) -> Array:
-        moved = _move_x(bits[:, 1:], moves[n, 1:, :, half, 0])
-        moved = jnp.concatenate([bits[:, :1], moved], axis=1)
+        moved = _move_x(bits[:, lowest:], moves[n, lowest:, :, half, 0])
+        moved = jnp.concatenate([bits[:, :lowest], moved], axis=1)
         return moved & free[2 * n + half + 2][:, None]
 
     parts = [
@@ -306,8 +319,9 @@ def reach_set(
 
 def _start_bits(grid: Grid, initial_speed: Array, speeds: Array) -> Array:
     lattice, cell = grid.lattice, grid.start
-    level = initial_speed / speeds[-1] * (lattice.levels - 1)
-    near = jnp.abs(jnp.arange(lattice.levels, dtype=level.dtype) - level) < 1.0
+    # The levels below and above the initial speed.
+    gap = jnp.where(initial_speed < 0.0, speeds[1] - speeds[0], speeds[-1] - speeds[-2])
+    near = jnp.abs(jnp.clip(initial_speed, speeds[0], speeds[-1]) - speeds) < 0.999 * gap
     x, y = (jnp.arange(num, dtype=cell.dtype) for num in lattice.cells)
     at = (y[:, None] == cell[1]) & (x[None] == cell[0])
     bits = near[:, None, None] & (jnp.arange(lattice.headings) == 0)[None, :, None]
@@ -369,4 +383,6 @@ def goal_cells(
     cells = nearest + jnp.asarray(AROUND, jnp.int32)[None]
     of_level = jax.vmap(jax.vmap(bit_at, (None, None, None, 0)), (None, None, 0, 0))
     of_all = jax.vmap(of_level, (None, 0, None, None))
-    return cells, of_all(layer, jnp.arange(lattice.levels), bins, cells) & headings[None, :, None]
+    return cells, of_all(layer, jnp.arange(lattice.num_speeds), bins, cells) & headings[
+        None, :, None
+    ]

@@ -208,7 +208,7 @@ class Driver:
         if planner.kind is Kind.COMPOSITE:
             plans = planner.plan_by(self, cases)
             return plans, is_unsolved(plans.status)
-        attempts = attempts or planner.attempts
+        attempts = attempts or planner.attempts_for(cases)
         if self.is_pure:
             plans = _plan_purely(planner, attempts, cases)
             return plans, is_unsolved(plans.status)

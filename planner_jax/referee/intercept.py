@@ -25,7 +25,7 @@ _SENTENCES = {
     "origin": "the origin of the plan's positions is {excess:.3g} m from the case's origin",
     "start": "the plan starts {excess:.3g} off the case in position [lengths of the body], heading "
     "[rad], speed [speed limits] or curvature [1 / length of the body]",
-    "speed": "{excess:.2%} of its limit above it or below zero at {time:.3f} s",
+    "speed": "{excess:.2%} of its limit above it, or too fast in reverse, at {time:.3f} s",
     **dict.fromkeys(
         ("acceleration", "curvature", "steering rate", "lateral acceleration"), judging.ABOVE_LIMIT
     ),
@@ -68,7 +68,7 @@ class InterceptVerdict(judging.Verdict):
 
     SENTENCES = _SENTENCES
 
-    max_speed: np.ndarray  # (B,) [m/s]
+    max_speed: np.ndarray  # (B,) [m/s], magnitude
     max_acceleration: np.ndarray  # (B,) [m/s^2], |dv/dt|
     rms_acceleration: np.ndarray  # (B,) [m/s^2], sqrt(1/T int (dv/dt)^2 dt)
     max_curvature: np.ndarray  # (B,) [1/m], magnitude
@@ -177,6 +177,9 @@ def _leaves(cases, plans) -> dict[str, np.ndarray]:
     of_plan = {"start": (3,), "time": (), "curvature": speed.shape[1:], "speed": speed.shape[1:]}
     leaves = judging.read_leaves(plans, of_plan | {"origin": (2,)}, len(speed), "plan.")
     leaves |= judging.read_leaves(cases, _SHAPES, len(speed))
+    name, reverse = "limits.reverse_speed", cases.limits.reverse_speed
+    reverse = np.zeros(len(speed)) if reverse is None else reverse
+    leaves[name] = judging.check_leaf(name, reverse, (len(speed),))
     region = np.asarray(cases.region)
     if region.ndim != 3 or region.shape[::2] != (len(speed), 2) or region.shape[1] < 1:
         raise ValueError(f"region must be ({len(speed)}, V >= 1, 2), got {region.shape}")
@@ -331,7 +334,7 @@ def _judge_limits(case: dict, span: np.ndarray, relative: float) -> tuple[dict, 
     lateral = np.abs(np.concatenate([v**2 * k, bent], axis=1))
     lateral_times = np.concatenate([knots, starts + inside], axis=1)
     peaks = {
-        "speed": _greatest(v, knots),
+        "speed": _greatest(np.abs(v), knots),
         "acceleration": _greatest(np.abs(rise), starts),
         "curvature": _greatest(np.abs(k), knots),
         "steering rate": _greatest(steering, starts + zero),
@@ -351,10 +354,10 @@ def _judge_limits(case: dict, span: np.ndarray, relative: float) -> tuple[dict, 
     for name, (value, time) in peaks.items():
         limit = case[f"limits.{name.replace(' ', '_')}"]
         tests[name] = judging.above(value, limit, relative, time, smallest=_SMALLEST_LIMIT)
-    # The car may not drive backwards. A negative speed fails the test of the speed limit.
-    limit = case["limits.speed"][:, None]
+    # The speed in reverse, a negative speed, has a limit of its own; 0 without a reverse gear.
+    limit, reverse = (case[f"limits.{name}"][:, None] for name in ("speed", "reverse_speed"))
     scale = np.where(np.isinf(limit), 1.0, np.maximum(limit, _SMALLEST_LIMIT))
-    excess, when = _greatest(np.maximum(v - limit, -v) / scale, knots)
+    excess, when = _greatest(np.maximum(v - limit, -v - reverse) / scale, knots)
     tests["speed"] = (excess > relative, excess, when)
     return measured, tests
 

@@ -21,11 +21,18 @@ from planner_jax.robot.setpoints import sample_at_rate
 class CarLimits:
     """Limits of a car; infinity means no limit."""
 
-    speed: Array  # () [m/s], greatest speed; the least speed is 0, since the car does not reverse
+    speed: Array  # () [m/s], greatest speed
     acceleration: Array  # () [m/s^2], greatest magnitude of the acceleration along the path
     lateral_acceleration: Array  # () [m/s^2], greatest magnitude of speed^2 * curvature
     curvature: Array  # () [1/m], greatest magnitude of the rear axle's curvature
     steering_rate: Array  # () [rad/s], greatest magnitude of the steering angle's rate
+    reverse_speed: Array | None = None  # () [m/s], greatest speed in reverse; None: no reverse gear
+
+    @property
+    def least_speed(self) -> Array:
+        """Least speed, () [m/s]: negative if the car may drive in reverse, else 0."""
+        reverse = self.reverse_speed
+        return jnp.zeros_like(self.speed) if reverse is None else -reverse
 
 
 @struct.dataclass
@@ -53,7 +60,7 @@ class CarSetpoints:
     time: np.ndarray  # (K,) [s] since the start of the plan
     pos: np.ndarray  # (K, 2) [m], middle of the rear axle
     heading: np.ndarray  # (K,) [rad]
-    speed: np.ndarray  # (K,) [m/s]
+    speed: np.ndarray  # (K,) [m/s], negative in reverse
     acceleration: np.ndarray  # (K,) [m/s^2], along the path
     curvature: np.ndarray  # (K,) [1/m]
     yaw_rate: np.ndarray  # (K,) [rad/s]
@@ -65,7 +72,8 @@ class CarPlan(Plan):
 
     start: Array  # (3,) x [m], y [m] of the rear axle's middle and heading [rad] at time 0
     time: Array  # () [s], end of the plan
-    speed: Array  # (K + 1,) [m/s], at the knots, the first at time 0, the last at `time`
+    # Speed at the knots, the first at time 0, the last at `time`; negative in reverse.
+    speed: Array  # (K + 1,) [m/s]
     curvature: Array  # (K + 1,) [1/m], at the knots
     origin: Array  # (2,) [m], world position to which `start` is relative
 

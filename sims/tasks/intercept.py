@@ -183,7 +183,7 @@ def remaining(
     return dataclasses.replace(
         cases,
         start=pose,
-        speed=jnp.clip(speed, 0.0, limits.speed),
+        speed=jnp.clip(speed, limits.least_speed, limits.speed),
         curvature=jnp.clip(curvature, -limits.curvature, limits.curvature),
         target=target,
         time=cases.time - elapsed,

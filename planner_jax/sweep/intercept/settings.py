@@ -3,7 +3,7 @@
 import dataclasses
 from typing import ClassVar
 
-from planner_jax.core.choices import require_one_of
+from planner_jax.core.choices import EFFORTS, require_one_of
 from planner_jax.runs.settings import SweepSettings, option
 from planner_jax.task.group.spec import DECISIONS
 
@@ -12,10 +12,17 @@ from planner_jax.task.group.spec import DECISIONS
 class InterceptSettings(SweepSettings):
     """Settings of a run over many cases of a car that meets one moving target."""
 
+    effort: str = option(EFFORTS[0], "NAME", f"how long the planner searches: {', '.join(EFFORTS)}")
+
     RUN: ClassVar[str] = "planner_jax.sweep.intercept.sweep:InterceptSweep"
     CASE_BYTES: ClassVar[int] = 100_000
     CPU_BATCH: ClassVar[int] = 256
     GPU_BATCH: ClassVar[int] = 4096
+    PLANNER: ClassVar[tuple[str, ...]] = ("effort",)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require_one_of(EFFORTS, "effort", self.effort)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -40,5 +40,5 @@ TASK = Task(
     sweep="planner_jax.sweep.block.settings:BlockSettings",
     flight="planner_jax.sims.settings:BlockFly",
     contact="contact_time",
-    yardstick="brisk",
+    yardstick={"name": "brisk"},
 )

@@ -96,13 +96,14 @@ def _positions_at(paths: PlanePath, times: Array) -> Array:
     return jax.vmap(lambda path: jax.vmap(lambda time: path.at(time).pos)(times))(paths)
 
 
-def planner(name: str = "spacetime", **options: object) -> Planner[InterceptCase, InterceptPlan]:
+def planner(
+    name: str = "spacetime", *, effort: str = "feasible", **options: object
+) -> Planner[InterceptCase, InterceptPlan]:
     """Make a planner of interceptions by its name.
 
     * `spacetime`: computes the set of cells in space and time that the car can reach, and optimises
       path and speed together, by least squares from random paths through this set.
     * `quick`: `spacetime` with fewer paths and steps, for large batches on a GPU.
-    * `best`: `spacetime` with more paths and steps; selects the plan of least discomfort.
     * `lattice`: plans eight paths among the walls, then the speed along each path among the moving
       obstacles, and selects the best plan.
     * `paper`: the planner of [Qu2022]: one path by Hybrid A*, smoothed, then the speed along it. It
@@ -110,10 +111,17 @@ def planner(name: str = "spacetime", **options: object) -> Planner[InterceptCase
     * `em`: the best path of `lattice`, with the speed optimisation of the EM planner [Fan2018].
     * `constant`: the best path of `lattice` at constant speed; ignores moving obstacles.
 
-    An unknown name raises `ValueError`. The options are the fields of the planner's class:
-    `SpacetimeIntercept`, `PathThenSpeed` or `PaperIntercept`.
+    Args:
+        name: name of the planner, as listed above.
+        effort: "feasible" ends with the first plan that keeps every limit. "good" and "best" try
+            more paths, for plans of less discomfort, or earlier ones with `meet="early"`.
+        options: fields of the planner's class: `SpacetimeIntercept`, `PathThenSpeed` or
+            `PaperIntercept`.
+
+    Raises:
+        ValueError: no planner has the requested name, or it does not support the effort.
     """
-    return TASK.make_planner(name, options)
+    return TASK.make_planner(name, options).with_effort(effort)
 
 
 def judge(cases: InterceptCase, plans: InterceptPlan, **settings: object) -> InterceptVerdict:

@@ -26,11 +26,18 @@ from planner_jax.robot.car import CarBody, CarLimits
 from planner_jax.task.arguments import array_of, batch_of
 
 _BODY, _LIMITS = ([field.name for field in dataclasses.fields(c)] for c in (CarBody, CarLimits))
+# The speed limits allow an initial speed that was rounded.
+_DRIVABLE = rules.Rule(
+    "from -reverse_speed to the greatest speed of the car",
+    lambda value, case: (
+        (value <= 1.001 * case.limits.speed) & (value >= 1.001 * case.limits.least_speed)
+    ),
+)
 
 # Shapes, types and ranges that `pj.require_sound` checks for the arrays of an `InterceptCase`.
 RULES: Table = (
     Field("start", (3,)),
-    Field("speed", (), rules.NOT_NEGATIVE),
+    Field("speed", (), _DRIVABLE),
     Field("curvature", ()),
     Field("time", (), rules.POSITIVE),
     Field("tolerance", (), rules.POSITIVE),
@@ -58,7 +65,7 @@ RULES: Table = (
     Field("movers.track.step", ("M",), rules.POSITIVE),
     Field("region", ("V", 2)),
     Field("earliest", (), rules.NOT_NEGATIVE),
-    Field("end_speed", (2,), rules.NOT_NEGATIVE_OR_NONE),
+    Field("end_speed", (2,), rules.NUMBER),
     Field("margin", (), rules.NOT_NEGATIVE),
     Field("map_heading", ()),
     Field("origin", (2,)),
@@ -66,7 +73,8 @@ RULES: Table = (
     Field("upper", (2,), rules.NUMBER),
     *(Field(f"body.{name}", (), rules.POSITIVE) for name in _BODY if name != "rear_overhang"),
     Field("body.rear_overhang", ()),
-    *(Field(f"limits.{name}", (), rules.POSITIVE_OR_NONE) for name in _LIMITS),
+    *(Field(f"limits.{name}", (), rules.POSITIVE_OR_NONE) for name in _LIMITS[:-1]),
+    Field("limits.reverse_speed", (), rules.NOT_NEGATIVE_OR_NONE),
 )
 # Maps a field of a case to the argument of `case` that sets it; error messages name the argument.
 _ARGUMENTS = {
@@ -91,7 +99,7 @@ class InterceptCase:
     rules: ClassVar[Table] = RULES
 
     start: Array  # (3,) x [m], y [m] of the rear axle's middle and heading [rad] at time 0
-    speed: Array  # () [m/s], of the car at time 0
+    speed: Array  # () [m/s], of the car at time 0, negative in reverse
     curvature: Array  # () [1/m], of the rear axle's path at time 0, from the steering angle
     target: PlanePath  # expected path of the target
     time: Array  # () [s], of the meeting; the latest time for planners that choose the time
@@ -134,7 +142,7 @@ def case(
     earliest: ArrayLike = 0.0,
     end_heading: ArrayLike | None = None,
     heading_tolerance: ArrayLike = 0.05,
-    end_speed: ArrayLike = (0.0, np.inf),
+    end_speed: ArrayLike = (-np.inf, np.inf),
     margin: ArrayLike = 0.0,
     lower: ArrayLike = (0.0, 0.0),
     upper: ArrayLike = (8.0, 8.0),
@@ -149,6 +157,7 @@ def case(
     lateral_acceleration: ArrayLike = 0.8,
     curvature: ArrayLike = 2.0,
     steering_rate: ArrayLike = 2.0,
+    reverse_speed: ArrayLike = 0.0,
     dtype: DTypeLike = jnp.float32,
 ) -> InterceptCase:
     """Make one case of an interception, or a batch, by default with the numbers of [Qu2022].
@@ -161,7 +170,7 @@ def case(
         time: () or (B,) [s], of the meeting, > 0. The time and every following number is one value
             for all cases, or one value for each case.
         start: (3,) x, y of the rear axle's middle [m], and heading [rad], at time 0.
-        initial_speed: [m/s], speed at time 0.
+        initial_speed: [m/s], speed at time 0, negative in reverse; within the car's limits.
         initial_curvature: [1/m], curvature of the rear axle's path at time 0.
         walls: static obstacles: polygons with V corners (V, 2) [m], `Circle`s, or geometries of
             Shapely, which all cases share; or `Obstacles` with the batch's axes on every leaf.
@@ -182,7 +191,7 @@ def case(
         earliest: [s], earliest time of the meeting, for planners that choose the time.
         end_heading: [rad], heading of the car at the meeting; by default any heading.
         heading_tolerance: [rad], greatest deviation from `end_heading`.
-        end_speed: (2,) [m/s], least and greatest speed of the car at the meeting.
+        end_speed: (2,) [m/s], least and greatest speed of the car at the meeting; (0, 0) is a stop.
         margin: [m], distance from every obstacle that the car's body has to keep.
         lower: (2,) [m], corner of the map, in the axes of the map. It may be -inf.
         upper: (2,) [m], the opposite corner. It may be inf.
@@ -201,6 +210,8 @@ def case(
         lateral_acceleration: [m/s^2], greatest magnitude of speed^2 * curvature.
         curvature: [1/m], greatest magnitude of the curvature.
         steering_rate: [rad/s], greatest rate of the steering angle.
+        reverse_speed: [m/s], greatest speed in reverse. With 0 for all cases the car has no reverse
+            gear, and planning is faster.
         dtype: type of every floating leaf.
 
     Raises:
@@ -217,7 +228,15 @@ def case(
     is_free = end_heading is None
     around = leaf("heading_tolerance", heading_tolerance)
     body = (length, width, wheelbase, rear_overhang)
-    limits = (speed, acceleration, lateral_acceleration, curvature, steering_rate)
+    has_reverse = bool(np.any(np.asarray(reverse_speed) != 0.0))
+    limits = {
+        "speed": speed,
+        "acceleration": acceleration,
+        "lateral_acceleration": lateral_acceleration,
+        "curvature": curvature,
+        "steering_rate": steering_rate,
+        **({"reverse_speed": reverse_speed} if has_reverse else {}),
+    }
     moved = functools.partial(_make_obstacles, origin=shift, batch=batch, dtype=dtype)
     movement = {"velocities": mover_velocities, "paths": mover_paths, "growth": mover_growth}
     result = InterceptCase(
@@ -234,7 +253,7 @@ def case(
         lower=leaf("lower", np.asarray(lower, np.float64) - shift, 2),
         upper=leaf("upper", np.asarray(upper, np.float64) - shift, 2),
         body=CarBody(*map(leaf, _BODY, body)),
-        limits=CarLimits(*map(leaf, _LIMITS, limits)),
+        limits=CarLimits(**{name: leaf(name, value) for name, value in limits.items()}),
         region=_make_region(region, batch, dtype),
         earliest=leaf("earliest", earliest),
         end_speed=leaf("end_speed", end_speed, 2),

@@ -17,14 +17,14 @@ All numbers are in the units of the case (`units`).
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, Self
 
 import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
 from planner_jax.core import protocol
-from planner_jax.core.choices import require
+from planner_jax.core.choices import EFFORTS, require, require_one_of
 from planner_jax.core.planner import Planner
 from planner_jax.plane.cell_paths import PathNoise
 from planner_jax.task.intercept.case import InterceptCase
@@ -38,13 +38,14 @@ from planner_jax.task.intercept.problem import (
 )
 from planner_jax.task.intercept.replan import ReplanIntercept
 from planner_jax.task.intercept.searches import (
-    BEST,
+    NARROW,
     QUICK,
     SEARCHES,
     LoadedSearch,
     Reachability,
     Search,
     draw_cell_path,
+    leave_out_fine,
     load_search,
     make_field,
     make_grid,
@@ -52,6 +53,7 @@ from planner_jax.task.intercept.searches import (
 )
 from planner_jax.task.intercept.units import enter_units, leave_units, units_of
 
+_EFFORTS = {"good": (8, 48), "best": (32, 96)}  # numbers of paths, and of steps of the last stage
 _SPREAD = 2  # early paths end in one of the first two time layers that reach the target
 
 
@@ -89,10 +91,31 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
         """The searches for a plan, in the order in which they are tried."""
         return self.searches or SEARCHES[self.meet]
 
+    def attempts_for(self, cases: InterceptCase) -> tuple[Search, ...]:
+        """Return the searches of `attempts` whose cells are not smaller than the cases need."""
+        return leave_out_fine(self.attempts, cases)
+
     @property
     def problem(self) -> MotionProblem:
         """The least-squares problem that every search solves."""
         return MotionProblem(self.meet, self.pieces, self.samples, self.checked)
+
+    def with_effort(self, effort: str) -> Self:
+        """Return a planner that tries all paths of a search, and selects the plan of least cost.
+
+        Args:
+            effort: "good" tries 8 paths, and takes up to 48 steps to reduce the cost of each plan.
+                "best" tries 32 paths, takes up to 96 steps, and makes more searches for narrow
+                passages. "feasible" returns the planner itself, which ends with the first plan.
+        """
+        require_one_of(EFFORTS, "effort", effort)
+        if effort not in _EFFORTS:
+            return self
+        first, *others = self.attempts
+        paths, settling = _EFFORTS[effort]
+        first = dataclasses.replace(first, paths=max(paths, first.paths), settling=settling)
+        searches = (first, *others, *(NARROW if effort == "best" else ()))
+        return dataclasses.replace(self, searches=searches, tries_all=True)
 
     def replanner(self) -> ReplanIntercept:
         """Return the planner by which `pj.replan` updates a plan while it is being driven."""
@@ -152,7 +175,8 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
                 noise = jax.tree.map(lambda leaf: leaf[k], search.noise)
                 return self._guess(case, found, noise, search)
 
-            guess = lax.cond(k < 0, lambda: problem.guess_directly(case), guess_along_cells)
+            directly = lambda: problem.guess_directly(case, search.is_late)  # noqa: E731
+            guess = lax.cond(k < 0, directly, guess_along_cells)
             plan = problem.refine(case, field, guess, search, stages)
             is_path = (k < 0) | found.is_reached
             return k + 1, found, protocol.select(plan, best, is_path)
@@ -195,7 +219,7 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
             return problem.decode(case, points[-1], steps)
 
         guesses = jax.vmap(lambda noise: self._guess(case, found, noise, attempt))(attempt.noise)
-        direct = problem.guess_directly(case)
+        direct = problem.guess_directly(case, attempt.is_late)
         guesses = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), direct, guesses)
         plans = jax.vmap(solve_from)(guesses)
         best = protocol.index_of_best(plans)
@@ -207,13 +231,15 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
     def load_attempt(self, attempt: Search, cases: InterceptCase) -> LoadedSearch:
         """Return the search `attempt` in the form of the second argument of the compiled `solve`.
 
-        Its settings become arrays, so that on a CPU all searches of the planner share one program.
-        The cases are not used.
+        Its settings become arrays, so that on a CPU all searches of the planner with equal lattices
+        share one program. Of the cases only the presence of a reverse gear is used.
         """
         if isinstance(attempt, LoadedSearch):
             return attempt
         attempts = self.attempts if attempt in self.attempts else (attempt,)
-        return load_search(attempt, attempts, jax.default_backend() != "cpu")
+        is_apart = jax.default_backend() != "cpu"
+        has_reverse = cases.limits.reverse_speed is not None
+        return load_search(attempt, attempts, is_apart, has_reverse)
 
     def _guess(
         self, case: InterceptCase, found: Reachability, noise: PathNoise, attempt: Search
@@ -224,6 +250,9 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
             if self.meet == "early":
                 allowed &= jnp.cumsum(found.layers) <= _SPREAD
             layer = jnp.argmax(jnp.where(allowed, noise.layers, -jnp.inf))
+            numbers = jnp.arange(found.layers.size)
+            latest = jnp.max(jnp.where(found.layers, numbers, 0))
+            layer = jnp.where(attempt.is_late, latest, layer)
         path = draw_cell_path(case, found, layer, noise, attempt.directness)
         return self.problem.guess_along(case, found.grid, found.reach.speeds, path, layer)
 
@@ -238,8 +267,3 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
 def quick(**fields: object) -> SpacetimeIntercept:
     """Make a fast `SpacetimeIntercept` with fewer paths and steps; `fields` set other fields."""
     return SpacetimeIntercept(**{"searches": QUICK, **fields})
-
-
-def best(**fields: object) -> SpacetimeIntercept:
-    """Make a `SpacetimeIntercept` that tries more paths to reduce the discomfort."""
-    return SpacetimeIntercept(**{"searches": BEST, "tries_all": True, **fields})

@@ -163,32 +163,40 @@ class MotionProblem:
         turned = 0.5 * knot * (first + 2.0 * rate[0] + rate[1])
         lag = interpolate(bins, straight, at)[1] - straight - turned
         rate = rate.at[:2].add(0.5 * lag / knot)
-        curvature = rate / jnp.maximum(speed, 0.3 * speeds[-1])
+        forward = jnp.maximum(jnp.abs(speed), 0.3 * jnp.max(jnp.abs(speeds)))
+        curvature = rate / jnp.where(speed < 0.0, -forward, forward)
         limit = case.limits.curvature
         point = self.pack(speed, jnp.clip(curvature, -limit, limit), time)
         cells = grid.corner[None] + grid.cell[None] * path.cell.astype(grid.cell.dtype)
         return Guess(point=point, positions=interpolate(cells, case.start[:2], at - 0.5))
 
-    def guess_directly(self, case: InterceptCase) -> Guess:
+    def guess_directly(self, case: InterceptCase, is_late: Array | bool) -> Guess:
         """Return a starting point that leads directly to the target, past no obstacle.
 
         The motion is a point's motion with the least integral of the squared acceleration: a cubic
         polynomial in time. The point starts with the car's position and velocity. It is at the
-        target at the case's time, or at an earlier time if the meeting shall be early. Obstacles
-        and limits are ignored. The case is in the units of `units.enter_units`.
+        target at the case's time, or at an earlier time if the meeting shall be early, unless
+        `is_late` is true. Obstacles and limits are ignored. The car drives in reverse if it may,
+        does not move forward at first, and the target is behind it. The case is in the units of
+        `units.enter_units`.
         """
-        time = self._direct_time(case)
+        time = jnp.where(is_late, case.time, self._direct_time(case))
         is_heading_free = case.heading_tolerance >= np.pi
         first = case.speed * jnp.asarray([1.0, 0.0], time.dtype)
+        limits, is_behind = case.limits, case.target.at(time).pos[0] < 0.0
+        is_reverse = is_behind & (limits.least_speed < 0.0) & (case.speed <= 0.0)
+        gear = jnp.where(is_reverse, -1.0, 1.0).astype(time.dtype)
+        fastest = jnp.where(is_reverse, -limits.least_speed, limits.speed)
+        bounds = jnp.where(is_reverse, -case.end_speed[::-1], case.end_speed)
 
         def solve(heading: Array) -> tuple[Array, Array]:
             ahead = jnp.stack([jnp.cos(heading), jnp.sin(heading)])
             goal = case.target.at(time).pos - case.body.middle * ahead
             offset = goal - first * time
             free = first + 1.5 * offset / time  # velocity at the end of the optimal motion
-            along = jnp.clip(jnp.dot(free, ahead, precision=_HIGHEST), 0.1, case.limits.speed)
-            low, high = case.end_speed[0], case.end_speed[1]
-            end = ahead * jnp.clip(along, low, jnp.maximum(high, low))
+            along = jnp.clip(gear * jnp.dot(free, ahead, precision=_HIGHEST), 0.1, fastest)
+            low, high = bounds[0], bounds[1]
+            end = gear * ahead * jnp.clip(along, low, jnp.maximum(high, low))
             is_free = is_heading_free & (low <= 0.0) & jnp.isinf(high)
             end = jnp.where(is_free, free, end)
             # Coefficients of t^2 and t^3 for the given position and velocity at the end.
@@ -196,7 +204,7 @@ class MotionProblem:
             return 3.0 * offset / time**2 - change / time, change / time**2 - 2.0 * offset / time**3
 
         square, cube = solve(case.end_heading)
-        leaving = first + time * (2.0 * square + 3.0 * time * cube)
+        leaving = gear * (first + time * (2.0 * square + 3.0 * time * cube))
         heading = jnp.where(is_heading_free, jnp.arctan2(leaving[1], leaving[0]), case.end_heading)
         square, cube = solve(heading)
         at = time * (jnp.arange(1, self.pieces + 1, dtype=time.dtype) / self.pieces)[:, None]
@@ -205,9 +213,9 @@ class MotionProblem:
         vel = first + at * (2.0 * square + 3.0 * at * cube)
         bend = 2.0 * square + 6.0 * at * cube
         speed = jnp.sqrt(jnp.sum(vel**2, axis=1) + 1e-6)
-        curvature = (vel[:, 0] * bend[:, 1] - vel[:, 1] * bend[:, 0]) / speed**3
-        limit = case.limits.curvature
-        speed = jnp.minimum(speed, case.limits.speed)
+        curvature = gear * (vel[:, 0] * bend[:, 1] - vel[:, 1] * bend[:, 0]) / speed**3
+        limit = limits.curvature
+        speed = gear * jnp.minimum(speed, fastest)
         return Guess(self.pack(speed, jnp.clip(curvature, -limit, limit), time), pos)
 
     def _direct_time(self, case: InterceptCase) -> Array:
@@ -258,6 +266,12 @@ class MotionProblem:
             gradient = gradient.at[-1].add(push)
             stiffness = pull + jnp.where(late > 0.0, weights.limit, 0.0)
             curvature = curvature.at[-1, -1].add(stiffness / case.time**2)
+            # A fixed time is decoupled from the other unknowns, and its steps are zero.
+            is_other = jnp.arange(gradient.size) < gradient.size - 1
+            is_moved = is_other | ~jnp.asarray(weights.is_time_fixed)
+            gradient = jnp.where(is_moved, gradient, 0.0)
+            eye = jnp.eye(gradient.size, dtype=gradient.dtype)
+            curvature = jnp.where(is_moved[:, None] & is_moved[None], curvature, eye)
             total += weights.limit * late**2 + pull * (time / case.time) ** 2
         return Model(
             cost=total,
@@ -269,10 +283,29 @@ class MotionProblem:
     def list_stages(self, attempt: Search) -> list[Stage]:
         """Return the three stages of least squares that start along a path of grid cells.
 
-        They follow the path, keep all limits, and reduce acceleration or meeting time. The settings
+        They follow the path, keep all limits, and reduce discomfort or meeting time. The settings
         `attempt` determine their numbers of steps, tolerances and margins.
         """
-        return [Stage(_FOLLOWING, attempt.following), *self.list_last_stages(attempt)]
+        following, keeping, last = (
+            Stage(_FOLLOWING, attempt.following),
+            *self.list_last_stages(attempt),
+        )
+        if not self.is_time_free:
+            return [following, keeping, last]
+        late = jnp.asarray(attempt.is_late)
+        fixed = [
+            dataclasses.replace(each.weights, is_time_fixed=late) for each in (following, keeping)
+        ]
+        return [
+            dataclasses.replace(following, weights=fixed[0]),
+            dataclasses.replace(
+                keeping,
+                weights=fixed[1],
+                tolerance=jnp.where(late, 1.0, keeping.tolerance),
+                settled=jnp.where(late, 1, keeping.settled),
+            ),
+            last,
+        ]
 
     def list_last_stages(self, attempt: Search | Warm) -> list[Stage]:
         """Return the last two stages: keep all limits, then reduce acceleration or meeting time."""

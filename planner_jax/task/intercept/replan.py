@@ -93,7 +93,7 @@ class ReplanIntercept(Planner[Replanning, InterceptPlan]):
             for (name, value), default in zip(given.items(), planned, strict=True)
         )
         limits = cases.limits
-        speed = np.clip(speed, 0.0, limits.speed)
+        speed = np.clip(speed, limits.least_speed, limits.speed)
         curvature = np.clip(curvature, -np.asarray(limits.curvature), limits.curvature)
         if movers is None:
             movers = move_on(cases.movers, elapsed)

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jax import Array
+from jax.core import Tracer
 
 from planner_jax.core.choices import require
 from planner_jax.core.compiled import cached_by_precision, with_run_time_numbers
@@ -50,21 +51,26 @@ class Search(Attempt):
     # The set is conservative, as obstacles are rounded to whole cells. A factor below 1 admits
     # narrow passages that are open in truth.
     body_scale: float = 1.0
+    body_discs: int = 2  # number of discs that cover the body in the reach set
     # Whether least squares also start from the direct motion to the target (`guess_directly`).
     is_direct: bool = False
+    # Whether the search is left out if the cells of the default lattice are small enough.
+    is_for_small_cars: bool = False
+    # Whether the meeting is at the latest time until all limits are kept, although it may be early.
+    is_late: bool = False
 
     def __post_init__(self) -> None:
         require(self.paths >= 1, "paths", ">= 1", self.paths)
         lattice = self.lattice
         columns, rows = lattice.cells
-        words = columns // 32 * rows * lattice.levels * lattice.headings * lattice.layers
+        words = columns // 32 * rows * lattice.num_speeds * lattice.headings * lattice.layers
         starts = max(_PATH_STARTS * self.paths, round(_WORD_STARTS * words))
         object.__setattr__(self, "starts", starts)
 
 
 @with_run_time_numbers(
     *("paths", "following", "settling", "margin", "slack", "directness", "body_scale"),
-    *("noise", "is_last", "is_direct"),
+    *("noise", "is_last", "is_direct", "is_late"),
 )
 @dataclasses.dataclass(frozen=True)
 class LoadedSearch(Search):
@@ -72,21 +78,30 @@ class LoadedSearch(Search):
 
     _: dataclasses.KW_ONLY
     noise: cell_paths.PathNoise  # random numbers that select each path
-    is_last: bool  # whether the planner makes no search after this one
+    is_last: bool  # whether the planner makes no later search with the same lattice
 
     def __post_init__(self) -> None:
         """Skip the checks of `Search`, which were made when the search was created."""
 
 
 @cached_by_precision
-def load_search(search: Search, searches: tuple[Search, ...], is_apart: bool) -> LoadedSearch:
+def load_search(
+    search: Search, searches: tuple[Search, ...], is_apart: bool, has_reverse: bool
+) -> LoadedSearch:
     """Return one of a planner's searches, with its settings as arguments of a compiled program.
 
-    All `searches` of the planner share one program. Its arrays of random numbers, which select the
-    paths, are padded to the greatest numbers of paths and candidates of any search. If `is_apart`,
-    the search has its own program without padding, because a GPU would try padded paths, too.
+    All `searches` of the planner with equal lattices share one program. Its arrays of random
+    numbers, which select the paths, are padded to the greatest numbers of paths and candidates of
+    these searches. If `is_apart`, the search has its own program without padding, because a GPU
+    would try padded paths, too. `has_reverse` is whether the car has a reverse gear.
     """
-    sizes = (search,) if is_apart else searches
+    same = [each for each in searches if each.lattice == search.lattice]
+    is_last = search == same[-1]
+    sizes = (search,) if is_apart else same
+    if has_reverse:
+        lattice = search.lattice
+        lattice = dataclasses.replace(lattice, reverse_levels=lattice.levels - 1)
+        search = dataclasses.replace(search, lattice=lattice)
     paths, candidates = (max(vars(each)[name] for each in sizes) for name in _PADDED)
     noise = cell_paths.draw_noise(search.lattice, search.paths, search.seed, search.candidates)
     path = np.minimum(np.arange(paths), search.paths - 1)
@@ -99,7 +114,7 @@ def load_search(search: Search, searches: tuple[Search, ...], is_apart: bool) ->
     fields = dict(vars(search))
     del fields["starts"]
     fields |= {"seed": 0, "candidates": candidates, "within": None}
-    return LoadedSearch(**fields, noise=noise, is_last=search == searches[-1])
+    return LoadedSearch(**fields, noise=noise, is_last=is_last)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -117,18 +132,35 @@ _GIVEN = (
     Search(2, LevenbergConfig(10), following=3, settling=40, is_direct=True),
     Search(4, LevenbergConfig(16), seed=1, body_scale=0.9),
     Search(16, LevenbergConfig(24), seed=2, body_scale=0.75, candidates=1, directness=0.0),
+    # For cars that cannot keep a large distance from an obstacle or a limit.
+    Search(16, LevenbergConfig(60), seed=3, body_scale=0.8, margin=0.006, slack=1e-3),
 )
+# Search for cars that are small in comparison with the distance to the target, such as cars on
+# roads. Its cells are small, and four discs cover the body closely.
+_FINE = Search(
+    16,
+    LevenbergConfig(60),
+    following=16,
+    seed=5,
+    body_scale=0.9,
+    body_discs=4,
+    discs=5,
+    margin=0.01,
+    slack=5e-3,
+    is_for_small_cars=True,
+    lattice=reach.Lattice((256, 192), layers=60, levels=8, pace=5.0),
+)
+_COARSE = 0.6  # a cell that is longer than this share of the car's width is coarse
 QUICK = tuple(
     dataclasses.replace(search, paths=paths, solver=LevenbergConfig(steps), settling=12)
-    for search, paths, steps in zip(_GIVEN, (2, 4, 6), (8, 10, 14), strict=True)
+    for search, paths, steps in zip(_GIVEN[:3], (2, 4, 6), (8, 10, 14), strict=True)
 )
-# Attempts for cars that start close to a wall and cannot keep a large distance from it: many paths,
-# and penalties only at distances below 6 mm from obstacles.
-_NARROW = tuple(
+# Last attempts of the effort "best", for cars that start close to a wall and cannot keep a large
+# distance from it: many paths, and penalties only at small distances from obstacles.
+NARROW = tuple(
     Search(64, LevenbergConfig(60), seed=seed, body_scale=girth, margin=0.006, slack=1e-3, discs=7)
     for seed, girth in ((3, 0.9), (4, 0.75), (6, 0.9))
 )
-BEST = (dataclasses.replace(_GIVEN[0], paths=8, settling=48), *_GIVEN[1:], *_NARROW)
 # First search if the meeting shall be as early as possible: least squares run from every path until
 # the cost falls by less than 0.05 % a step, and the best plan is selected. There is no first stage
 # (`following`), because following a path of grid cells delays the meeting.
@@ -142,11 +174,29 @@ _EARLY = Search(
     is_direct=True,
 )
 _LEAST = Search(16, LevenbergConfig(60, tolerance=5e-4), is_direct=True)
-_LATER = (
-    Search(8, seed=1, body_scale=0.9),
-    dataclasses.replace(_GIVEN[2], solver=LevenbergConfig(30)),
-)
-SEARCHES = {"given": _GIVEN, "early": (_EARLY, *_LATER), "least": (_LEAST, *_LATER)}
+# Later searches for a free meeting time first find a plan for the latest time, and then improve it.
+_LATER = tuple(dataclasses.replace(each, is_late=True) for each in (*_GIVEN, _FINE))
+SEARCHES = {
+    "given": (*_GIVEN, _FINE),
+    "early": (_EARLY, *_LATER),
+    "least": (_LEAST, *_LATER),
+}
+
+
+def leave_out_fine(searches: tuple[Search, ...], cases: InterceptCase) -> tuple[Search, ...]:
+    """Leave out searches for small cars if the usual cells are small enough for all cases.
+
+    They are also left out inside compiled functions, where they would double the compile time.
+    """
+    usual = reach.Lattice().cells
+    leaves = (cases.lower, cases.upper, cases.limits.speed, cases.time, cases.body.width)
+    if any(isinstance(leaf, Tracer) for leaf in leaves):
+        is_coarse = False
+    else:
+        lower, upper, speed, time, width = (np.asarray(leaf, np.float64) for leaf in leaves)
+        cell = np.minimum(upper - lower, 2.0 * (speed * time)[..., None]) / np.asarray(usual)
+        is_coarse = np.any(cell > _COARSE * width[..., None])
+    return tuple(each for each in searches if is_coarse or not each.is_for_small_cars)
 
 
 @struct.dataclass
@@ -194,9 +244,10 @@ def make_grid(case: InterceptCase, lattice: reach.Lattice, *, is_time_free: bool
 
 
 def _top_speed(case: InterceptCase) -> Array:
-    """Return the greatest speed () that the car can reach by the case's time."""
-    gained = case.speed + jnp.minimum(case.limits.acceleration, 1e6) * case.time
-    return jnp.minimum(case.limits.speed, jnp.maximum(gained, 1e-3))
+    """Return the greatest speed () in any gear that the car can reach by the case's time."""
+    gained = jnp.abs(case.speed) + jnp.minimum(case.limits.acceleration, 1e6) * case.time
+    most = jnp.maximum(case.limits.speed, -case.limits.least_speed)
+    return jnp.minimum(most, jnp.maximum(gained, 1e-3))
 
 
 def _map_corners(case: InterceptCase, reach: Array) -> Array:
@@ -234,10 +285,17 @@ def search_reach(
     target may be met before the case's time.
     """
     lattice, limits, speed = search.lattice, case.limits, _top_speed(case)
-    radius, ahead = discs_of(case.body, 2)
-    level = speed * jnp.linspace(0.0, 1.0, lattice.levels)
-    quickest = limits.lateral_acceleration / jnp.maximum(level, 0.1 * speed)
-    turn_rates = jnp.minimum(limits.curvature * level, quickest)
+    radius, ahead = discs_of(case.body, search.body_discs)
+    shares = [
+        jnp.linspace(0.0, 1.0, num + 1) for num in (lattice.reverse_levels, lattice.levels - 1)
+    ]
+    backward, forward = (
+        jnp.minimum(speed, most) * share
+        for most, share in zip((-limits.least_speed, limits.speed), shares, strict=True)
+    )
+    level = jnp.concatenate([-backward[:0:-1], forward])
+    quickest = limits.lateral_acceleration / jnp.maximum(jnp.abs(level), 0.1 * speed)
+    turn_rates = jnp.minimum(limits.curvature * jnp.abs(level), quickest)
     vehicle = reach.Vehicle(
         search.body_scale * radius + case.margin, ahead, level, turn_rates, limits.acceleration
     )
@@ -286,7 +344,7 @@ def _meeting_cells(
     cells, is_reached = reach.goal_cells(
         grid, found.bits[layer], points, case.body.middle, headings
     )
-    gap = found.speeds[-1] - found.speeds[-2]
+    gap = jnp.max(jnp.diff(found.speeds))
     levels = (found.speeds > case.end_speed[0] - gap) & (found.speeds < case.end_speed[1] + gap)
     return cells, is_reached & levels[:, None, None]
 

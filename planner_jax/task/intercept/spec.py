@@ -61,7 +61,6 @@ TASK = Task(
     planners={
         "spacetime": "planner_jax.task.intercept.default_planner:SpacetimeIntercept",
         "quick": "planner_jax.task.intercept.default_planner:quick",
-        "best": "planner_jax.task.intercept.default_planner:best",
         "lattice": "planner_jax.baselines.intercept.path_then_speed:lattice",
         "paper": "planner_jax.baselines.intercept.paper:PaperIntercept",
         "em": "planner_jax.baselines.intercept.path_then_speed:em",
@@ -72,5 +71,5 @@ TASK = Task(
     flight="planner_jax.sims.settings:InterceptFly",
     single="planner_jax.cli.plan.settings:SingleInterceptSettings",
     contact="time",
-    yardstick="best",
+    yardstick={"effort": "best"},
 )

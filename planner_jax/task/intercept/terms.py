@@ -33,6 +33,7 @@ class Weights:
     follow: float = 0.0  # [1/m^2], of the distance at knots from a path of cells
     margin: float = 0.03  # [m], distance from obstacles below which they are penalised
     slack: float = 0.015  # a value is penalised above (1 - slack) times its limit
+    is_time_fixed: bool = False  # whether the meeting time stays as it is, even if it is free
 
 
 # Factors of the discomfort, in the units of `units.enter_units`: of the lateral jerk, a time; and
@@ -86,12 +87,15 @@ def limit_terms(
     fast, bend = share * v + (1.0 - share) * v0, share * c + (1.0 - share) * c0
     by_speed, by_curvature = 2.0 * fast * bend, fast**2
     # Limited values: speed, curvature, acceleration, steering rate, and the lateral acceleration at
-    # `points` positions. The limits 0 <= v <= v_max are written as |v - v_max / 2| <= v_max / 2.
-    values = jnp.concatenate(
-        [v - 0.5 * limits.speed, c, acceleration, steering, by_curvature * bend]
+    # `points` positions. The limits v_min <= v <= v_max are written as |v - middle| <= half, where
+    # half is (v_max - v_min) / 2.
+    middle, half = (
+        0.5 * (limits.speed + limits.least_speed),
+        0.5 * (limits.speed - limits.least_speed),
     )
+    values = jnp.concatenate([v - middle, c, acceleration, steering, by_curvature * bend])
     lateral = jnp.full(points, limits.lateral_acceleration)
-    others = [0.5 * limits.speed, limits.curvature, limits.acceleration, limits.steering_rate]
+    others = [half, limits.curvature, limits.acceleration, limits.steering_rate]
     bounds = jnp.concatenate([jnp.stack(others), lateral])[:, None]
     none, rates = jnp.zeros_like(v), jnp.full_like(v, rate)
     slopes = jnp.stack(  # derivatives of the values by the five variables of a piece, (5, R, K)
@@ -114,13 +118,13 @@ def limit_terms(
     low, high = case.end_speed[0], case.end_speed[1]
     over, under = v[0, -1] - high, low - v[0, -1]
     is_over, is_under = over + weights.slack > 0.0, under + weights.slack > 0.0
-    is_under &= low > 0.0
+    is_under &= low > limits.least_speed
     at_end = jnp.where(is_over, over + weights.slack, 0.0)
     at_end -= jnp.where(is_under, under + weights.slack, 0.0)
     slope_at_end = jnp.where(is_over, 1.0, 0.0) + jnp.where(is_under, 1.0, 0.0)
     end = jnp.zeros((6, 1), dtype).at[V_RIGHT].set(slope_at_end).at[5].set(at_end)
     squares = squares.at[..., -1].add(_sum_squares(end, weights.limit))
-    wrong_end = jnp.maximum(over, jnp.where(low > 0.0, under, -1.0))
+    wrong_end = jnp.maximum(over, jnp.where(low > limits.least_speed, under, -1.0))
     # Residuals of the discomfort, whose integral over a piece is a square times the duration.
     sideways, sideways0 = v**2 * c, v0**2 * c0
     rough = jnp.concatenate(
@@ -376,7 +380,8 @@ def is_too_far(case: InterceptCase) -> Array:
 def longest_drive(case: InterceptCase, times: Array) -> Array:
     """Return upper bounds (...) [m] of the distances that the car can drive until times (...)."""
     gained = 0.5 * jnp.minimum(case.limits.acceleration, 1e6) * times
-    return jnp.minimum(case.speed + gained, case.limits.speed) * times
+    most = jnp.maximum(case.limits.speed, -case.limits.least_speed)
+    return jnp.minimum(jnp.abs(case.speed) + gained, most) * times
 
 
 def nearest_in_region(region: Array, point: Array) -> tuple[Array, Array]:

@@ -20,6 +20,7 @@ from planner_jax.task.intercept.plan import InterceptPlan
 
 _LENGTH = 0.4  # length of the car's body in the units
 _ACCELERATION = 1.0  # greatest acceleration of the car in the units
+_ABRUPT = 1e3  # acceleration that stands for an infinite one, in the units
 
 
 @struct.dataclass
@@ -56,10 +57,18 @@ def units_of(case: InterceptCase) -> Units:
 
 
 def enter_units(case: InterceptCase, units: Units) -> InterceptCase:
-    """Convert a case to units: its start is at the origin, and its car is 0.4 long."""
+    """Convert a case to units: its start is at the origin, and its car is 0.4 long.
+
+    An infinite speed limit is replaced by a speed that the car cannot reach.
+    """
     turn, origin = -units.frame[2], units.frame[:2]
     body, limits = case.body, case.limits
     to_map = rotate(origin, -case.map_heading)
+    acceleration = _divide(limits.acceleration, units.acceleration)
+    gained = jnp.minimum(acceleration, _ABRUPT) * case.time / units.time
+    reachable = 1.1 * (jnp.abs(case.speed) / units.speed + gained)
+    bound = lambda speed: jnp.minimum(_divide(speed, units.speed), reachable)  # noqa: E731
+    reverse = limits.reverse_speed
     return dataclasses.replace(
         case,
         start=jnp.zeros_like(case.start),
@@ -80,11 +89,12 @@ def enter_units(case: InterceptCase, units: Units) -> InterceptCase:
             rear_overhang=body.rear_overhang / units.length,
         ),
         limits=CarLimits(
-            speed=_divide(limits.speed, units.speed),
-            acceleration=_divide(limits.acceleration, units.acceleration),
+            speed=bound(limits.speed),
+            acceleration=acceleration,
             lateral_acceleration=_divide(limits.lateral_acceleration, units.acceleration),
             curvature=_divide(limits.curvature, 1.0 / units.length),
             steering_rate=_divide(limits.steering_rate, 1.0 / units.time),
+            reverse_speed=None if reverse is None else bound(reverse),
         ),
         region=rotate(case.region, turn) / units.length,
         earliest=case.earliest / units.time,
