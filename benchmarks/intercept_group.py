@@ -1,6 +1,6 @@
 """Compare methods to decide in which order one car meets three targets.
 
-    python -m benchmarks.intercept_group [--num 20] [--seed 1] [--out DIR]
+    python -m benchmarks.intercept_group [--num 20] [--forty 0] [--seed 1] [--out DIR]
 
 A case has the first three targets of a group of moving targets, drawn from the suite `group`. Four
 methods are compared:
@@ -19,6 +19,9 @@ distance is within the case's tolerance. The bound is the earliest last meeting 
 Planning times are for a second call, which compiles nothing, with all groups at once. The compile
 time of the first listed method is the longest, because the other methods use the same programs. The
 run's summary has the success rate of the first method.
+
+With --forty the groups have 40 targets among 40 moving obstacles, of the suite `forty`, and are
+planned by `direct` one by one. Their lower bound is described in `benchmarks.group_bound`.
 """
 
 import argparse
@@ -31,6 +34,7 @@ import jax
 import numpy as np
 
 import planner_jax as pj
+from planner_jax.benchmarks.group_bound import bound_end_time
 from planner_jax.benchmarks.run import Bench, argument_parser, begin
 from planner_jax.plane.target import PlanePath
 from planner_jax.task.group.case import InterceptGroup
@@ -44,6 +48,7 @@ DECISIONS = {
     "greedy": "greedy",
     "random": "given",
 }
+FORTY_STEP = 0.2  # [s] Time step of the lower bound for 40 targets.
 STEP = 0.005  # [s] Time step of the lower bound on the time of the last meeting.
 
 
@@ -172,11 +177,81 @@ def measure(bench: Bench, options: argparse.Namespace) -> None:
     bench.count(found["best of all six orders"][1])
 
 
+def bound_forty(groups: InterceptGroup, ends: np.ndarray) -> np.ndarray:
+    """Return lower bounds (B,) [s] on the last meeting of B groups; `ends` (B,) are known times."""
+    bounds = []
+    for k, upper in enumerate(ends):
+        shared = pj.take(groups.shared, k)
+        times = FORTY_STEP * np.arange(int(np.ceil(upper / FORTY_STEP)) + 2)
+        with jax.enable_x64(True):
+            paths = jax.tree.map(lambda leaf: np.asarray(leaf, float)[None], shared.target)
+            places = np.asarray(_places(paths, times[None]))[0]
+        limits, ahead = shared.limits, float(shared.body.middle)
+        v = np.minimum(limits.speed, shared.speed + limits.acceleration * times)
+        # The speed of the body's middle is v sqrt(1 + (ahead kappa)^2), with the curvature kappa at
+        # most its limit and at most the limit of v^2 kappa, divided by v^2.
+        bend = np.minimum(limits.curvature, limits.lateral_acceleration / np.maximum(v, 1e-6) ** 2)
+        slow = np.sqrt(limits.lateral_acceleration / limits.curvature)
+        slow = np.minimum(v, slow) * np.sqrt(1.0 + (ahead * limits.curvature) ** 2)
+        fast = np.maximum(v * np.sqrt(1.0 + (ahead * bend) ** 2), slow)
+        travel = np.concatenate([[0.0], np.cumsum(FORTY_STEP * fast[1:])])
+        heading = shared.start[2]
+        start = np.asarray(shared.start[:2]) + ahead * np.array([np.cos(heading), np.sin(heading)])
+        tolerance = float(shared.tolerance)
+        bounds.append(bound_end_time(places, travel, start, tolerance, FORTY_STEP, float(upper)))
+    return np.array(bounds)
+
+
+def measure_forty(bench: Bench, options: argparse.Namespace) -> None:
+    """Plan groups of 40 targets one by one, and print success, planning times, times and gaps."""
+    groups = jax.tree.map(np.asarray, pj.group.draw(options.forty, "forty", options.seed))
+    planner, plans, seconds = pj.group.planner("direct", decide="search"), [], []
+    began = time.perf_counter()
+    pj.plan(planner, pj.take(groups, 0))
+    cold = time.perf_counter() - began
+    for k in range(options.forty):
+        began = time.perf_counter()
+        plans.append(pj.plan(planner, pj.take(groups, k)))
+        seconds.append(time.perf_counter() - began)
+    together = jax.tree.map(lambda *leaves: np.stack(leaves), *plans)
+    success = pj.group.judge(groups, together).success
+    good = np.flatnonzero(success)
+    ends, median = together.cost[good], float(np.median(seconds))
+    gaps = ends / bound_forty(pj.take(groups, good), ends) - 1.0
+    bench.say(
+        "",
+        f"{options.forty} groups of 40 targets among 40 movers, seed {options.seed}; times of the "
+        f"{good.size} solved",
+        "",
+        "| refereed success | last meeting, median | worst | above the bound, median | worst "
+        "| s a group, warm, p50 | worst | compiling |",
+        "|---|---|---|---|---|---|---|---|",
+        f"| {100 * success.mean():.1f} % | {np.median(ends):.1f} s | {ends.max():.1f} s "
+        f"| {100 * np.median(gaps):.0f} % | {100 * gaps.max():.0f} % | {median:.2f} "
+        f"| {max(seconds):.2f} | {cold - median:.0f} s |",
+    )
+    bench.row(
+        order="search, 40 targets",
+        success_rate=success.mean(),
+        median=np.median(ends),
+        over_bound=np.median(gaps),
+        worst_over_bound=gaps.max(),
+        ms_a_group=1e3 * median,
+        compile_seconds=cold - median,
+    )
+    bench.count(success)
+
+
 def main() -> None:
     parser = argument_parser("intercept_group", __doc__, num=20, seed=1)
+    what = "plan this number of groups of 40 targets instead"
+    parser.add_argument("--forty", type=int, default=0, help=what)
     options = parser.parse_args()
     with begin(parser, options) as bench:
-        measure(bench, options)
+        if options.forty:
+            measure_forty(bench, options)
+        else:
+            measure(bench, options)
 
 
 if __name__ == "__main__":

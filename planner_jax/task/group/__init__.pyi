@@ -5,6 +5,8 @@ from .case import case as case
 from .decide import Best as Best
 from .decide import Given as Given
 from .decide import Greedy as Greedy
+from .decide import Search as Search
 from .default_planner import GroupIntercept as GroupIntercept
+from .direct import DirectGroup as DirectGroup
 from .plan import GroupPlan as GroupPlan
 from .suites import draw as draw

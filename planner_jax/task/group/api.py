@@ -20,15 +20,17 @@ def planner(
     target after another with the intercept planner `spacetime`, each meeting as early as possible.
 
     Args:
-        name: `spacetime`, or a planner of another package.
+        name: `spacetime`; `direct`, a fast planner for up to 40 targets, which searches no cells
+            and improves the order while it plans; or a planner of another package.
         decide: how to find the order. "best" plans the orders that are estimated to end first, and
             selects the plan that ends first. "greedy" always meets next the target with the
-            earliest estimated meeting. "given" uses the orders in the cases. An object is also
+            earliest estimated meeting. "search" improves this order by a local search, for many
+            targets. "given" uses the orders in the cases. An object is also
             accepted: `Best(finalists=3)` plans only three orders.
         **options: fields of the planner's dataclass.
 
     Returns:
-        A planner for `pj.plan`; its field `planner` is a `GroupIntercept`.
+        A planner for `pj.plan`; its field `planner` is a `GroupIntercept` or a `DirectGroup`.
 
     Raises:
         ValueError: no planner or no decision has the requested name.

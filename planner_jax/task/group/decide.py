@@ -19,6 +19,7 @@ from planner_jax.core.choices import require
 from planner_jax.core.protocol import Decision, require_settings
 from planner_jax.task.arguments import require_orders
 from planner_jax.task.group.case import GroupChoice, InterceptGroup
+from planner_jax.task.group.order import Departure, improve, make_table
 
 _GRID = 128  # number of times at which the position of every target is evaluated
 _PACE = 0.8  # assumed mean speed of the car, divided by its greatest speed
@@ -154,3 +155,26 @@ class Given(Decision):
         """Return the order of N targets stored in one case as the only proposal, (1, N)."""
         present_first = jnp.argsort(~case.present[case.order], stable=True)
         return GroupChoice(order=case.order[present_first][None])
+
+
+@jax.tree_util.register_static
+@dataclasses.dataclass(frozen=True)
+class Search(Decision):
+    """Decision for many targets: a local search that starts from the greedy order.
+
+    Three local searches follow each other. The first ignores the time that turns take, the second
+    counts a share of it, and the third all of it.
+    """
+
+    moves: int = 40  # greatest number of moves of each local search
+
+    def propose(self, case: InterceptGroup) -> GroupChoice:
+        """Return the improved order of a group's N targets as the only proposal, (1, N)."""
+        start = _start(case)
+        toward = jnp.stack([jnp.cos(start.heading), jnp.sin(start.heading)])
+        departure = Departure(start.position, toward, start.time)
+        table, order = make_table(case), Greedy().propose(case).order[0]
+        for share in (0.0, 0.3, 1.0):
+            some = dataclasses.replace(table, delay=share * table.delay)
+            order = improve(case, some, departure, order, 0, self.moves)
+        return GroupChoice(order=order[None])
