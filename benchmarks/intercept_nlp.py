@@ -17,13 +17,14 @@ by at most log(2) / `SHARPNESS` = 1.7 mm if two gaps are equal.
 IPOPT starts where the planner starts: first from the direct motion to the target, then from --paths
 paths of reachable cells, up to the first plan that the referee accepts. Another row starts from the
 planner's own plans, and shows how far these are from a local optimum. Costs, the total variation of
-the curvature and the lateral jerk are compared on the cases that both solve; a gap is the planner's
-cost divided by IPOPT's, minus 1.
+the curvature and the lateral jerk are compared on the cases that both solve; a gap is the cost of
+the planner `spacetime` with the default effort, divided by the row's cost, minus 1.
 
 Times are for one case at a time; those of the planner are the fastest of three calls. The drawn
 cars have the length and acceleration in which the discomfort is defined (`units`).
 """
 
+import contextlib
 import dataclasses
 import importlib
 import importlib.metadata
@@ -133,9 +134,10 @@ class Program:
         self._cost = ca.Function("cost", [program["x"], given], [program["f"]])
         options: dict[str, Any] = {"print_time": False, "ipopt": OPTIONS}
         if folder and shutil.which("gcc"):  # the program as C code is some ten times faster
-            flags = {"flags": ["-O1", "-march=native"], "directory": f"{folder}/"}
+            flags = {"flags": ["-O1", "-march=native"]}
             options |= {"jit": True, "compiler": "shell", "jit_options": flags}
-        self._solver = ca.nlpsol("solver", "ipopt", program, options)
+        with contextlib.chdir(folder or "."):  # where CasADi writes its C code
+            self._solver = ca.nlpsol("solver", "ipopt", program, options)
         self.build_seconds = time.perf_counter() - began
 
     def _names(self) -> tuple[Any, dict[str, Any]]:
@@ -256,7 +258,7 @@ def start_plans(planner: Any, cases: Any, plans: Any, paths: int) -> list[Any]:
 
     def guess(case: Any) -> tuple[jax.Array, jax.Array]:
         local = enter_units(case, units_of(case))
-        return problem.unpack(local, problem.guess_directly(local).point)[:2]
+        return problem.unpack(local, problem.guess_directly(local, False).point)[:2]
 
     speed, curvature = jax.jit(jax.vmap(guess))(cases)
     found = [dataclasses.replace(plans, speed=speed, curvature=curvature)]
@@ -322,22 +324,24 @@ def finish(program: Program, lanes: list[Any], plans: list[Any], seconds: np.nda
 
 
 def say_row(bench: Bench, name: str, one: Results, ours: Results) -> None:
-    """Print a row of one planner, and its cost beside this library's."""
+    """Print a row of one planner, and the default plans' cost and smoothness beside it."""
     both = one.success & ours.success
     gap = ours.cost[both] / one.cost[both] - 1.0
     gaps = np.percentile(gap, [10, 50, 90]) if both.any() else np.full(3, np.nan)
     ways = int((gap > 0.01).sum()), int((gap < -0.01).sum()), int(both.sum())
     bends, jerk = (
-        np.median(one.measure(leaf)[both]) if both.any() else np.nan
+        [np.median(each.measure(leaf)[both]) if both.any() else np.nan for each in (ours, one)]
         for leaf in ("total_curvature_variation", "rms_lateral_jerk")
     )
     times = 1e3 * np.percentile(one.seconds, [50, 90])
     bench.say(
         f"| {name} | {' | '.join(rate_cells(int(one.success.sum()), len(both)))} | "
         f"{' / '.join(f'{100 * each:.1f}' for each in gaps)} | {ways[0]} / {ways[1]} of {ways[2]} "
-        f"| {bends:.2f} | {jerk:.3f} | {times[0]:.0f} / {times[1]:.0f} |"
+        f"| {bends[0]:.2f} / {bends[1]:.2f} | {jerk[0]:.3f} / {jerk[1]:.3f} | "
+        f"{times[0]:.0f} / {times[1]:.0f} |"
     )
-    bench.row(planner=name, success=one.success, cost=one.cost, gaps=gaps, seconds=one.seconds)
+    figures = {"success": one.success, "cost": one.cost, "seconds": one.seconds}
+    bench.row(planner=name, **figures, gaps=gaps, variation=bends, lateral_jerk=jerk)
 
 
 def main() -> None:
@@ -363,24 +367,19 @@ def main() -> None:
             f"first call of the planner {first:.1f} s; CasADi builds and compiles the program in "
             f"{program.build_seconds:.1f} s",
             "",
-            "| planner | cases | success [%] | 95 % interval | gap of our cost, p10 / p50 / p90 "
-            "[%] | gap above 1 % / below -1 % | total variation of curvature [1/m] | rms "
-            "lateral jerk [m/s3] | time p50 / p90 [ms] |",
+            "| planner | cases | success [%] | 95 % interval | gap of `spacetime`, p10 / p50 / p90 "
+            "[%] | above 1 % / below -1 % | total variation of curvature, `spacetime` / this [1/m] "
+            "| rms lateral jerk, `spacetime` / this [m/s3] | time p50 / p90 [ms] |",
             "|---|---|---|---|---|---|---|---|---|",
         )
         bench.count(ours.success)
         say_row(bench, "`spacetime`", ours, ours)
+        good = run_planner(planner.with_effort("good"), lanes, program)
+        say_row(bench, '`spacetime`, effort "good"', good, ours)
         plans = jax.tree.map(lambda *each: np.stack(each), *ours.plans)
         starts = start_plans(planner, cases, plans, options.paths)
         for name, given in (("IPOPT", starts), ("IPOPT, from our plans", [plans])):
-            peer = run_ipopt(program, lanes, given)
-            say_row(bench, name, peer, ours)
-            both = peer.success & ours.success
-            bends = [each.measure("total_curvature_variation")[both] for each in (ours, peer)]
-            if both.any():
-                ratio = np.median(bends[0]) / np.median(bends[1]) - 1.0
-                bench.note(**{f"variation beside {name}": ratio})
-                bench.say(f"(our variation of curvature is {100 * ratio:+.1f} % of {name}'s)")
+            say_row(bench, name, run_ipopt(program, lanes, given), ours)
 
 
 if __name__ == "__main__":
