@@ -286,7 +286,7 @@ def test_a_plan_stays_the_same_for_an_unchanged_target(planned):
     elapsed = 2.0
     target = jax.vmap(lambda path: path.at(elapsed))(cases.target)
     turned = pj.TurningPath(target.pos, target.vel, cases.target.turn_rate)
-    again = pj.replan(PLANNER, cases, plans, elapsed, target=turned)
+    again = pj.replan(PLANNER, cases, plans, elapsed)  # by default for the target of the cases
     assert pj.are_solved(again).all()
     np.testing.assert_allclose(again.time, 8.0, atol=1e-5)
     np.testing.assert_allclose(again.meeting, plans.meeting, atol=1e-3)
@@ -299,6 +299,23 @@ def test_a_plan_stays_the_same_for_an_unchanged_target(planned):
     start = {"start": again.start, "speed": again.speed[:, 0], "curvature": again.curvature[:, 0]}
     moved = cases.replace(target=turned, time=again.time, movers=movers, **start)
     assert pj.intercept.judge(moved, again).success.all()
+
+
+@pytest.mark.slow
+def test_a_wall_that_is_seen_on_the_way_is_avoided():
+    straight = pj.TurningPath(jnp.array([6.0, 4.0]), jnp.zeros(2), jnp.array(0.0))
+    case = pj.intercept.case(straight, 10.0, walls=[np.array([[0, 0], [1, 0], [0, 1]], float)])
+    plan = pj.plan(PLANNER, case)
+    walls = pj.obstacles([np.array([[4, 3.7], [4.2, 3.7], [4.2, 4.4], [4, 4.4]], float)])
+    again = pj.replan(PLANNER, case, plan, 2.0, walls=walls)
+    seen = case.replace(
+        walls=walls, start=again.start, speed=again.speed[0], curvature=again.curvature[0]
+    )
+    seen = seen.replace(time=again.time)
+    assert not pj.intercept.judge(case.replace(walls=walls), plan).success
+    assert pj.are_solved(again) and pj.intercept.judge(seen, again).success
+    with pytest.raises(TypeError, match="walls must be"):
+        pj.replan(PLANNER, case, plan, 2.0, walls=[np.zeros((3, 2))])
 
 
 def test_latency_plans_the_remainders_of_solved_plans_again(planned):

@@ -78,7 +78,8 @@ def replan(planner: PyTree, cases: PyTree, previous: PlanT, elapsed: PyTree, **n
         elapsed: () or (B,) [s], time since the plan's start, >= 0.
         **news: changed quantities, with times that count from the present. Catches take `targets`
             and `head_state`, hits `ball`, `drag` and `head_state`. The default of `head_state` is
-            the robot's state in the plan at this time.
+            the robot's state in the plan at this time. Interceptions take `target`, `walls`,
+            `movers`, and the car's `start`, `speed` and `curvature`.
 
     Returns:
         The plans; their times count from the present.

@@ -19,7 +19,7 @@ from planner_jax.core.checks import require_beginning, require_kind, require_pat
 from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import Attempt
 from planner_jax.plane.obstacles import Obstacles, move_on
-from planner_jax.plane.target import PlanePath
+from planner_jax.plane.target import LaterPath, PlanePath
 from planner_jax.planning.replan import Replanning, check_elapsed, resolve_argument
 from planner_jax.robot.car import pose_at
 from planner_jax.task.intercept.case import InterceptCase
@@ -62,7 +62,8 @@ class ReplanIntercept(Planner[Replanning, InterceptPlan]):
         previous: InterceptPlan,
         elapsed: ArrayLike,
         *,
-        target: PlanePath,
+        target: PlanePath | None = None,
+        walls: Obstacles | None = None,
         movers: Obstacles | None = None,
         start: ArrayLike | None = None,
         speed: ArrayLike | None = None,
@@ -74,7 +75,10 @@ class ReplanIntercept(Planner[Replanning, InterceptPlan]):
             cases: one case or a batch of B cases, as they were planned.
             previous: the plans that are being driven.
             elapsed: () [s], time since the start of the plans, or (B,) for B cases.
-            target: the expected path of the target; its time 0 is the moment of re-planning.
+            target: the expected path of the target; its time 0 is the moment of re-planning. By
+                default it is the path of the case.
+            walls: the static obstacles known at this moment, by `pj.obstacles`; by default those of
+                the cases.
             movers: the moving obstacles at this moment; by default the obstacles of the cases,
                 moved at their velocities.
             start: (3,) or (B, 3) x, y [m], heading [rad] of the rear axle; by default as planned.
@@ -82,10 +86,13 @@ class ReplanIntercept(Planner[Replanning, InterceptPlan]):
             curvature: () or (B,) [1/m]; by default as planned; clipped to the car's limits.
         """
         elapsed, batch = check_elapsed(cases, elapsed), cases.batch_shape
+        if target is None:
+            target = LaterPath(path=cases.target, begin=np.broadcast_to(elapsed, batch))
         require_path("target", target, batch, 2)
-        if movers is not None:
-            require_kind("movers", movers, Obstacles)
-            require_beginning("movers", movers, batch, f"the batch shape {batch}")
+        for name, group in (("walls", walls), ("movers", movers)):
+            if group is not None:
+                require_kind(name, group, Obstacles)
+                require_beginning(name, group, batch, f"the batch shape {batch}")
         planned = (_states if cases.batch_shape else _state)(previous, elapsed)
         given = {"start": start, "speed": speed, "curvature": curvature}
         start, speed, curvature = (
@@ -106,6 +113,8 @@ class ReplanIntercept(Planner[Replanning, InterceptPlan]):
             curvature=curvature,
             target=target,
             time=np.maximum(np.asarray(until) - elapsed, 0.5 * self.shortest).astype(elapsed.dtype),
+            earliest=np.maximum(np.asarray(cases.earliest) - elapsed, 0.0).astype(elapsed.dtype),
+            walls=cases.walls if walls is None else walls,
             movers=movers,
         )
         return Replanning(case=remainder, previous=previous, elapsed=elapsed)
