@@ -58,6 +58,12 @@ def test_a_plan_is_drawn_with_walls_bodies_and_the_verdict(drive):
     assert axes.figure.axes[1].get_ylabel() == "speed of the car [m/s]"
 
 
+def test_times_of_a_target_at_standstill_and_of_the_car_are_on_opposite_sides(drive):
+    axes = pj.intercept.draw_plan(*drive)
+    heights = {each.get_text(): each.xyann[1] for each in axes.texts if each.xy[0] > 4.9}
+    assert heights == {"0 s": -13.0, "4 s": 13.0}
+
+
 def test_circles_absent_movers_and_a_map_without_bounds_are_drawn():
     square = 0.5 * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
     case = pj.intercept.case(

@@ -264,8 +264,8 @@ def _label_times(
     for k, (time, point) in enumerate(zip(times, places, strict=True)):
         if np.linalg.norm(point - last) >= gap:
             x, y = places[min(k + 1, len(places) - 1)] - places[max(k - 1, 0)]
-            length = float(np.hypot(x, y))
-            offset = (-15.0 * side * y / length, 13.0 * side * x / length) if length else (0, 13)
+            x, y = (x, y) / np.hypot(x, y) if x or y else (1.0, 0.0)
+            offset = (-15.0 * side * y, 13.0 * side * x)
             look: Look = {"textcoords": "offset points", "fontsize": 8.0, "color": style.INK}
             look |= {"ha": "center", "va": "center", "zorder": 9}
             halo = [withStroke(linewidth=2.0, foreground="white")]
