@@ -312,9 +312,15 @@ def plan_again(
     elapsed = drive.time - drive.began
     if isinstance(planner, SpacetimeIntercept):
         again = planner.replanner()
-        now = {"start": pose, "speed": speed, "curvature": curvature}
         task = again.begin(
-            begun, cast(InterceptPlan, drive.plan), elapsed, target=target, movers=movers, **now
+            begun,
+            cast(InterceptPlan, drive.plan),
+            elapsed,
+            target=target,
+            movers=movers,
+            start=pose,
+            speed=speed,
+            curvature=curvature,
         )
         left, found = task.case, plan_all(again, task)
     else:

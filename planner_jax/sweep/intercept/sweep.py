@@ -1,5 +1,7 @@
 """Runs over many cases of a car that meets a moving target among walls and moving obstacles."""
 
+import dataclasses
+
 import numpy as np
 import pyarrow as pa
 from jaxtyping import PyTree
@@ -58,7 +60,9 @@ class InterceptSweep(Sweep[InterceptSettings]):
     def setting(self, cases: PyTree) -> Entries:
         """Return map, car body and limits that all cases share, for the manifest's `setting`."""
         bounds = first_values(cases, ["lower", "upper"])
-        return bounds | first_values(cases.body, prefix="body_") | first_values(cases.limits)
+        reverse = np.abs(np.asarray(cases.limits.least_speed))
+        limits = dataclasses.replace(cases.limits, reverse_speed=reverse)
+        return bounds | first_values(cases.body, prefix="body_") | first_values(limits)
 
     def findings(self, manifest: Entries) -> list[str]:
         """Return a sentence on mean meeting time, miss distance and acceleration of successes."""

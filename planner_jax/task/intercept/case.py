@@ -37,7 +37,6 @@ _DRIVABLE = rules.Rule(
 # Shapes, types and ranges that `pj.require_sound` checks for the arrays of an `InterceptCase`.
 RULES: Table = (
     Field("start", (3,)),
-    Field("speed", (), _DRIVABLE),
     Field("curvature", ()),
     Field("time", (), rules.POSITIVE),
     Field("tolerance", (), rules.POSITIVE),
@@ -75,6 +74,7 @@ RULES: Table = (
     Field("body.rear_overhang", ()),
     *(Field(f"limits.{name}", (), rules.POSITIVE_OR_NONE) for name in _LIMITS[:-1]),
     Field("limits.reverse_speed", (), rules.NOT_NEGATIVE_OR_NONE),
+    Field("speed", (), _DRIVABLE),
 )
 # Maps a field of a case to the argument of `case` that sets it; error messages name the argument.
 _ARGUMENTS = {

@@ -6,7 +6,7 @@ remain unsolved are planned from scratch.
 """
 
 import dataclasses
-from typing import ClassVar
+from typing import ClassVar, cast
 
 import jax
 import jax.numpy as jnp
@@ -87,7 +87,8 @@ class ReplanIntercept(Planner[Replanning, InterceptPlan]):
         """
         elapsed, batch = check_elapsed(cases, elapsed), cases.batch_shape
         if target is None:
-            target = LaterPath(path=cases.target, begin=np.broadcast_to(elapsed, batch))
+            begin = cast(Array, np.broadcast_to(elapsed, batch))
+            target = LaterPath(path=cases.target, begin=begin)
         require_path("target", target, batch, 2)
         for name, group in (("walls", walls), ("movers", movers)):
             if group is not None:
