@@ -20,7 +20,7 @@ planner's own plans, and shows how far these are from a local optimum. Costs, th
 the curvature and the lateral jerk are compared on the cases that both solve; a gap is the cost of
 the planner `spacetime` with the default effort, divided by the row's cost, minus 1.
 
-Times are for one case at a time; those of the planner are the fastest of three calls. The drawn
+Cases are planned one at a time. The time of the planner is the fastest of three calls. The drawn
 cars have the length and acceleration in which the discomfort is defined (`units`).
 """
 
@@ -280,7 +280,7 @@ class Results:
 
     @property
     def success(self) -> np.ndarray:
-        """Whether the referee accepts each plan, (B,) bool."""
+        """The referee's acceptance of each plan, (B,) bool."""
         return np.array([bool(verdict.success) for verdict in self.verdicts])
 
     def measure(self, name: str) -> np.ndarray:

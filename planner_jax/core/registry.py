@@ -56,9 +56,9 @@ class Task:
     # Keyword arguments with which speed benchmarks call `planner`.
     bench: Mapping[str, object] = dataclasses.field(default_factory=dict)
     contact: str | None = None  # dotted name of the contact times in a plan, such as "stroke.time"
-    # Keyword arguments of `planner` for the planner with whose costs those of other planners are
-    # compared; empty: no such planner. Planners that minimise a cost are compared with a longer
-    # search of their own.
+    # Keyword arguments of `planner`. They select the planner with whose costs the costs of other
+    # planners are compared; empty: no such planner. Planners that minimise a cost are compared with
+    # a longer search of their own.
     yardstick: Mapping[str, object] = dataclasses.field(default_factory=dict)
 
     @property

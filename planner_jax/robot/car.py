@@ -49,6 +49,13 @@ class CarBody:
         """Distance of the rectangle's middle ahead of the rear axle, () [m]."""
         return 0.5 * self.length - self.rear_overhang
 
+    def middle_at(self, pose: Array) -> Array:
+        """Return the position (2,) [m] of the rectangle's middle at a pose (3,) of the rear axle.
+
+        A pose has x [m], y [m] and the heading [rad].
+        """
+        return pose[:2] + self.middle * jnp.stack([jnp.cos(pose[2]), jnp.sin(pose[2])])
+
 
 @dataclasses.dataclass(frozen=True)
 class CarSetpoints:

@@ -36,10 +36,8 @@ class _Meeting:
 
 def _start(group: InterceptGroup) -> _Meeting:
     shared = group.shared
-    heading = shared.start[2]
-    ahead = shared.body.middle * jnp.stack([jnp.cos(heading), jnp.sin(heading)])
-    zero = jnp.zeros_like(shared.time)
-    return _Meeting(time=zero, position=shared.start[:2] + ahead, heading=heading, delay=zero)
+    zero, position = jnp.zeros_like(shared.time), shared.body.middle_at(shared.start)
+    return _Meeting(time=zero, position=position, heading=shared.start[2], delay=zero)
 
 
 def _timetable(group: InterceptGroup) -> tuple[Array, Array]:

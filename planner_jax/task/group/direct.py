@@ -83,7 +83,7 @@ class DirectGroup(Planner[InterceptGroup, GroupPlan]):
             begins = begins.at[k + 1].set(begin + plan.time)
             tries = tries.at[k].add(1).at[k + 1].set(0)
             toward = jnp.stack([jnp.cos(pose[2]), jnp.sin(pose[2])])
-            start = Departure(pose[:2] + shared.body.middle * toward, toward, begins[k + 1])
+            start = Departure(shared.body.middle_at(pose), toward, begins[k + 1])
             order = lax.cond(
                 is_good & (self.moves > 0),
                 lambda: improve(case, table, start, order, k + 1, self.moves),
@@ -127,7 +127,7 @@ class DirectGroup(Planner[InterceptGroup, GroupPlan]):
     ) -> InterceptPlan:
         """Plan the leg to `target` from starting point `trial`; `following` is -1 at the end."""
         shared, leg = group.shared, group.leg(target, begin, car)
-        here = _middle(leg, car.pose)
+        here = leg.body.middle_at(car.pose)
         path, later = (
             jax.tree.map(lambda x, k=k: x[k], shared.target) for k in (target, following)
         )
@@ -175,10 +175,6 @@ class DirectGroup(Planner[InterceptGroup, GroupPlan]):
         return dataclasses.replace(make_plan(leg, *motion, **checks), cost=plan.time)
 
 
-def _middle(case: InterceptCase, pose: Array) -> Array:
-    return pose[:2] + case.body.middle * jnp.stack([jnp.cos(pose[2]), jnp.sin(pose[2])])
-
-
 def _pursue(case: InterceptCase, speed: Array, side: Array, hold: Array) -> Array:
     """Return the unknowns (n,) of a motion that steers along arcs towards the target.
 
@@ -197,7 +193,7 @@ def _pursue(case: InterceptCase, speed: Array, side: Array, hold: Array) -> Arra
     def drive(state: tuple, k: Array) -> tuple[tuple, tuple[Array, Array]]:
         pose, v, c, is_met, time, nearest = state
         now = k * step
-        far = jnp.sqrt(jnp.sum((case.target.at(now).pos - _middle(case, pose)) ** 2) + 1e-6)
+        far = jnp.sqrt(jnp.sum((case.target.at(now).pos - case.body.middle_at(pose)) ** 2) + 1e-6)
         ahead = now + far / jnp.maximum(v, 0.5 * limits.speed * speed)
         goal = case.target.at(ahead).pos - (case.body.middle + hold * far) * end
         x, y = goal - pose[:2]
@@ -219,7 +215,7 @@ def _pursue(case: InterceptCase, speed: Array, side: Array, hold: Array) -> Arra
         between, length = 0.5 * (pose[2] + heading), 0.5 * (v + v1) * step
         move = [length * jnp.cos(between), length * jnp.sin(between), heading - pose[2]]
         pose = pose + jnp.stack(move)
-        gap = case.target.at(now + step).pos - _middle(case, pose)
+        gap = case.target.at(now + step).pos - case.body.middle_at(pose)
         miss = jnp.sqrt(jnp.sum(gap**2))
         is_nearer = ~is_met & (miss < nearest)
         is_met |= ~is_nearer & (nearest < length)

@@ -286,26 +286,23 @@ class MotionProblem:
         They follow the path, keep all limits, and reduce discomfort or meeting time. The settings
         `attempt` determine their numbers of steps, tolerances and margins.
         """
-        following, keeping, last = (
-            Stage(_FOLLOWING, attempt.following),
-            *self.list_last_stages(attempt),
-        )
-        if not self.is_time_free:
-            return [following, keeping, last]
-        late = jnp.asarray(attempt.is_late)
-        fixed = [
-            dataclasses.replace(each.weights, is_time_fixed=late) for each in (following, keeping)
-        ]
-        return [
-            dataclasses.replace(following, weights=fixed[0]),
-            dataclasses.replace(
+        following = Stage(_FOLLOWING, attempt.following)
+        keeping, last = self.list_last_stages(attempt)
+        if self.is_time_free:
+            late = jnp.asarray(attempt.is_late)
+            following, keeping = (
+                dataclasses.replace(
+                    each, weights=dataclasses.replace(each.weights, is_time_fixed=late)
+                )
+                for each in (following, keeping)
+            )
+            # At a fixed time the stage ends at the first point that keeps all limits.
+            keeping = dataclasses.replace(
                 keeping,
-                weights=fixed[1],
                 tolerance=jnp.where(late, 1.0, keeping.tolerance),
                 settled=jnp.where(late, 1, keeping.settled),
-            ),
-            last,
-        ]
+            )
+        return [following, keeping, last]
 
     def list_last_stages(self, attempt: Search | Warm) -> list[Stage]:
         """Return the last two stages: keep all limits, then reduce acceleration or meeting time."""

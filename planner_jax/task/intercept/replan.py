@@ -77,8 +77,8 @@ class ReplanIntercept(Planner[Replanning, InterceptPlan]):
             elapsed: () [s], time since the start of the plans, or (B,) for B cases.
             target: the expected path of the target; its time 0 is the moment of re-planning. By
                 default it is the path of the case.
-            walls: the static obstacles known at this moment, by `pj.obstacles`; by default those of
-                the cases.
+            walls: the static obstacles known at this moment, by `pj.obstacles`; by default the
+                walls of the cases.
             movers: the moving obstacles at this moment; by default the obstacles of the cases,
                 moved at their velocities.
             start: (3,) or (B, 3) x, y [m], heading [rad] of the rear axle; by default as planned.

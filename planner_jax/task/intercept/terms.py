@@ -353,8 +353,7 @@ def is_blocked(case: InterceptCase) -> tuple[Array, Array]:
     goal = case.target.at(case.time).pos
     first = jnp.zeros_like(case.time)[None]
     at_start = gaps(case, case.start[None, :2], case.start[2:], first)
-    direction = jnp.stack([jnp.cos(case.start[2]), jnp.sin(case.start[2])])
-    is_off = inside_map(case, case.start[:2] + case.body.middle * direction) < 0.0
+    is_off = inside_map(case, case.body.middle_at(case.start)) < 0.0
     both = join_obstacles(case.walls, case.movers)
     placed = place(both, case.time[None])
     local = placed.enter(goal[None, None, 0], goal[None, None, 1])
@@ -368,8 +367,7 @@ def is_blocked(case: InterceptCase) -> tuple[Array, Array]:
 
 def is_too_far(case: InterceptCase) -> Array:
     """Return whether the target is further away than any path of the car by the case's time."""
-    direction = jnp.stack([jnp.cos(case.start[2]), jnp.sin(case.start[2])])
-    middle = case.start[:2] + case.body.middle * direction
+    middle = case.body.middle_at(case.start)
     away, _ = nearest_in_region(case.region, middle - case.target.at(case.time).pos)
     # The middle of a turning body may drive further than the rear axle.
     across = case.body.middle * case.limits.curvature
