@@ -10,9 +10,9 @@ knots as further variables, and IPOPT solves it with exact second derivatives (e
 
 Of every obstacle the body's rectangle must keep `GRAZING` at `SAMPLES` times of each piece, or its
 distance at the start if that is less. The planner penalises distances below 3 cm, and its finished
-plans keep 5 mm. The distance of two convex polygons is at least the greatest gap along the normals
-of their edges. Since IPOPT needs smooth functions, a soft maximum replaces it, which is too great
-by at most log(2) / `SHARPNESS` = 1.7 mm if two gaps are equal.
+plans touch nothing. The distance of two convex polygons is at least the greatest gap along the
+normals of their edges. Since IPOPT needs smooth functions, a soft maximum replaces it, which is too
+great by at most log(2) / `SHARPNESS` = 1.7 mm if two gaps are equal.
 
 IPOPT starts where the planner starts: first from the direct motion to the target, then from --paths
 paths of reachable cells, up to the first plan that the referee accepts. Another row starts from the

@@ -9,8 +9,9 @@ from flax import struct
 import planner_jax as pj
 from planner_jax.plane.obstacles import place
 from planner_jax.plane.reach import Lattice
+from planner_jax.task.intercept.plan import make_plan
 from planner_jax.task.intercept.searches import Search
-from planner_jax.task.intercept.terms import nearest_in_region
+from planner_jax.task.intercept.terms import least_between, nearest_in_region
 
 SMALL = {"searches": (Search(2, lattice=Lattice(layers=20, headings=16), is_direct=True),)}
 BOX = np.array([[-1.0, -0.5], [1.0, -0.5], [1.0, 0.5], [-1.0, 0.5]])
@@ -183,3 +184,45 @@ def test_the_vector_from_a_region_is_exact_and_its_slope_is_the_derivative(float
 def test_a_wrong_argument_is_named(settings, says):
     with pytest.raises(ValueError, match=says):
         pj.intercept.case(Bare(jnp.zeros(2)), **settings)
+
+
+@pytest.mark.parametrize("size", [0.4, 4.5, 4500.0])
+def test_the_bound_between_samples_is_a_lower_bound_and_exact_for_a_dip(size):
+    # Distances |t - c| of points that pass each other, of which no sample shows the least one.
+    least = size * np.linspace(0.0, 0.9, 7)
+    dips = least[:, None] + size * np.abs(np.arange(9.0) - np.linspace(3.0, 4.0, 7)[:, None])
+    assert dips[3].min() > least[3] + 0.4 * size
+    np.testing.assert_allclose(least_between(jnp.asarray(dips)), least, atol=1e-5 * size)
+    # Distances of random points that pass each other, at fine times and at every 16th of them.
+    random = np.random.default_rng(0)
+    apart, velocity = random.normal(size=(2, 200, 2, 1))
+    fine = size * np.linalg.norm(apart + velocity * np.linspace(-2.0, 2.0, 16 * 40 + 1), axis=1)
+    bound = least_between(jnp.asarray(fine[:, ::16]))
+    assert (np.asarray(bound) <= fine.min(axis=1) + 1e-5 * size).all()
+    assert (np.asarray(bound) >= fine.min(axis=1) - 0.1 * size * np.abs(velocity).sum()).all()
+
+
+@pytest.mark.parametrize("size", [1.0, 11.25])
+@pytest.mark.parametrize("gap, is_solved", [(2e-3, True), (-2e-3, False)])
+def test_cars_of_any_size_may_pass_walls_and_thin_posts_closely(size, gap, is_solved):
+    # The car, `size` times 0.4 m long, drives straight on, past a wall and a thin post beside it.
+    side = 0.125 + gap
+    walls = [[[1.5, side], [2.5, side], [2.0, side + 0.5]], [[3.0, -side], [2.99, -2], [3.01, -2]]]
+    lengths = {"length": 0.4, "width": 0.25, "wheelbase": 0.3, "rear_overhang": 0.05}
+    case = pj.intercept.case(
+        pj.TurningPath(size * jnp.array([5.15, 0.0]), jnp.zeros(2), jnp.zeros(())),
+        start=(0.0, 0.0, 0.0),
+        initial_speed=0.5 * size,
+        walls=[size * np.array(wall) for wall in walls],
+        lower=-np.inf,
+        upper=np.inf,
+        **{name: size * value for name, value in lengths.items()},
+        speed=1.5 * size,
+        acceleration=size,
+        lateral_acceleration=0.8 * size,
+        curvature=2.0 / size,
+    )
+    speed, bend = jnp.full(33, 0.5 * size), jnp.zeros(33)
+    plan = make_plan(case, case.time, speed, bend, samples=16, points=4, steps=jnp.array(0))
+    assert (plan.status == pj.Status.CONVERGED) == is_solved
+    assert pj.intercept.judge(case, plan).success == is_solved

@@ -13,8 +13,6 @@ from planner_jax.robot.car_motion import motion
 from planner_jax.task.intercept import terms
 from planner_jax.task.intercept.case import InterceptCase
 
-_GRAZING = 5e-3  # [m], required clearance at samples, so that nothing is touched between samples
-
 
 @struct.dataclass
 class InterceptPlan(CarPlan):
@@ -39,14 +37,14 @@ def make_plan(
     the integral of the squared acceleration of [Qu2022, eq. 8a].
     Speed [m/s] and curvature [1/m] are the values at K + 1 equally spaced knots from time 0 to
     `time` () [s]. On each piece between two knots the distance from obstacles is checked at
-    `samples` positions, and the lateral acceleration at `points` positions. `steps` () int32 is the
-    number of iterations that the plan reports.
+    `samples` positions and, by a bound, between them, and the lateral acceleration at `points`
+    positions. `steps` () int32 is the number of iterations that the plan reports.
     """
     drive = motion(case.start, time, speed, curvature, samples)
     weights = terms.Weights()
     _, violation, discomfort = terms.limit_terms(case, time, speed, curvature, weights, points)
     _, missed = terms.meeting_terms(case, drive, time, weights)
-    too_close = (_GRAZING - jnp.min(terms.clearance(case, drive))) / case.body.width
+    too_close = -jnp.min(terms.clearance(case, drive)) / case.body.width
     worst = jnp.maximum(jnp.maximum(violation, missed), too_close)
     return InterceptPlan(
         cost=discomfort,
