@@ -256,7 +256,7 @@ class Lattice:
         walls = self.walls[heading]
         return walls ^ (walls & blocked)
 
-    def _goal(self, layer: int) -> list[int]:
+    def goal(self, layer: int) -> list[int]:
         scene = self.scene
         reach = scene.tolerance + CELL * np.sqrt(0.5)
         place = (scene.target[layer] - self.origin - scene.middle * self.direction) / CELL
@@ -286,15 +286,15 @@ class Lattice:
         for layer in range(self.layers):
             planes = self._move(planes, 2 * layer)
             planes = [
-                [a | b | c for a, b, c in zip(*self._neighbours(planes, k), strict=True)]
+                [a | b | c for a, b, c in zip(*self.neighbours(planes, k), strict=True)]
                 for k in range(num)
             ]
             turns = self.turns[layer]
-            planes = [_spread(row, turn) for row, turn in zip(planes, turns, strict=True)]
+            planes = [spread(row, turn) for row, turn in zip(planes, turns, strict=True)]
             planes = self._move(planes, 2 * layer + 1)
             yield planes
 
-    def _neighbours(self, planes: list[list[int]], k: int) -> list[list[int]]:
+    def neighbours(self, planes: list[list[int]], k: int) -> list[list[int]]:
         last = len(planes) - 1
         return [planes[max(k - 1, 0)], planes[k], planes[min(k + 1, last)]]
 
@@ -318,7 +318,7 @@ class Lattice:
         A state is (bit of the cell, index of the speed level, index of the heading). At most one
         state is returned for each speed level and heading.
         """
-        goal = self._goal(layer)
+        goal = self.goal(layer)
         found = [
             (plane & goal[heading], level, heading)
             for level, row in enumerate(planes)
@@ -393,7 +393,7 @@ def shift_bits(plane: int, shift: int) -> int:
     return plane << shift if shift >= 0 else plane >> -shift
 
 
-def _spread(row: list[int], turn: int) -> list[int]:
+def spread(row: list[int], turn: int) -> list[int]:
     # row[h] is the set of cells with heading h; spread[h] unites row[h] to row[h + width - 1].
     target, width, spread = 2 * turn + 1, 1, row
     while width < target:

@@ -1,7 +1,7 @@
 """Measure which interceptions of a suite are feasible, and how early their targets can be met.
 
     python -m benchmarks.intercept_oracle [--suite hard] [--num 200] [--seed 1] [--first 0]
-        [--planner spacetime] [--failed | --early] [--workers N] [--out FILE.npz]
+        [--planner spacetime] [--failed | --early] [--steering N] [--workers N] [--out FILE.npz]
 
 A car must meet a moving target among obstacles. Three searches determine for each case whether the
 target can be met at the case's time. They divide time into layers of 0.25 s, and also find the
@@ -31,9 +31,18 @@ by the referee, an independent check in float64. With --failed only cases that t
 solve are searched. This gives the same success rate in much less time. With --early the default
 planner also plans to meet every target as early as possible, and its times are compared with the
 earliest meetings of `strict`.
+
+The cars of `strict` need no time to steer, so a motion that it finds may be infeasible. With
+--steering the cases that `strict` reaches and the planner does not solve are searched again, with
+the steering angle as a part of the state (`intercept_steering`). A motion that this search finds is
+accepted by the referee, and proves that the planner failed. If the search finds none, the case is
+very likely infeasible. As a check, the search also runs on the first N cases that the planner
+solves. With --early, the search determines when the late plans could have met their targets, and is
+checked at the times of the first N other plans.
 """
 
 import argparse
+import dataclasses
 import multiprocessing
 import os
 import time
@@ -48,6 +57,7 @@ import planner_jax as pj
 from planner_jax.benchmarks.intercept_bound import earliest_bound
 from planner_jax.benchmarks.intercept_departure import departs
 from planner_jax.benchmarks.intercept_lattice import LAYER, MINIMAL, STRICT, Lattice, Scene
+from planner_jax.benchmarks.intercept_steering import STEP, find_plan
 from planner_jax.benchmarks.run import Bench, at_least
 from planner_jax.plane.obstacles import Obstacles
 from planner_jax.plane.target import PlanePath
@@ -59,10 +69,13 @@ from planner_jax.task.intercept.spec import SUITES, TASK
 SEARCHES = ("bound", "minimal", "strict")
 
 
-def scenes(cases: InterceptCase) -> list[Scene]:
-    """Convert cases to scenes: plain numbers, with the target's position at each time step."""
+def scenes(cases: InterceptCase, layer: float = LAYER) -> list[Scene]:
+    """Convert cases to scenes: plain numbers, with the target's position at each time step.
+
+    A time step is at most `layer` [s] long.
+    """
     ends = np.asarray(cases.time, float)
-    layers = np.maximum(np.ceil(ends / LAYER - 1e-6), 1).astype(int)
+    layers = np.maximum(np.ceil(ends / layer - 1e-6), 1).astype(int)
     times = ends[:, None] / layers[:, None] * np.arange(layers.max() + 1)
     with jax.enable_x64(True):
         cases = jax.tree.map(
@@ -217,10 +230,59 @@ def compare(bench: Bench, index: np.ndarray, reached: np.ndarray, solved: np.nda
     bench.count(solved)
 
 
-def report_early(bench: Bench, cases: InterceptCase, earliest: np.ndarray) -> None:
+def can_steer(cases: InterceptCase, which: np.ndarray, times: np.ndarray) -> np.ndarray:
+    """Return for M cases whether a car with a limited steering rate can meet the target, (M,) bool.
+
+    `which` (M,) has the indices of the cases, and `times` (M,) [s] the times of the meetings.
+    """
+    if not which.size:
+        return np.zeros(0, bool)
+    chosen = dataclasses.replace(jax.tree.map(np.asarray, pj.take(cases, which)), time=times)
+    return np.array(
+        [
+            find_plan(jax.tree.map(lambda leaf, k=k: leaf[k], chosen), scene) is not None
+            for k, scene in enumerate(tqdm(scenes(chosen, STEP), unit="case"))
+        ]
+    )
+
+
+def report_steering(
+    bench: Bench,
+    cases: InterceptCase,
+    first: int,
+    open_cases: np.ndarray,
+    solved: np.ndarray,
+    num: int,
+) -> None:
+    """Print the share of the cases feasible with a limited steering rate that the planner solves.
+
+    Of B cases, `solved` (B,) bool are solved by the planner, and the others with the indices
+    `open_cases` are reached by the search `strict`, which ignores the steering rate. The search
+    with this limit runs on the cases `open_cases`, and as a check on the first `num` solved cases.
+    `first` is the number of the first case in the suite.
+    """
+    checked, times = np.flatnonzero(solved)[:num], np.asarray(cases.time, float)
+    found = can_steer(cases, open_cases, times[open_cases])
+    known = int(can_steer(cases, checked, times[checked]).sum())
+    good, feasible = int(solved.sum()), int(solved.sum() + found.sum())
+    low, high = wilson_interval(good, feasible)
+    bench.say(
+        "",
+        f"With a limited steering rate: the planner solves {percent(good, feasible)} % of the "
+        f"{feasible} feasible cases (95 % interval {100 * low:.1f} to {100 * high:.1f} %). "
+        f"Feasible and not solved: {format_indices(first + open_cases[found])}. No motion found: "
+        f"{format_indices(first + open_cases[~found])}. As a check, the search finds a motion in "
+        f"{known} of {len(checked)} cases that the planner solves.",
+    )
+    bench.note(of_feasible_with_steering=good / max(feasible, 1), steering_check=known)
+
+
+def report_early(bench: Bench, cases: InterceptCase, earliest: np.ndarray, num: int | None) -> None:
     """Plan B cases to meet the target as soon as possible, and print how early the plans are.
 
     `earliest` (B,) [s] has the earliest meetings of the exhaustive search `strict`, for comparison.
+    If `num` is not None, later plans are compared with the search that has a limited steering rate,
+    too. As a check, this search runs at the meeting times of the first `num` other plans.
     """
     plans = pj.plan(pj.intercept.planner(meet="early"), cases)
     solved = np.asarray(pj.intercept.judge(cases, plans).success)
@@ -234,6 +296,25 @@ def report_early(bench: Bench, cases: InterceptCase, earliest: np.ndarray) -> No
         f"{percent(soon, int(reached.sum()))} % of the {reached.sum()} that the lattice reaches.",
     )
     bench.note(early_median=float(np.median(met)), early_share=soon / max(int(reached.sum()), 1))
+    if num is None:
+        return
+    is_late, sooner = reached & (met > earliest + LAYER), np.full(len(met), np.inf)
+    for k in np.flatnonzero(is_late):
+        for at in np.arange(earliest[k], min(met[k], float(cases.time[k])) - LAYER, STEP):
+            if can_steer(cases, np.array([k]), np.array([at]))[0]:
+                sooner[k] = at
+                break
+    checked = np.flatnonzero(reached & ~is_late)[:num]
+    known = int(can_steer(cases, checked, met[checked]).sum())
+    soon = int((reached & np.isinf(sooner)).sum())
+    bench.say(
+        "",
+        f"With a limited steering rate: {percent(soon, int(reached.sum()))} % of these plans meet "
+        f"at most {LAYER:g} s after the earliest motion that was found. Later plans: "
+        f"{format_indices(np.flatnonzero(np.isfinite(sooner)))}. As a check, the search finds a "
+        f"motion at the times of {known} of {len(checked)} plans.",
+    )
+    bench.note(early_share_with_steering=soon / max(int(reached.sum()), 1), steering_check=known)
 
 
 def main() -> None:
@@ -247,6 +328,12 @@ def main() -> None:
     add("--planner", choices=TASK.planners, default="spacetime", help="default: spacetime")
     add("--failed", action="store_true", help="search only cases that the planner does not solve")
     add("--early", action="store_true", help="also plan to meet as early as possible")
+    add(
+        "--steering",
+        type=at_least(0),
+        metavar="N",
+        help="also search with a limited steering rate, and check this search on N cases",
+    )
     add(
         "--workers",
         type=at_least(1),
@@ -277,10 +364,13 @@ def main() -> None:
             bench.say("")
             report(bench, index, at_end, earliest)
         if options.early:
-            report_early(bench, cases, earliest[:, SEARCHES.index("strict")])
+            report_early(bench, cases, earliest[:, SEARCHES.index("strict")], options.steering)
         reached = solved.copy()
         reached[searched] = at_end[:, SEARCHES.index("strict")]
         compare(bench, options.first + drawn, reached, solved)
+        if options.steering is not None and not options.early:
+            open_cases = np.flatnonzero(reached & ~solved)
+            report_steering(bench, cases, options.first, open_cases, solved, options.steering)
         found: dict[str, np.ndarray] = {}
         found |= {f"{name}_at_end": at_end[:, k] for k, name in enumerate(SEARCHES)}
         found |= {f"{name}_earliest": earliest[:, k] for k, name in enumerate(SEARCHES)}

@@ -10,6 +10,7 @@ from planner_jax.benchmarks.intercept_bound import earliest_bound
 from planner_jax.benchmarks.intercept_departure import departs
 from planner_jax.benchmarks.intercept_lattice import CELL, HEADINGS, LAYER, MINIMAL, STRICT, Lattice
 from planner_jax.benchmarks.intercept_oracle import scenes, search
+from planner_jax.benchmarks.intercept_steering import STEP, find_plan
 from planner_jax.referee.clearance import clearances
 
 START, SPEED, TOP, ACCELERATION, MIDDLE, TOLERANCE = (0.8, 4.0, 0.0), 0.5, 1.5, 1.0, 0.15, 0.05
@@ -170,3 +171,23 @@ def test_near_a_target_it_suffices_to_touch_nothing(ahead, lives):
     front = START[0] + MIDDLE + 0.2
     near = scene((1.5, 4.0), time=2.0, walls=[box(front + ahead, 2.0, front + ahead + 0.2, 6.0)])
     assert departs(replace(near, initial_speed=0.5)) == lives
+
+
+@pytest.mark.parametrize(("rate", "is_feasible"), [(2.0, True), (0.1, False)])
+def test_a_car_with_quick_steering_turns_in_time_and_with_slow_steering_does_not(rate, is_feasible):
+    # In 2 s the car must turn by about 55 degrees. At 0.1 rad/s it turns by 25 degrees.
+    case = pj.intercept.case(
+        pj.TurningPath(jnp.array([1.75, 4.55]), jnp.zeros(2), jnp.zeros(())),
+        2.0,
+        start=START,
+        initial_speed=SPEED,
+        speed=0.6,
+        steering_rate=rate,
+    )
+    cases = jax.tree.map(lambda leaf: np.asarray(leaf)[None], case)
+    assert Lattice(scenes(cases)[0], STRICT).reach().at_end
+    plan = find_plan(jax.tree.map(np.asarray, case), scenes(cases, STEP)[0])
+    assert (plan is not None) == is_feasible
+    if plan is not None:
+        assert pj.intercept.judge(case, plan).success
+        assert np.diff(plan.curvature).max() > 0.0
