@@ -102,6 +102,12 @@ FIRST = (
 )
 
 
+def pytest_ignore_collect(collection_path, config):
+    """Do not import modules in SLOW if the slow tests are deselected; paths named by a user are."""
+    is_slow = collection_path.stem.removeprefix("test_") in SLOW
+    return True if is_slow and "not slow" in config.option.markexpr else None
+
+
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items):
     """Mark tests of modules in SLOW as slow, and move tests of modules in FIRST to the front."""

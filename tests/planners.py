@@ -152,7 +152,8 @@ def block(name, suite="pole", **options):
 
 
 BY_NET = {"of": lambda plan: plan.times[-1], "by": "net"}
-ONE_SEARCH = (Search(1, LevenbergConfig(2), lattice=Lattice(layers=20, headings=16)),)
+# test_intercept and the contract's tests of interceptions share one compiled program.
+ONE_SEARCH = (Search(12, lattice=Lattice(layers=22)),)
 ENTRIES = {
     "hit exact": hit("exact", {"of": "cost", "by": "racket_height", "steps": 0}, **SHORT, **NONE),
     "hit bat": hit("bat", {"of": "cost", "by": ["target", "gravity"]}, nodes=6, **NONE),
@@ -166,7 +167,7 @@ ENTRIES = {
         "mpp", "parabola2", None, decide=pj.catch.Best(finalists=2), speeds=(0.0, 1.0), nodes=6
     ),
     "intercept spacetime": drive(
-        pj.intercept.planner(pieces=6, samples=2, checked=2, searches=ONE_SEARCH),
+        pj.intercept.planner(searches=ONE_SEARCH),
         {"of": "cost", "by": "time", "steps": 0},
     ),
     "intercept lattice": path_then_speed("lattice"),

@@ -28,7 +28,10 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize(("name", "given"), [("catch", 4), ("extra", 0), ("extra", 4)])
+@pytest.mark.parametrize(
+    ("name", "given"),
+    [("catch", 4), ("extra", 0), pytest.param("extra", 4, marks=pytest.mark.slow)],
+)
 def test_all_derivatives_are_those_of_the_integrated_penalties(name, given):
     with jax.enable_x64(True):
         case = double(pj.take(CASES[name](), 0))

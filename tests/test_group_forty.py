@@ -14,6 +14,8 @@ from planner_jax.task.group.order import Departure, end_times, improve, make_tab
 from planner_jax.task.group.suites import WIDE
 from tests.trees import as_numpy
 
+tables, ends_of = jax.jit(make_table), jax.jit(end_times, static_argnums=4)
+
 
 def few(group, num):
     target = jax.tree.map(lambda leaf: leaf[:num], group.shared.target)
@@ -54,30 +56,30 @@ def test_a_point_meets_a_target_where_both_arrive():
 
 def test_estimated_ends_are_those_of_drives_one_after_another():
     group = few(pj.take(pj.group.draw(1, "forty", 2), 0), 5)
-    table, start, speed = make_table(group), departure(group), group.shared.limits.speed
+    table, start, speed = tables(group), departure(group), group.shared.limits.speed
     straight = dataclasses.replace(table, delay=jnp.float32(0.0))
     orders = jnp.array([[0, 1, 2, 3, 4], [3, 1, 0, 4, 2]])
-    ends = end_times(group, straight, start, orders, 0)
+    ends = ends_of(group, straight, start, orders, 0)
     for order, end in zip(np.asarray(orders), ends, strict=True):
         at, place = jnp.float32(0.0), start.position
         for target in order:
             path = jax.tree.map(lambda leaf, k=target: leaf[k], group.shared.target)
             at, place = meet(path, place, at, speed)
         np.testing.assert_allclose(end, at, rtol=5e-3)
-    assert (end_times(group, table, start, orders, 0) > ends).all()
+    assert (ends_of(group, table, start, orders, 0) > ends).all()
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_the_search_of_orders_is_near_the_best_of_all(seed):
     group = few(pj.take(pj.group.draw(1, "forty", seed), 0), 6)
-    table, start = make_table(group), departure(group)
+    table, start = tables(group), departure(group)
     orders = jnp.array(list(itertools.permutations(range(6))))
-    every = end_times(group, table, start, orders, 0)
+    every = ends_of(group, table, start, orders, 0)
     ends = {}
     for decision in (Greedy(), Search()):
         order = first_choice(decision, group).order
         assert sorted(order.tolist()) == list(range(6))
-        ends[type(decision)] = float(end_times(group, table, start, order[None], 0)[0])
+        ends[type(decision)] = float(ends_of(group, table, start, order[None], 0)[0])
     assert every.min() - 1e-3 <= ends[Search] <= 1.1 * every.min()
     assert ends[Search] <= ends[Greedy] + 1e-3
 
@@ -88,7 +90,7 @@ def test_a_search_keeps_the_front_of_an_order_and_absent_targets_last():
     order = first_choice(Search(), group).order.tolist()
     assert order[-1] == 2 and sorted(order) == list(range(6))
     given = jnp.array([4, 0, 5, 1, 3, 2])
-    better = improve(group, make_table(group), departure(group), given, 2, 10).tolist()
+    better = improve(group, tables(group), departure(group), given, 2, 10).tolist()
     assert better[:2] == [4, 0] and better[-1] == 2
 
 

@@ -10,15 +10,14 @@ import planner_jax as pj
 from planner_jax.benchmarks.latency import begin_replans
 from planner_jax.cli.compilation import record_programs
 from planner_jax.optimise.levenberg import LevenbergConfig
-from planner_jax.plane.reach import Lattice
 from planner_jax.robot.car import pose_at
 from planner_jax.robot.car_motion import Quadratic, by_unknowns, motion
-from planner_jax.task.intercept.searches import Search, make_field, make_grid
+from planner_jax.task.intercept.searches import make_field, make_grid
 from planner_jax.task.intercept.terms import Weights
+from tests.planners import ONE_SEARCH
 
 # Planners in these tests make one search, so that only one program is compiled.
-SEARCHES = (Search(12, lattice=Lattice(layers=22)),)
-PLANNER = pj.intercept.planner(searches=SEARCHES)
+PLANNER = pj.intercept.planner(searches=ONE_SEARCH)
 START = np.array([0.8, 4.0, 0.3])
 WALL = [[3.9, -0.5], [4.1, -0.5], [4.1, 8.5], [3.9, 8.5]]
 HALF = [[3.9, -0.5], [4.1, -0.5], [4.1, 5.5], [3.9, 5.5]]
@@ -109,7 +108,7 @@ def test_the_gradient_of_the_cost_matches_finite_differences(knots, float64, mee
     case = case.replace(end_heading=jnp.array(2.0), heading_tolerance=jnp.array(0.1))
     planner = pj.intercept.planner(pieces=8, meet=meet)
     problem = planner.problem
-    grid = jax.jit(lambda case: make_grid(case, SEARCHES[0].lattice, is_time_free=False))(case)
+    grid = jax.jit(lambda case: make_grid(case, ONE_SEARCH[0].lattice, is_time_free=False))(case)
     field = jax.jit(make_field)(case, grid)
     positions = np.random.default_rng(3).uniform(1.0, 7.0, (8, 2))
     given = case, field, Weights(follow=1.0), positions
@@ -260,7 +259,7 @@ def test_other_numbers_of_obstacles_and_corners_compile_nothing(scenes):
 @pytest.fixture(scope="module")
 def early():
     batch = stack([scene((5.0, 5.0)), scene((6.0, 4.0), [HALF]), scene((6.0, 4.0), [WALL])])
-    search = dataclasses.replace(SEARCHES[0], solver=LevenbergConfig(40))
+    search = dataclasses.replace(ONE_SEARCH[0], solver=LevenbergConfig(40))
     return batch, pj.plan(pj.intercept.planner(meet="early", searches=(search,)), batch)
 
 

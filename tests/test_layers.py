@@ -1,5 +1,6 @@
 """No module imports a package that comes later in the list of layers, `LAYERS`."""
 
+import functools
 import sys
 
 import layers
@@ -7,7 +8,11 @@ import pytest
 from layers import BY_NAME, LAYERS, OUTSIDE, ROOT, package_of
 
 PALLAS = ROOT / "planner_jax" / "lanes" / "pallas.py"
-IMPORTS = [found for path in layers.list_modules() for found in layers.read_imports(path)]
+
+
+@functools.cache
+def list_imports():
+    return [found for path in layers.list_modules() for found in layers.read_imports(path)]
 
 
 def top_of(found):
@@ -42,7 +47,7 @@ OFFENDERS = {
 
 @pytest.mark.parametrize("rule", OFFENDERS)
 def test_no_import_breaks_a_rule(rule):
-    assert [str(found) for found in IMPORTS if OFFENDERS[rule](found)] == []
+    assert [str(found) for found in list_imports() if OFFENDERS[rule](found)] == []
 
 
 def test_imports_are_found_wherever_and_however_they_are_written():
@@ -73,7 +78,7 @@ PLANNERS = {"mine": "planner_jax.live.loop:Live", "text": "See planner_jax.live.
 
 def test_only_declared_packages_are_named_in_strings():
     named = {}
-    for found in IMPORTS:
+    for found in list_imports():
         if found.is_string and found.package != package_of(found.path):
             if LAYERS.index(found.package) > LAYERS.index(package_of(found.path)):
                 named.setdefault(package_of(found.path), set()).add(found.package)

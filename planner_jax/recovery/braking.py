@@ -163,10 +163,13 @@ def _arm_problem(case: PyTree, pieces: np.ndarray, times: np.ndarray) -> str:
     joint = int(beyond.argmax())
     if beyond[joint] > 0.0:
         return f"position: joint {joint + 1} is {beyond[joint]:.3g} rad beyond its limit"
-    gap = float(np.min(case.clearances(jnp.asarray(angles, jnp.float32))))
+    gap = float(np.min(_clearances(case, np.asarray(angles, np.float32))))
     return (
         "" if gap >= _GAP else f"clearance: the arm is {gap:.3g} m from an obstacle or from itself"
     )
+
+
+_clearances = jax.jit(lambda case, angles: case.clearances(angles))
 
 
 def _change(kind: type[PlanT], plan: PlanT, **fields: Any) -> PlanT:
