@@ -26,10 +26,9 @@ from tests.derivatives import double
 SMALL = OnlineBlock(
     pieces=6, points=10, searches=(Search(straight=12, tries=3, solver=LevenbergConfig(8)),)
 )
-# Planners that try only straight motions of the joints. Their programs for a single case compile
+# A planner that tries only straight motions of the joints. Its program for a single case compiles
 # much faster than a program for a batch.
-STRAIGHT = dataclasses.replace(SMALL, searches=(Search(straight=60, tries=0),))
-BRISK = dataclasses.replace(STRAIGHT, brisk=True)
+BRISK = dataclasses.replace(SMALL, searches=(Search(straight=60, tries=0),), brisk=True)
 
 
 def throw(**options):
@@ -230,11 +229,8 @@ def test_plans_of_a_batch_say_what_became_of_each_ball():
 def test_brisk_motions_end_before_the_ball_is_there():
     cases = jax.tree.map(np.array, pj.block.draw(8, seed=8))
     cases.ends_at_rest[4] = False
-    singles = [pj.take(cases, k) for k in range(8)]
-    plans, quick = (
-        jax.tree.map(lambda *leaves: np.stack(leaves), *(pj.plan(each, case) for case in singles))
-        for each in (STRAIGHT, BRISK)
-    )
+    plans, singles = pj.plan(SMALL, cases), [pj.plan(BRISK, pj.take(cases, k)) for k in range(8)]
+    quick = jax.tree.map(lambda *leaves: np.stack(leaves), *singles)
     some = pj.are_solved(quick)
     np.testing.assert_array_equal(some, pj.are_solved(plans))
     assert some.sum() >= 4 and some[4]

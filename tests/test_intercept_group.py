@@ -16,6 +16,7 @@ from planner_jax.planning.decided import first_choice
 from planner_jax.robot.car import pose_at
 from planner_jax.sweep.intercept.settings import GroupSettings
 from planner_jax.sweep.run import start_sweep
+from planner_jax.sweep.sweep import Sweep
 from planner_jax.task.group.case import CarState
 from planner_jax.task.group.decide import Best, Given, Greedy
 from planner_jax.task.group.spec import SUITES, TASK
@@ -208,6 +209,7 @@ def test_the_referee_rejects_a_plan_with_a_wrong_leg(planned):
 def test_a_sweep_of_groups_has_a_row_for_every_group(monkeypatch, tmp_path):
     small = {"decide": "greedy", "planner": LEGS, "patient": LEGS}
     monkeypatch.setattr(GroupSettings, "planner_options", lambda self: small)
+    monkeypatch.setattr(Sweep, "other_planners", lambda *_: {})
     settings = GroupSettings(num=2, seed=4, batch=2, decide="greedy")
     start_sweep(TASK, settings, tmp_path / "run", progress=False)
     rows = pq.read_table(tmp_path / "run" / "plans")

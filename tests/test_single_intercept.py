@@ -67,8 +67,8 @@ def test_the_command_writes_plan_setpoints_and_picture(tmp_path, capsys):
 
 
 def test_a_target_out_of_reach_is_reported_with_the_limit_that_fails(tmp_path, capsys):
-    path = write_case(tmp_path, time=0.5)
-    assert main(["plan", "intercept", "--map", str(path), "--planner", "quick"]) == 1
+    path = write_case(tmp_path, target={"position": [7.5, 4.6]}, time=0.5)
+    assert main(["plan", "intercept", "--map", str(path)]) == 1
     printed = capsys.readouterr().out
     assert printed.startswith("No plan that keeps every limit was found.")
     assert "Referee on the best plan found: " in printed
