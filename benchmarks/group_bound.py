@@ -18,9 +18,12 @@ visit earns a price lambda_j of either sign (a Lagrangian relaxation). For any p
     min over walks of (end time - sum of earned prices) + sum of all prices
 
 is a lower bound, because a walk that visits every target once earns exactly the sum of all prices.
-Walks that return to a target directly after one other target are left out, as no tour is such a
-walk. The minimum over walks is found by dynamic programming; the prices are
-raised for targets that the best walk leaves out, and lowered for targets that it repeats.
+A walk remembers some of the targets that it has visited, and does not return to them (an ng-route
+[Baldacci2011]): at target j it remembers j, and those targets near j that it remembered at the
+target before. No tour returns to a target, so that every tour still is such a walk. The minimum
+over walks is found by dynamic programming over time steps, targets and remembered targets; the
+prices are raised for targets that the best walk leaves out, and lowered for targets that it
+repeats.
 """
 
 import numba
@@ -53,69 +56,87 @@ def _arrivals(places, travel, slack):  # pragma: no cover
     return found
 
 
-@numba.njit(cache=True)
-def _insert(value, before, origin, k, j, values, befores, origins):  # pragma: no cover
-    """Store a label if it is one of the two best with different targets before; say if it is."""
-    if value >= values[k, j, 0] - 1e-9:
-        if before == befores[k, j, 0] or value >= values[k, j, 1] - 1e-9:
-            return False
-        slot = 1
-    else:
-        if before != befores[k, j, 0]:
-            values[k, j, 1] = values[k, j, 0]
-            befores[k, j, 1] = befores[k, j, 0]
-            origins[k, j, 1] = origins[k, j, 0]
-        slot = 0
-    values[k, j, slot], befores[k, j, slot], origins[k, j, slot] = value, before, origin
-    return True
+def _nearest(places: np.ndarray, size: int) -> np.ndarray:
+    """Return the `size` targets nearest to each target at the start of each step, (T, N, size)."""
+    apart = np.linalg.norm(places[:, None, :-1] - places[None, :, :-1], axis=3)  # (N, N, T)
+    apart[np.arange(len(places)), np.arange(len(places))] = np.inf
+    return np.ascontiguousarray(np.argsort(apart, axis=1)[:, :size].transpose(2, 0, 1))
 
 
 @numba.njit(cache=True)
-def _best_walk(first, arrivals, prices, step):  # pragma: no cover
+def _remember(known, near):  # pragma: no cover
+    """Return which targets `near` (size,) are in the set `known` of targets; sets are bits."""
+    memory = 0
+    for bit in range(near.size):
+        memory |= (known >> near[bit] & 1) << bit
+    return memory
+
+
+@numba.njit(cache=True)
+def _best_walk(first, arrivals, near, prices, step):  # pragma: no cover
     """Return the least end time minus prices over walks, and the visits (N,) of the best walk."""
-    steps, num = arrivals.shape[0], arrivals.shape[1]
-    values = np.full((steps + 1, num, 2), _NEVER)
-    befores = np.full((steps + 1, num, 2), -1, np.int32)
-    origins = np.full((steps + 1, num, 2), -1, np.int64)
+    steps, num, size = arrivals.shape[0], arrivals.shape[1], 2 ** near.shape[2]
+    values = np.full((steps, num, size), _NEVER)
+    origins = np.full((steps, num, size), -1, np.int64)
     for j in range(num):
         if first[j] < steps:
-            _insert(-prices[j], num, -1, first[j], j, values, befores, origins)
-    least, end = _NEVER, -1
+            values[first[j], j, 0] = -prices[j]
+    least, end = _NEVER, np.int64(-1)
     visits = np.zeros(num)
     for k in range(steps):
-        for i in range(num):
-            for slot in range(2):
-                if k > 0 and values[k - 1, i, slot] < _NEVER:
-                    value, before = values[k - 1, i, slot], befores[k - 1, i, slot]
-                    _insert(value, before, origins[k - 1, i, slot], k, i, values, befores, origins)
         # Drives that end in the step in which they start improve labels of this step again. No tour
         # has more than N of them.
         is_open, passes = True, 0
+        done = np.full((num, size), _NEVER)
         while is_open and passes < num:
             is_open, passes = False, passes + 1
             for i in range(num):
-                if values[k, i, 0] >= _NEVER:
-                    continue
-                for j in range(num):
-                    there = arrivals[k, i, j]
-                    if j == i or there >= steps:
+                for m in range(size):
+                    value = values[k, i, m]
+                    if value >= done[i, m]:
                         continue
-                    slot = 1 if befores[k, i, 0] == j else 0
-                    value = values[k, i, slot]
-                    if value < _NEVER:
-                        origin = (np.int64(k) * num + i) * 2 + slot
-                        value -= prices[j]
-                        is_new = _insert(value, i, origin, there, j, values, befores, origins)
-                        is_open |= is_new and there == k
+                    done[i, m] = value
+                    known, is_useful = np.int64(1) << i, True
+                    for bit in range(near.shape[2]):
+                        if m >> bit & 1:
+                            known |= np.int64(1) << near[k, i, bit]
+                            # A walk that remembers less and costs less may do all that this does.
+                            is_useful &= values[k, i, m ^ (1 << bit)] > value
+                    if not is_useful:
+                        continue
+                    origin = (np.int64(k) * num + i) * size + m
+                    for j in range(num):
+                        there = arrivals[k, i, j]
+                        if there >= steps or known >> j & 1:
+                            continue
+                        memory = _remember(known, near[there, j])
+                        new = value - prices[j]
+                        if new < values[there, j, memory] - 1e-9:
+                            values[there, j, memory] = new
+                            origins[there, j, memory] = origin
+                            is_open |= there == k
         for i in range(num):
-            if values[k, i, 0] < _NEVER and k * step + values[k, i, 0] < least:
-                least, end = k * step + values[k, i, 0], (np.int64(k) * num + i) * 2
+            for m in range(size):
+                value = values[k, i, m]
+                if value >= _NEVER:
+                    continue
+                if k * step + value < least:
+                    least, end = k * step + value, (np.int64(k) * num + i) * size + m
+                if k + 1 < steps:  # the walk may wait
+                    known = np.int64(0)
+                    for bit in range(near.shape[2]):
+                        if m >> bit & 1:
+                            known |= np.int64(1) << near[k, i, bit]
+                    memory = _remember(known, near[k + 1, i])
+                    if value < values[k + 1, i, memory]:
+                        values[k + 1, i, memory] = value
+                        origins[k + 1, i, memory] = origins[k, i, m]
     for _ in range(4 * num):  # the walk only guides the prices, so that it may be cut
         if end < 0:
             break
-        k, i, slot = end // 2 // num, end // 2 % num, end % 2
+        k, i, m = end // size // num, end // size % num, end % size
         visits[i] += 1
-        end = origins[k, i, slot]
+        end = origins[k, i, m]
     return least, visits
 
 
@@ -125,10 +146,13 @@ def bound_end_time(
     start: np.ndarray,
     tolerance: float,
     step: float,
-    upper: float,
-    rounds: int = 300,
+    rounds: int = 80,
+    near: int = 6,
 ) -> float:
     """Return a lower bound [s] on the time when a car has met N targets.
+
+    The bound is at most the end of the last step, because later walks are not evaluated. It is best
+    if the T steps end between the true bound and the end of a known plan.
 
     Args:
         places: (N, T + 1, 2) [m], positions of the targets at the ends of T time steps.
@@ -136,12 +160,15 @@ def bound_end_time(
         start: (2,) [m], middle of the car at time 0.
         tolerance: [m], of a meeting.
         step: [s], duration of a time step.
-        upper: [s], end time of a known plan, at most T steps, which scales the changes of prices.
         rounds: number of changes of the prices.
+        near: number of targets near a target that a walk can remember there.
 
     Raises:
-        ValueError: a target is faster than the car, for which the bound is not proved.
+        ValueError: a target is faster than the car, for which the bound is not proved; or there are
+            more than 62 targets, whose sets would not fit into 64 bits.
     """
+    if len(places) > 62:
+        raise ValueError("more than 62 targets")
     moved = np.linalg.norm(np.diff(places, axis=1), axis=2).max(axis=0)
     if (moved > np.diff(travel) + 1e-9).any():
         raise ValueError("a target is faster than the car")
@@ -149,12 +176,14 @@ def bound_end_time(
     far = np.linalg.norm(places[:, 1:] - start, axis=2) - tolerance
     meets = far <= travel[1:]
     first = np.where(meets.any(axis=1), meets.argmax(axis=1), len(travel) - 1)
-    prices, best = np.full(len(places), 0.2 * upper / len(places)), 0.0
+    nearest = _nearest(places, min(near, len(places) - 1))
+    horizon = step * arrivals.shape[0]
+    prices, best = np.full(len(places), 0.8 * horizon / len(places)), 0.0
     for size in np.geomspace(1.0, 0.02, rounds):
-        least, visits = _best_walk(first, arrivals, prices, step)
+        least, visits = _best_walk(first, arrivals, nearest, prices, step)
         value, lack = least + prices.sum(), 1.0 - visits
         best = max(best, value)
         if not lack.any():
             break
-        prices = prices + size * max(upper - value, 0.01 * upper) / (lack @ lack) * lack
-    return best
+        prices = prices + size * max(horizon - value, 0.01 * horizon) / (lack @ lack) * lack
+    return min(best, horizon)

@@ -49,6 +49,7 @@ DECISIONS = {
     "random": "given",
 }
 FORTY_STEP = 0.2  # [s] Time step of the lower bound for 40 targets.
+FORTY_SHARE = 0.6  # End of the bound's last time step, divided by the end time of the plan.
 STEP = 0.005  # [s] Time step of the lower bound on the time of the last meeting.
 
 
@@ -182,7 +183,7 @@ def bound_forty(groups: InterceptGroup, ends: np.ndarray) -> np.ndarray:
     bounds = []
     for k, upper in enumerate(ends):
         shared = pj.take(groups.shared, k)
-        times = FORTY_STEP * np.arange(int(np.ceil(upper / FORTY_STEP)) + 2)
+        times = FORTY_STEP * np.arange(int(np.ceil(FORTY_SHARE * upper / FORTY_STEP)) + 2)
         with jax.enable_x64(True):
             paths = jax.tree.map(lambda leaf: np.asarray(leaf, float)[None], shared.target)
             places = np.asarray(_places(paths, times[None]))[0]
@@ -198,7 +199,7 @@ def bound_forty(groups: InterceptGroup, ends: np.ndarray) -> np.ndarray:
         heading = shared.start[2]
         start = np.asarray(shared.start[:2]) + ahead * np.array([np.cos(heading), np.sin(heading)])
         tolerance = float(shared.tolerance)
-        bounds.append(bound_end_time(places, travel, start, tolerance, FORTY_STEP, float(upper)))
+        bounds.append(bound_end_time(places, travel, start, tolerance, FORTY_STEP))
     return np.array(bounds)
 
 

@@ -150,10 +150,23 @@ def test_the_bound_is_below_the_best_order_and_not_far(num):
         travel = 1.5 * times
         start = np.asarray(departure(group).position, float)
         upper = brute_force(places, travel, start, 0.05, step)
-        few_steps = int(upper / step) + 3
-        inputs = places[:, :few_steps], travel[:few_steps], start, 0.05, step, upper
-        bound = bound_end_time(*inputs, rounds=200)
-        assert 0.6 * upper <= bound <= upper + 1e-6
+        few_steps = int(1.1 * upper / step) + 3
+        inputs = places[:, :few_steps], travel[:few_steps], start, 0.05, step
+        bounds = [bound_end_time(*inputs, rounds=200, near=near) for near in (1, 2, num - 1)]
+        assert 0.5 * upper <= bounds[0] <= upper + 1e-6
+        assert bounds[0] <= bounds[1] + 0.02 * upper
+        # A walk that remembers all targets is a tour, but it still may leave out targets.
+        assert 0.85 * upper <= bounds[2] <= upper + 1e-6
+
+
+def test_the_bound_is_at_most_the_end_of_its_last_step():
+    bound_end_time = pytest.importorskip("planner_jax.benchmarks.group_bound").bound_end_time
+    places = np.repeat(np.array([[[5.0, 0.0]], [[-5.0, 0.0]]]), 101, axis=1)
+    travel, start = np.arange(101.0) * 0.1, np.zeros(2)
+    assert bound_end_time(places[:, :31], travel[:31], start, 0.05, 0.1) == pytest.approx(3.0)
+    longer = np.repeat(places[:, :1], 301, axis=1)
+    bound = bound_end_time(longer, np.arange(301.0) * 0.1, start, 0.05, 0.1)
+    assert 13.0 <= bound <= 15.0  # 5 m to one target, then 10 m to the other, at 1 m/s
 
 
 def test_no_bound_is_stated_for_targets_faster_than_the_car():
