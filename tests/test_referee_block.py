@@ -1,5 +1,6 @@
 """The referee of blocks, an independent check of plans, on motions in closed form."""
 
+import functools
 from unittest.mock import Mock
 
 import jax
@@ -286,6 +287,14 @@ def test_extrema_are_the_greatest_of_many_samples(seed):
         assert getattr(verdict, f"{name}_share")[0] >= share * (1.0 - 1e-12)
 
 
+@functools.cache
+def judge_poses():
+    """Judge arms at standstill in 201 poses along the motion from `HOME` to `GOAL`."""
+    shares = np.linspace(0.0, 1.0, 201)
+    angles = HOME + np.polynomial.polynomial.polyval(shares, REST_TO_REST)[:, None] * CHANGE
+    return judge(stack(*(still(each) for each in angles)))
+
+
 @pytest.mark.parametrize("durations", [PIECES, (0.05, 0.02), (0.0, 0.9)])
 def test_the_least_clearance_is_that_of_a_pose_among_close_samples(monkeypatch, durations):
     clearances = Mock(wraps=block.clearances)
@@ -296,11 +305,8 @@ def test_the_least_clearance_is_that_of_a_pose_among_close_samples(monkeypatch, 
     steps = np.linalg.norm(np.diff(sampled_angles), axis=0)
     assert steps.max() <= block.LARGEST_TURN and len(steps) >= sum(durations) / block.LONGEST_STEP
     np.testing.assert_allclose(sampled_angles[:, [0, -1]].T, [HOME, GOAL], atol=1e-12)
-    shares = np.linspace(0.0, 1.0, 201)
-    angles = HOME + np.polynomial.polynomial.polyval(shares, REST_TO_REST)[:, None] * CHANGE
-    poses = judge(stack(*(still(each) for each in angles)))
     for kind in ("floor", "pole", "rig", "base", "self"):
-        least, found = (getattr(x, f"{kind}_clearance").min() for x in (poses, verdict))
+        least, found = (getattr(x, f"{kind}_clearance").min() for x in (judge_poses(), verdict))
         assert 0.0 <= least - found + 1e-12 < 1e-4
 
 
