@@ -1,7 +1,7 @@
-"""A six-axis arm with a square shield at its flange: kinematics, limits, and plans of the joints.
+"""An arm with a square shield at its flange: kinematics, limits, and plans of the joints.
 
-Positions are in the robot's base frame, z up, SI units; joint angles are (6,) [rad]. The frame of a
-link lies at its joint and turns with it, as in MuJoCo's model files (see `robot.arm_mjcf`).
+Positions are in the robot's base frame, z up, SI units; angles of n joints are (n,) [rad]. The
+frame of a link lies at its joint and turns with it, as in MuJoCo's files (see `robot.arm_mjcf`).
 """
 
 import dataclasses
@@ -19,32 +19,37 @@ from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
 
 @struct.dataclass
 class Arm:
-    """A six-axis arm: joints, links 1 to 6, capsules around the links, base and shield."""
+    """An arm of n hinge joints: joints, links 1 to n, capsules around links, base and shield."""
 
-    origin: Array  # (6, 3) [m], position of each joint in the frame of the previous link
-    turn: Array  # (6, 4) unit quaternion w, x, y, z: rotation of the joint's frame at angle 0
-    axis: Array  # (6, 3) unit vector along each joint's axis, in the joint's frame
-    lower: Array  # (6,) [rad], least joint angles
-    upper: Array  # (6,) [rad], greatest joint angles
-    home: Array  # (6,) [rad], joint angles at which the arm waits
-    mass: Array  # (6,) [kg], of each link
-    centre: Array  # (6, 3) [m], centre of mass of each link, in the link's frame
-    inertia: Array  # (6, 3, 3) [kg m^2], of each link about its centre of mass, link's axes
+    origin: Array  # (n, 3) [m], position of each joint in the frame of the previous link
+    turn: Array  # (n, 4) unit quaternion w, x, y, z: rotation of the joint's frame at angle 0
+    axis: Array  # (n, 3) unit vector along each joint's axis, in the joint's frame
+    lower: Array  # (n,) [rad], least joint angles
+    upper: Array  # (n,) [rad], greatest joint angles
+    home: Array  # (n,) [rad], joint angles at which the arm waits
+    mass: Array  # (n,) [kg], of each link
+    centre: Array  # (n, 3) [m], centre of mass of each link, in the link's frame
+    inertia: Array  # (n, 3, 3) [kg m^2], of each link about its centre of mass, link's axes
     capsule_ends: Array  # (C, 2, 3) [m], ends of each capsule's axis in the frame of its link
     capsule_radius: Array  # (C,) [m]
     base_box: Array  # (2, 3) [m], lowest and highest corner of the box around the base
-    shield_centre: Array  # (3,) [m], middle of the shield's front face, in the frame of link 6
-    shield_half: Array  # () [m], half of an edge; outward normal +x of link 6, edges y and z
-    # (C,) link of each capsule: 0 to 5 are links 1 to 6, -1 is the base.
+    shield_centre: Array  # (3,) [m], middle of the shield's front face, in the frame of link n
+    shield_half: Array  # () [m], half of an edge; outward normal +x of link n, edges y and z
+    # (C,) link of each capsule: 0 to n - 1 are links 1 to n, -1 is the base.
     capsule_link: tuple[int, ...] = struct.field(pytree_node=False)
+
+    @property
+    def num(self) -> int:
+        """Number n of joints; leading axes of a batch of arms are not counted."""
+        return self.origin.shape[-2]
 
 
 @struct.dataclass
 class ArmLimits:
     """Greatest magnitudes of joint velocities and accelerations; `Arm` has the limits of angles."""
 
-    velocity: Array  # (6,) [rad/s]
-    acceleration: Array  # (6,) [rad/s^2]
+    velocity: Array  # (n,) [rad/s]
+    acceleration: Array  # (n,) [rad/s^2]
 
 
 @struct.dataclass
@@ -88,12 +93,12 @@ def quaternion_rotation(quaternion: Array) -> Array:
 
 
 def _joint_rotations(arm: Arm, angles: Array) -> Array:
-    """Return rotations (6, 3, 3) of links relative to the previous links, at angles (6,) [rad]."""
+    """Return rotations (n, 3, 3) of links relative to the previous links, at angles (n,) [rad]."""
     turn = quaternion_rotation(jnp.asarray(arm.turn))
     axis = jnp.asarray(arm.axis)
     x, y, z = axis[:, 0], axis[:, 1], axis[:, 2]
     none = jnp.zeros_like(x)
-    cross = jnp.stack([none, -z, y, z, none, -x, -y, x, none], axis=-1).reshape(6, 3, 3)
+    cross = jnp.stack([none, -z, y, z, none, -x, -y, x, none], axis=-1).reshape(-1, 3, 3)
     # `along` and `across` do not depend on the angles: `vmap` over angles computes them only once.
     along = product(turn, axis[:, :, None] * axis[:, None, :])
     across = product(turn, cross)
@@ -102,44 +107,44 @@ def _joint_rotations(arm: Arm, angles: Array) -> Array:
 
 
 def link_frames(arm: Arm, angles: Array) -> tuple[Array, Array]:
-    """Return links' rotations (6, 3, 3) to the base frame and joints' positions (6, 3) [m]."""
+    """Return links' rotations (n, 3, 3) to the base frame and joints' positions (n, 3) [m]."""
     turned = _joint_rotations(arm, angles)
     origin = jnp.asarray(arm.origin)
     rotations, positions = [turned[0]], [origin[0]]
-    for k in range(1, 6):
+    for k in range(1, arm.num):
         positions.append(positions[-1] + product(rotations[-1], origin[k]))
         rotations.append(product(rotations[-1], turned[k]))
     return jnp.stack(rotations), jnp.stack(positions)
 
 
 def joint_axes(arm: Arm, rotations: Array) -> Array:
-    """Return the joint axes (6, 3) in the base frame, given the links' rotations (6, 3, 3)."""
+    """Return the joint axes (n, 3) in the base frame, given the links' rotations (n, 3, 3)."""
     return product(rotations, jnp.asarray(arm.axis)[:, :, None])[:, :, 0]
 
 
 def shield_pose(arm: Arm, angles: Array) -> tuple[Array, Array]:
-    """Return the shield's rotation (3, 3) and its face's middle (3,) [m], at angles (6,) [rad].
+    """Return the shield's rotation (3, 3) and its face's middle (3,) [m], at angles (n,) [rad].
 
     The columns of the rotation are the outward normal and the two edges, in the base frame.
     """
     rotations, positions = link_frames(arm, angles)
-    return rotations[5], positions[5] + product(rotations[5], jnp.asarray(arm.shield_centre))
+    return rotations[-1], positions[-1] + product(rotations[-1], jnp.asarray(arm.shield_centre))
 
 
 def shield_jacobian(arm: Arm, angles: Array) -> Array:
-    """Return the geometric Jacobian (6, 6) of the shield at angles (6,) [rad], in the base frame.
+    """Return the geometric Jacobian (6, n) of the shield at angles (n,) [rad], in the base frame.
 
     Each column belongs to a joint. Rows 0 to 2 are the velocity of the middle of the shield's face
     for a joint rate of 1 rad/s, [m/rad]. Rows 3 to 5 are the angular velocity.
     """
     rotations, positions = link_frames(arm, angles)
     axes = joint_axes(arm, rotations)
-    middle = positions[5] + product(rotations[5], jnp.asarray(arm.shield_centre))
+    middle = positions[-1] + product(rotations[-1], jnp.asarray(arm.shield_centre))
     return jnp.concatenate([jnp.cross(axes, middle[None] - positions), axes], axis=1).T
 
 
 def capsules(arm: Arm, angles: Array) -> Array:
-    """Return the ends (C, 2, 3) [m] of the axes of C capsules in the base frame, at angles (6,)."""
+    """Return the ends (C, 2, 3) [m] of the axes of C capsules in the base frame, at angles (n,)."""
     rotations, positions = link_frames(arm, angles)
     # Append the base as the last link, since the base has the index -1 in `arm.capsule_link`.
     rotations = jnp.concatenate([rotations, jnp.eye(3, dtype=rotations.dtype)[None]])
@@ -157,16 +162,16 @@ class ArmSetpoints:
     """
 
     time: np.ndarray  # (K,) [s] since the start of the plan
-    angles: np.ndarray  # (K, 6) [rad], joint angles
-    rates: np.ndarray  # (K, 6) [rad/s]
-    accelerations: np.ndarray  # (K, 6) [rad/s^2]
+    angles: np.ndarray  # (K, n) [rad], joint angles
+    rates: np.ndarray  # (K, n) [rad/s]
+    accelerations: np.ndarray  # (K, n) [rad/s^2]
 
 
 @struct.dataclass
 class ArmPlan(Plan):
-    """A plan of an arm: the motion of its six joints."""
+    """A plan of an arm: the motion of its n joints."""
 
-    motion: PiecewisePolynomial  # of the joint angles [rad]: M pieces, coefficients (M, D + 1, 6)
+    motion: PiecewisePolynomial  # of the joint angles [rad]: M pieces, coefficients (M, D + 1, n)
 
     def sample(self, rate: float) -> ArmSetpoints:
         """Sample the plan, or the batch of plans, `rate` times a second from start to end.
