@@ -248,6 +248,18 @@ def test_brisk_motions_end_before_the_ball_is_there():
     np.testing.assert_allclose(share[rests], 1.0 - SMALL.slack, rtol=1e-4)
 
 
+def boxes(half):
+    """Return the scene whose outer box is a cube around the origin with edges of 2 `half` [m]."""
+    scene = paper_scene()
+    lower, upper = (np.full(3, side * half, np.float32) for side in (-1.0, 1.0))
+    return scene.replace(outer=scene.outer.replace(lower=lower, upper=upper))
+
+
+BARE = irb1600().replace(
+    capsule_ends=np.zeros((0, 2, 3)), capsule_radius=np.zeros(0), capsule_link=()
+)
+
+
 @pytest.mark.parametrize(
     ("make", "options", "message"),
     [
@@ -255,6 +267,13 @@ def test_brisk_motions_end_before_the_ball_is_there():
         (throw, {"delay": -0.1}, "delay must be >= 0, got -0.1"),
         (throw, {"gravity": 0.0}, "gravity must be > 0, got 0"),
         (throw, {"angles": (0.0, 1.0)}, r"angles must have a .* ends with \(6,\), got \(2,\)"),
+        (
+            throw,
+            {"angles": (0.0, 5.0, 0.0, 0.0, 0.0, 0.0)},
+            "angles must be between arm.lower and arm.upper, got 5",
+        ),
+        (throw, {"scene": boxes(0.3)}, "scene.inner.lower must be >= scene.outer.lower, got -0.4"),
+        (throw, {"arm": BARE}, "arm must be one with a capsule around at least one link, got none"),
         (pj.block.draw, {"num": 0}, "num must be >= 1, got 0"),
         (pj.block.draw, {"num": 1, "suite": "x"}, "suite must be one of pole, .*, got 'x'"),
     ],

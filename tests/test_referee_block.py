@@ -211,8 +211,23 @@ def test_an_obstacle_moved_beyond_its_clearance_is_hit_by_the_difference(kind):
     leaves[name][place] += 0.003
     assert_good(leaves, contact_tolerance=0.0011)
     leaves[name][place] += 0.019
-    verdict = assert_limit(leaves, kind, excess=0.02)
-    assert f"{verdict.failed_part[0]} is 0.02 m " in verdict.sentence(0)
+    verdict = assert_limit(leaves, kind)
+    assert getattr(verdict, f"{kind}_clearance")[0] == pytest.approx(-0.02)
+    part, excess = verdict.failed_part[0], verdict.failed_excess[0]
+    assert f"{part} is {excess:.3g} m " in verdict.sentence(0)
+    assert excess == pytest.approx(0.02) or verdict.failed_time[0] == pytest.approx(DELAY)
+
+
+def test_an_arm_that_starts_in_the_pole_fails_at_its_start_although_it_gets_deeper_later():
+    poles = [np.mean([links(HOME)[k][1][:2] for k in (3, 4)], axis=0), CONTACT[:2]]
+    leaves = stack(good(), good())
+    leaves["scene.pole"][:] = poles
+    verdict, stays = judge(leaves), judge(still(HOME) | {"scene.pole": leaves["scene.pole"][:1]})
+    np.testing.assert_array_equal(verdict.failed_limit, "pole")
+    assert verdict.failed_time[0] == pytest.approx(DELAY) and verdict.failed_time[1] > 2.0 * DELAY
+    assert verdict.failed_excess[0] == pytest.approx(-stays.pole_clearance[0])
+    assert verdict.failed_excess[0] < -verdict.pole_clearance[0]
+    assert verdict.failed_excess[1] == -verdict.pole_clearance[1]
 
 
 def test_an_absent_pole_and_absent_beams_are_ignored():
@@ -384,7 +399,7 @@ def test_a_straight_wrist_does_not_touch_its_shield_and_a_folded_one_does():
 def test_capsules_of_the_base_are_kept_off_like_its_box():
     leaves = good()
     leaves["arm.capsule_ends"][0, 0] = [[0.9, 0.45, 0.0], [0.9, 0.45, 0.5]]  # under the wrist
-    assert_fails(leaves, "base", part="link 4", capsule_link=(-1, *ARM.capsule_link[1:]))
+    assert_fails(leaves, "base", part="the shield", capsule_link=(-1, *ARM.capsule_link[1:]))
 
 
 def test_distances_of_segments_are_those_of_a_solver():

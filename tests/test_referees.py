@@ -56,6 +56,18 @@ def test_a_nan_fails_its_own_lane_and_no_other(judged):
     assert_same(rows(judge(stack(*[lane] * len(names)))), rows(verdict, clean))
 
 
+def test_the_sentence_on_one_plan_needs_no_index_and_on_a_batch_an_index(judged):
+    tests, judge = judged
+    lanes = tests.unequal_lanes()
+    batch = judge(stack(*lanes))
+    one = type(batch)(**{name: value[0] for name, value in vars(batch).items()})
+    assert one.sentence() == one.sentence(0) == batch.sentence(0)
+    with pytest.raises(IndexError, match=r"a single plan has the index 0, got k = 1$"):
+        one.sentence(1)
+    with pytest.raises(IndexError, match=rf"on {len(lanes)} plans needs its index, got k = None$"):
+        batch.sentence()
+
+
 def test_absurd_numbers_fail_without_a_warning(judged):
     tests, judge = judged
     pairs = [(name, value) for name in tests.ABSURD for value in VALUES]

@@ -56,6 +56,16 @@ def below(other: str) -> Rule:
     return Rule("<", lambda value, part: value < part_at(part, other), other=other)
 
 
+def at_most(other: str) -> Rule:
+    """Return the rule that an array is not greater than the array `other` in the same part."""
+    return Rule("<=", lambda value, part: value <= part_at(part, other), other=other)
+
+
+def at_least(other: str) -> Rule:
+    """Return the rule that an array is not less than the array `other` in the same part."""
+    return Rule(">=", lambda value, part: value >= part_at(part, other), other=other)
+
+
 def below_or_infinite(other: str) -> Rule:
     """Return the rule `below(other)` for an array whose numbers may be infinite."""
     return dataclasses.replace(below(other), infinite=True)

@@ -181,8 +181,9 @@ def _judge(case: dict, links: tuple, relative: float, contact: float) -> dict:
     rest, parts["rest"] = _rest(case, motion, stays)
     tests["rest"] = rest
     turning = np.sqrt((np.abs(extremes[1][0]).max(axis=0) ** 2).sum(axis=0))
-    for kind, (least, time, part) in _clearances(case, links, motion, turning).items():
-        measured[f"{kind}_clearance"] = least
+    near = _clearances(case, links, motion, turning)
+    measured |= {f"{kind}_clearance": least for kind, (least, _, _) in near.items()}
+    for kind, (least, time, part) in _put_start_first(case, links, motion, near, contact).items():
         tests[kind], parts[kind] = (-least > contact, -least, time), part
     measured = {name: np.where(sound, value, np.nan) for name, value in measured.items()}
     measured |= {"contact_time": case["plan.contact_time"], "execution_time": execution}
@@ -311,6 +312,29 @@ def _clearances(case: dict, links: tuple, motion: _Motion, turning: np.ndarray) 
         kind: tuple(np.concatenate(values)[back] for values in zip(*parts, strict=True))
         for kind, parts in found.items()
     }
+
+
+def _put_start_first(
+    case: dict, links: tuple, motion: _Motion, near: dict[str, tuple], contact: float
+) -> dict[str, tuple]:
+    """Return the clearances `near`, with those of the start pose where the arm starts in contact.
+
+    A case that starts in a collision has no solution: the verdict names its start, although the
+    motion may get deeper into the obstacle.
+    """
+    hit = np.any([-least > contact for least, _, _ in near.values()], axis=0)
+    if not hit.any():
+        return near
+    of_hit, index = {name: leaf[hit] for name, leaf in case.items()}, np.cumsum(hit) - 1
+    angles = motion.coeffs[0][:, hit, :1]
+    found = {}
+    only = np.ones(angles.shape[1:], bool)
+    for kind, (least, _, part) in clearances(of_hit, links, angles, only).items():
+        start = least, motion.starts[hit, 0], part
+        is_inside = hit & (-least[index] > contact)
+        pairs = zip(start, near[kind], strict=True)
+        found[kind] = tuple(np.where(is_inside, new[index], old) for new, old in pairs)
+    return found
 
 
 def _sample(

@@ -40,8 +40,18 @@ class Verdict:
     failed_excess: np.ndarray
 
     def sentence(self, k: int | None = None) -> str:
-        """Describe in one line which limit plan `k` exceeds; `k` is None for a single plan."""
-        at = () if k is None else k
+        """Describe in one line which limit plan `k` exceeds.
+
+        For the verdict on a single plan `k` is left out, or 0. `IndexError` is raised for an index
+        that no plan has.
+        """
+        shape = np.shape(self.success)
+        at = () if k is None or (k == 0 and shape == ()) else k
+        if (at == ()) != (shape == ()):
+            which = (
+                f"{shape[0]} plans needs its index" if shape else "a single plan has the index 0"
+            )
+            raise IndexError(f"sentence(k) of the verdict on {which}, got k = {k}")
         name = str(np.asarray(self.failed_limit)[at])
         if not name:
             return f"success: {self.success_message(at)}"

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, DTypeLike
 from planner_jax.ball.flight import BallState
 from planner_jax.core import rules
 from planner_jax.core.checks import floating, require_kind, require_switch, shape_of
+from planner_jax.core.choices import require
 from planner_jax.core.registry import require_name
 from planner_jax.core.rules import Field, Table, require_sound
 from planner_jax.robot.arm import REGIMES, Arm, ArmLimits
@@ -21,13 +22,20 @@ from planner_jax.task.arguments import array_of, batch_of
 from planner_jax.task.block.clearance import least_clearances
 from planner_jax.task.block.scene import Scene, paper_scene
 
+_TOLERANCE = 1e-3  # [rad], by which a joint may start beyond its range; as in the referee
+_IN_RANGE = rules.Rule(
+    "between arm.lower and arm.upper",
+    lambda value, case: (
+        (value >= case.arm.lower - _TOLERANCE) & (value <= case.arm.upper + _TOLERANCE)
+    ),
+)
 # Shapes and ranges that `pj.require_sound` checks for the arrays of a `BlockCase`.
 RULES: Table = (
     Field("ball.pos", (3,)),
     Field("ball.vel", (3,)),
     Field("gravity", (), rules.POSITIVE),
     Field("delay", (), rules.NOT_NEGATIVE),
-    Field("angles", (6,)),
+    Field("angles", (6,), _IN_RANGE),
     Field("rates", (6,)),
     Field("arm.lower", (6,), rules.below("arm.upper")),
     Field("arm.upper", (6,)),
@@ -43,6 +51,8 @@ RULES: Table = (
     Field("scene.inner.upper", (3,)),
     Field("scene.outer.lower", (3,), rules.below("scene.outer.upper")),
     Field("scene.outer.upper", (3,)),
+    Field("scene.inner.lower", (3,), rules.at_least("scene.outer.lower")),
+    Field("scene.inner.upper", (3,), rules.at_most("scene.outer.upper")),
     Field("scene.pole", (2,)),
     Field("scene.pole_radius", (), rules.NOT_NEGATIVE),
     Field("scene.has_pole", (), kind=np.bool_),
@@ -138,6 +148,8 @@ def case(
     require_kind("scene", scene, Scene)
     arm = irb1600() if arm is None else arm
     require_kind("arm", arm, Arm)
+    rule = "one with a capsule around at least one link"
+    require(max(arm.capsule_link, default=-1) >= 0, "arm", rule, shown="none")
     angles = arm.home if angles is None else angles
     rates = np.full(6, rates) if shape_of("rates", rates) == () else rates
     vectors = {"ball_pos": (ball_pos, 3), "ball_vel": (ball_vel, 3), "angles": (angles, 6)}
