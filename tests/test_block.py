@@ -16,7 +16,12 @@ from planner_jax.robot.arm import REGIMES
 from planner_jax.robot.arm_mjcf import irb1600
 from planner_jax.sweep.block.settings import REGIMES as SWEPT
 from planner_jax.task.block.clearance import clearances, clearances_and_slopes, num_of_pole
-from planner_jax.task.block.default_planner import OnlineBlock, Search, rank_poses
+from planner_jax.task.block.default_planner import (
+    OnlineBlock,
+    Search,
+    rank_poses,
+    read_learned_starts,
+)
 from planner_jax.task.block.end_poses import contact_terms, end_poses, flight_of
 from planner_jax.task.block.motion import angles_at, polynomial, profiles, step_weights
 from planner_jax.task.block.scene import entry_time, paper_scene
@@ -224,6 +229,31 @@ def test_plans_of_a_batch_say_what_became_of_each_ball():
     np.testing.assert_array_equal(verdict.success[others], pj.are_solved(plans)[others])
     setpoints = plans.sample(100.0)
     np.testing.assert_allclose(setpoints.angles[0, 0], cases.angles[0], atol=1e-6)
+
+
+def test_more_starting_points_than_are_stored_are_drawn_like_the_stored_ones():
+    ranks, bumps = read_learned_starts()
+    assert len(ranks) == 15
+    for num in (20, 48):
+        more, drawn = read_learned_starts(num)
+        np.testing.assert_array_equal(more[:15], ranks)
+        np.testing.assert_array_equal(drawn[:15], bumps)
+        np.testing.assert_array_equal(drawn, read_learned_starts(60)[1][:num])
+        assert len(more) == len(drawn) == num and more.max() == ranks.max()
+    many = read_learned_starts(5000)[1][15:]
+    np.testing.assert_allclose(many.mean(axis=0), bumps.mean(axis=0), atol=0.05)
+    np.testing.assert_allclose(many.std(axis=0), bumps.std(axis=0), rtol=0.05)
+
+
+@pytest.mark.slow
+def test_drawn_starting_points_lead_to_plans():
+    late = Search(
+        straight=0, tries=33, first=15, kept=33, in_turn=False, solver=LevenbergConfig(12)
+    )
+    planner = dataclasses.replace(SMALL, searches=(late,))
+    case = jax.tree.map(np.asarray, pj.take(pj.block.draw(1, seed=3), 0))
+    plan = pj.plan(planner, case)
+    assert pj.are_solved(plan) and pj.block.judge(case, plan).success
 
 
 def test_brisk_motions_end_before_the_ball_is_there():

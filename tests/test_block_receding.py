@@ -15,10 +15,9 @@ from planner_jax.sims.perception.contact_check import end_at_contact
 from planner_jax.sims.perception.flight_fit import Sight
 from planner_jax.sims.perception.observation import cautious, eye
 from planner_jax.sims.perception.receding import Aim, decide
-from planner_jax.task.block.replan import ReplanBlock, WarmBlock
 
 AIMS = (Aim(0.02), Aim(0.09))
-AGAIN = ReplanBlock(warm=WarmBlock(planner=SMALL), planner=SMALL)
+AGAIN = SMALL.replanner()
 
 
 @pytest.fixture(scope="module")
@@ -86,7 +85,7 @@ def test_replanning_starts_from_the_motion_with_the_new_ball(cases):
     both = solved & pj.are_solved(warm)
     assert both.sum() >= 3
     assert pj.block.judge(take(tasks.case, both), take(warm, both)).success.all()
-    again = pj.replan(AGAIN, cases, plans, 0.1, ball=ball)
+    again = pj.replan(SMALL, cases, plans, 0.1, ball=ball)
     np.testing.assert_array_equal(again.contact_time[both], warm.contact_time[both])
 
 

@@ -185,7 +185,7 @@ class Planner(Generic[CaseT, PlanT]):
         """
         raise TypeError(
             f"{type(self).__name__} cannot plan again: use hits' and catches' exact, intercepts' "
-            "spacetime, or ReplanBlock"
+            "spacetime, or blocks' online"
         )
 
     def settle(

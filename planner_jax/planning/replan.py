@@ -79,10 +79,12 @@ def replan(planner: PyTree, cases: PyTree, previous: PlanT, elapsed: PyTree, **n
         **news: changed quantities, with times that count from the present. Catches take `targets`
             and `head_state`, hits `ball`, `drag` and `head_state`. The default of `head_state` is
             the robot's state in the plan at this time. Interceptions take `target`, `walls`,
-            `movers`, and the car's `start`, `speed` and `curvature`.
+            `movers`, and the car's `start`, `speed` and `curvature`. Blocks take `ball` at time 0
+            of the cases, and the arm's present `angles` and `rates`.
 
     Returns:
-        The plans; their times count from the present.
+        The plans; their times count from the present. Times of blocks count from the first
+        observation of the ball, as in their cases.
 
     Raises:
         TypeError: the planner has no re-planner, or cases, plans or changes are of another task.

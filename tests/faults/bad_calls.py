@@ -112,8 +112,8 @@ pj.replan(exact, hits, catch_plans, 0.1, ball=hits.ball) | previous must
 pj.replan(exact, hits, hit_plans, 0.1, ball=hits.ball, drag=-1.0) | case.drag must be >= 0, got -1
 pj.replan(catcher, catches, catch_plans, 0.1, targets=hits.ball) | targets must
 pj.replan(driver, drives, drive_plans, 0.1, target=drives.target, speed=nan) | speed must
-pj.replan(ReplanBlock(), blocks, block_plans, 0.1, rates=nan) | rates must
-pj.replan(blocker, blocks, block_plans, 0.1) | OnlineBlock cannot plan again
+pj.replan(blocker, blocks, block_plans, 0.1, rates=nan) | rates must
+pj.replan(pj.block.planner("direct"), blocks, block_plans, 0.1) | DirectBlock cannot plan again
 pj.gradient(exact, hits, of=5, by='target') | of must
 pj.gradient(exact, hits, of='cost', by='limits.nothing') | by must
 pj.optimal_plan(exact, hits) | case must be one case, got batch shape (2,)

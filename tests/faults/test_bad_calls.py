@@ -13,7 +13,6 @@ import planner_jax as pj
 from planner_jax.core.rules import part_at
 from planner_jax.policies.policy import policy
 from planner_jax.task.block.plan import BlockPlan
-from planner_jax.task.block.replan import ReplanBlock
 from planner_jax.task.catch.decide import Best
 from planner_jax.task.catch.plan import CatchPlan
 from planner_jax.task.hit.plan import HitPlan, Stroke
@@ -91,7 +90,7 @@ def given(tmp_path_factory):
 
     names = {
         **{"pj": pj, "np": np, "jax": jax, "nan": np.nan, "inf": np.inf},
-        **{"Best": Best, "policy": policy, "ReplanBlock": ReplanBlock},
+        **{"Best": Best, "policy": policy},
         **{"HitPlan": HitPlan, "CatchPlan": CatchPlan, "turning": turning, "SQUARE": square},
         **{"having": having, "fill": fill, "first": first, "save": save},
         **{"exact": exact, "catcher": catcher, "driver": driver, "blocker": blocker},

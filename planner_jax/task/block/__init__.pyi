@@ -4,6 +4,7 @@ from .case import BlockCase as BlockCase
 from .case import case as case
 from .default_planner import OnlineBlock as OnlineBlock
 from .plan import BlockPlan as BlockPlan
+from .replan import ReplanBlock as ReplanBlock
 from .scene import Scene as Scene
 from .scene import paper_scene as paper_scene
 from .suites import draw as draw

@@ -13,7 +13,7 @@ import dataclasses
 import functools
 import json
 from pathlib import Path
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -48,6 +48,9 @@ from planner_jax.task.block.end_poses import (
 )
 from planner_jax.task.block.plan import BlockPlan, explain_status, make_empty_plan
 
+if TYPE_CHECKING:
+    from planner_jax.task.block.replan import ReplanBlock
+
 _HIGHEST = lax.Precision.HIGHEST
 # Number of starting points that take trial steps before the best of them are refined, and number of
 # starting points that are refined at the same time on a GPU.
@@ -57,12 +60,15 @@ _GROUP, _WIDTH = 4, 2
 @with_run_time_numbers("straight", "tries", "first", "kept", "in_turn")
 @dataclasses.dataclass(frozen=True)
 class Search(Attempt):
-    """An attempt: check some straight joint motions, then run least squares from several starts."""
+    """An attempt: check some straight joint motions, then run least squares from several starts.
+
+    There may be any number of starting points: 15 are stored, and further ones are drawn.
+    """
 
     starts: int = 8
     straight: int = 48  # number of straight joint motions to check
     tries: int = 15  # number of starting points from which least squares are tried
-    first: int = 0  # index of the first stored starting point to try
+    first: int = 0  # index of the first starting point to try
     kept: int = 5  # number of starting points that continue after the solver's trial steps
     # Whether each starting point is refined to its end before the next, if a single case is
     # planned. Otherwise all take a few trial steps first, and only the `kept` best ones continue.
@@ -89,8 +95,11 @@ _BRISK = (Search(tries=0), *_LEAST_SQUARES)
 
 
 @functools.cache
-def read_learned_starts() -> tuple[np.ndarray, np.ndarray]:
-    """Read N stored starting points, each a straight motion in joint space plus a detour.
+def read_learned_starts(num: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Read the stored starting points, each a straight motion in joint space plus a detour.
+
+    If there are fewer than `num`, further ones are drawn: the ranks in turn, and detours from the
+    normal distribution with the stored detours' mean and standard deviation for each joint.
 
     Returns:
         ranks: (N,) int32, index of the motion's end pose among poses in order of rising effort.
@@ -98,7 +107,12 @@ def read_learned_starts() -> tuple[np.ndarray, np.ndarray]:
     """
     starts = json.loads((Path(__file__).parent / "learned_starts.json").read_text())
     ranks = np.array([start["rank"] for start in starts], np.int32)
-    return ranks, np.array([start["bump"] for start in starts], np.float32)
+    bumps = np.array([start["bump"] for start in starts], np.float32)
+    more = max(num - len(starts), 0)
+    drawn = np.random.default_rng(0).normal(size=(more, bumps.shape[1]))
+    drawn = (bumps.mean(axis=0) + bumps.std(axis=0) * drawn).astype(np.float32)
+    turns = (np.arange(more) % (1 + ranks.max())).astype(np.int32)
+    return np.append(ranks, turns), np.concatenate([bumps, drawn])
 
 
 def _combine_excess(joints: Array, contact: Array, too_near: Array) -> Array:
@@ -209,7 +223,7 @@ class OnlineBlock(Planner):
             compares = (k < straight) if self.brisk else False
             return (k < straight + tries + kept) & (compares | ~is_solved(best.status))
 
-        num, dtype = len(read_learned_starts()[0]), case.angles.dtype
+        num, dtype = len(self._starts()[0]), case.angles.dtype
         empty = levenberg.start_search(jnp.zeros(6 * self.pieces + 1, dtype), solver)
         searches = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (num, *leaf.shape)), empty)
         costs, best = jnp.full(num, jnp.inf, dtype), make_empty_plan(case, self.pieces)
@@ -282,8 +296,11 @@ class OnlineBlock(Planner):
         in_time = jnp.sum(poses.effort <= 1.0 - self.slack)
         return jnp.where(flight.comes, jnp.minimum(in_time, attempt.straight), 0)
 
+    def _starts(self) -> tuple[np.ndarray, np.ndarray]:
+        return read_learned_starts(max(search.first + search.tries for search in self.searches))
+
     def _encode_start(self, case: BlockCase, poses: EndPoses, order: Array, k: Array) -> Array:
-        ranks, bumps = (jnp.asarray(each) for each in read_learned_starts())
+        ranks, bumps = (jnp.asarray(each) for each in self._starts())
         k = jnp.minimum(k, len(ranks) - 1)
         point = self.encode_straight(case, poses, order[ranks[k]])
         bump = motion.bump_steps(bumps[k].astype(point.dtype), self.pieces)
@@ -404,6 +421,12 @@ class OnlineBlock(Planner):
         rests = is_solved(plan.status) & case.ends_at_rest & jnp.all(case.rates == 0.0)
         quick = dataclasses.replace(plan, motion=path, cost=pace * plan.cost)
         return jax.tree.map(lambda new, old: jnp.where(rests, new, old), quick, plan)
+
+    def replanner(self) -> "ReplanBlock":
+        """Return the planner by which `pj.replan` updates motions that are being executed."""
+        from planner_jax.task.block.replan import ReplanBlock, WarmBlock
+
+        return ReplanBlock(warm=WarmBlock(planner=self), planner=self)
 
 
 def brisk(**fields: object) -> OnlineBlock:

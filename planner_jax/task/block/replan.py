@@ -80,6 +80,9 @@ class WarmBlock(Planner):
 class ReplanBlock(Planner):
     """Planner for `pj.replan` that starts from the motion being executed.
 
+    `pj.block.planner().replanner()` returns it, and `pj.replan(pj.block.planner(), cases, plans,
+    elapsed, ball=...)` uses it.
+
     In every re-plan, times of cases and plans count from the first observation of the ball. The new
     motion starts at the case's `delay`, which grows from one re-plan to the next.
     """
