@@ -49,7 +49,7 @@ def show_board(
     angles = rng.uniform(arm.lower, arm.upper, (draws, 6)).astype(np.float32)
     rotations, positions = jax.jit(jax.vmap(link_frames, (None, 0)))(arm, angles)
     flange = pose(np.asarray(rotations[:, 5], float), np.asarray(positions[:, 5], float))
-    half = float(arm.shield_half)
+    half = float(np.min(arm.shield_half))
     grid = np.stack(np.meshgrid(*[np.linspace(-half, half, _CORNERS)] * 2), axis=-1)
     points = np.asarray(arm.shield_centre) + np.pad(grid.reshape(-1, 2), ((0, 0), (1, 0)))
     shown = points @ np.swapaxes(flange[:, :3, :3], 1, 2) + flange[:, None, :3, 3]

@@ -37,7 +37,9 @@ def some_angles(arm, num, seed=0):
 def without_capsules(arm):
     """Return the arm without collision capsules, so that all arms use the same programs."""
     none = {"capsule_ends": arm.capsule_ends[:0], "capsule_radius": arm.capsule_radius[:0]}
-    return dataclasses.replace(arm, **none, capsule_link=())
+    none["shield_gap_radius"] = arm.shield_gap_radius[:0]
+    pairs = {"capsule_link": (), "pairs": (), "shield_pairs": (), "base_pairs": ()}
+    return dataclasses.replace(arm, **none, **pairs)
 
 
 @struct.dataclass

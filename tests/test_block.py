@@ -151,7 +151,7 @@ def test_no_pose_is_freer_than_the_referee_says(float64):
     least = each(case).min(axis=1)
     leaves = {name: np.asarray(leaf, float) for name, leaf in leaves_by_name(case).items()}
     angles = np.asarray(case.angles, float).T[:, :, None]
-    kinds = referee_clearances(leaves, arm.capsule_link, angles, np.ones((num, 1), bool))
+    kinds = referee_clearances(leaves, arm, angles, np.ones((num, 1), bool))
     distances = np.array([kinds[kind][0] for kind in KINDS])
     theirs = distances.min(axis=0)
     assert (theirs[least >= OnlineBlock().margin] > -1e-3).all()  # the referee's tolerance
@@ -312,3 +312,15 @@ def test_an_error_in_a_case_or_a_draw_is_named(make, options, message):
     with pytest.raises(ValueError, match=f"^{message}$"):
         make(**options)
     assert tuple(REGIMES) == SWEPT
+
+
+def test_an_arm_has_limits_of_its_own_and_no_regime_of_another_arm():
+    arm = irb1600()
+    slow = dataclasses.replace(arm.limits, velocity=0.5 * arm.limits.velocity)
+    foreign = dataclasses.replace(arm, limits=slow)
+    case = throw(arm=foreign)
+    np.testing.assert_array_equal(case.limits.velocity, slow.velocity)
+    np.testing.assert_array_equal(throw(limits=slow).limits.velocity, slow.velocity)
+    assert case.ends_at_rest
+    with pytest.raises(ValueError, match="regime must be left out for an arm with limits of its"):
+        throw(arm=foreign, regime="R1")

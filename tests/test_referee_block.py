@@ -89,6 +89,8 @@ def good(shape=REST_TO_REST, end=GOAL, durations=PIECES, velocity=INCOMING, at=C
 
 def judge(leaves, capsule_link=ARM.capsule_link, **options) -> BlockVerdict:
     judged = tree(leaves)
+    for name in ("pairs", "shield_pairs", "base_pairs", "joint_names"):
+        setattr(judged.arm, name, getattr(ARM, name))
     judged.arm.capsule_link = capsule_link
     return referee_blocks(judged, judged.plan, **options)
 
@@ -344,7 +346,7 @@ def solids_of(angles):
         ends = place + ARM.capsule_ends[k] @ rotation.T
         found.append((link, *segment(*ends, ARM.capsule_radius[k])))
     rotation, middle = shield(angles)
-    half = np.array([0.5 * THICKNESS, ARM.shield_half, ARM.shield_half])
+    half = np.array([0.5 * THICKNESS, *ARM.shield_half])
     plate = (6, middle - 0.5 * THICKNESS * rotation[:, 0], list(half[:, None] * rotation.T), 0.0)
     return [*found, plate]
 
@@ -449,7 +451,9 @@ def unequal_lanes():
 
 
 FAILED = ["", "tilt", "time", "self", "velocity", "velocity", ""]
-UNREAD = {"arm.home", "arm.mass", "arm.centre", "arm.inertia"}  # for dynamics, and the home pose
+# For dynamics, the home pose, and the arm's own limits, which a case can replace.
+UNREAD = {"arm.home", "arm.mass", "arm.centre", "arm.inertia"}
+UNREAD |= {"arm.limits.velocity", "arm.limits.acceleration"}
 UNKNOWN = ("miss", "pole_clearance")
 PLANNED = (COEFFS, DURATIONS, "plan.contact_time")
 ABSURD, HARMLESS = ("ball.pos", "angles", "arm.origin", "scene.pole", *PLANNED), "scene.pole"

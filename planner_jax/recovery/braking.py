@@ -142,7 +142,7 @@ def _arm_candidates(
     angles: np.ndarray, rates: np.ndarray, most: np.ndarray
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     alone = np.maximum(np.abs(rates) / (_SPARE * most), 1e-3)
-    together = np.full(6, alone.max())
+    together = np.full(rates.size, alone.max())
     for ends in (together, alone, *(factor * together for factor in _SLOWER)):
         times = np.unique(ends)
         begins = np.append(0.0, times[:-1])
@@ -158,7 +158,7 @@ def _arm_candidates(
 def _arm_problem(case: PyTree, pieces: np.ndarray, times: np.ndarray) -> str:
     tau = times[:, None, None] * np.linspace(0.0, 1.0, _SAMPLES // len(times))[:, None]
     first, second, third = np.moveaxis(pieces, 1, 0)[:, :, None]
-    angles = (first + tau * (second + tau * third)).reshape(-1, 6)
+    angles = (first + tau * (second + tau * third)).reshape(-1, case.arm.num)
     beyond = np.maximum(angles - case.arm.upper, case.arm.lower - angles).max(axis=0)
     joint = int(beyond.argmax())
     if beyond[joint] > 0.0:

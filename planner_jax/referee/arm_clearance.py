@@ -1,18 +1,19 @@
-"""Clearance of a six-axis arm with a shield from obstacles and from itself, in float64 NumPy.
+"""Clearance of an arm of n joints with a shield from obstacles and from itself, in float64 NumPy.
 
 Base frame of the arm, z up, SI units. Vectors at S sampled times of B motions are (3, B, S), with
-S = 1 for solids that do not move. The solids are capsules around the links, and a square plate, the
-shield, 0.01 m thick. These distances are tested:
+S = 1 for solids that do not move. The solids are capsules around the links, and a rectangular
+plate, the shield, 0.01 m thick. These distances are tested:
 
 - of every link and the shield from the floor, the pole and the beams of the rig around the arm;
-- of links 2 to 6 and the shield from the base, on which link 1 is mounted;
-- of links 3 to 6 from link 1, since neighbouring links always touch;
-- of links 1 to 4 from the shield, which link 6 carries. `_beside_shield` explains link 4.
+- of the shield and the links of `Arm.base_pairs` from the base, on which link 1 is mounted;
+- of the links of `Arm.pairs`, since neighbouring links always touch;
+- of the links of `Arm.shield_pairs` from the shield, which the last link carries.
 """
 
 import dataclasses
 from collections.abc import Callable, Sequence
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -22,7 +23,7 @@ KINDS = ("floor", "pole", "rig", "base", "self")
 THICKNESS = 0.01  # [m], thickness of the shield's plate
 _POLE_HALF = 1e3  # [m], half the length of the pole, practically infinite
 _SLACK = 1e-9  # [m], greatest rounding error of the lower bound of a distance
-_BASE = -1  # index of the base, where links 1 to 6 have indices 0 to 5
+_BASE = -1  # index of the base, where links 1 to n have indices 0 to n - 1
 
 
 @dataclasses.dataclass(frozen=True)
@@ -107,14 +108,14 @@ class _Pair:
 
 
 def links_of(case: dict, angles: np.ndarray) -> tuple[list, list]:
-    """Return links' rotations to the base frame, and joints' positions [m], for links 1 to 6.
+    """Return links' rotations to the base frame, and joints' positions [m], for links 1 to n.
 
-    Joint `angles` are (6, B, S) [rad], at S samples of B motions. Each rotation is (3, 3, B, S),
+    Joint `angles` are (n, B, S) [rad], at S samples of B motions. Each rotation is (3, 3, B, S),
     each position (3, B, S).
     """
     turn, position = np.eye(3)[..., None, None], np.zeros((3, 1, 1))
     turns, positions = [], []
-    for k in range(6):
+    for k in range(len(angles)):
         origin, quaternion, axis = (
             case[f"arm.{name}"][:, k].T[..., None] for name in ("origin", "turn", "axis")
         )
@@ -129,15 +130,17 @@ def links_of(case: dict, angles: np.ndarray) -> tuple[list, list]:
     return turns, positions
 
 
-def shield_middle(case: dict, turns: list, positions: list) -> np.ndarray:
-    """Return the middle (3, B, S) [m] of the shield's face at S samples of B motions.
+def shield_pose(case: dict, turns: list, positions: list) -> tuple[np.ndarray, np.ndarray]:
+    """Return the shield's rotation (3, 3, B, S), and its face's middle (3, B, S) [m].
 
-    The outward normal of the face is the x axis of link 6.
+    The columns of the rotation are the outward normal of the face and the directions of its edges.
     """
-    return positions[5] + solids.rotate(turns[5], case["arm.shield_centre"].T[..., None])
+    own = _rotation(case["arm.shield_turn"].T[..., None])
+    middle = positions[-1] + solids.rotate(turns[-1], case["arm.shield_centre"].T[..., None])
+    return _product(turns[-1], own), middle
 
 
-def clearances(case: dict, links: Sequence, angles: np.ndarray, sampled: np.ndarray) -> dict:
+def clearances(case: dict, arm: Any, angles: np.ndarray, sampled: np.ndarray) -> dict:
     """Return an arm's least distances to the floor, the pole, the rig, its base and itself.
 
     The distance of overlapping solids is minus the penetration depth. If one solid is a capsule,
@@ -146,25 +149,24 @@ def clearances(case: dict, links: Sequence, angles: np.ndarray, sampled: np.ndar
 
     Args:
         case: arrays of B cases.
-        links: link of each capsule of the arm, 0 to 5 for links 1 to 6, -1 for the base.
-        angles: (6, B, S) [rad], joint angles at S samples of each motion.
+        arm: object with `capsule_link`, `pairs`, `shield_pairs` and `base_pairs` of `Arm`.
+        angles: (n, B, S) [rad], joint angles at S samples of each motion.
         sampled: (B, S) bool, samples to evaluate, at least one in each motion.
 
     Returns:
         For each kind of obstacle: the least distance (B,) [m], infinite without an obstacle; the
         index (B,) of its sample; and the name (B,) of the part of the arm.
     """
-    capsules, shield = _arm(case, links, angles)
+    capsules, shield = _arm(case, arm.capsule_link, angles)
     moving = [each for each in capsules if each.link != _BASE]
     on_base = [each for each in capsules if each.link == _BASE]
     bodies = [*moving, shield]
-    off_base = [each for each in moving if each.link > 0] + [shield]
+    off_base = [*(capsules[k] for k in arm.base_pairs), shield]
     beams, pole, base = _beams(case), _pole(case), [_base_box(case), *on_base]
     floor = case["scene.floor"][:, None]
     heights = [(body.name, body.lowest() - floor) for body in bodies]
-    first = [each for each in moving if each.link == 0]
-    folded = [(body, part) for body in moving if body.link > 1 for part in first]
-    guarded = [(part, shield) for part in (*first, *_beside_shield(case, links, capsules))]
+    folded = [(capsules[k], capsules[other]) for k, other in arm.pairs]
+    guarded = [(part, shield) for part in _beside_shield(case, arm, capsules)]
     pairs = {
         "floor": [_Pair(name, above, partial(_pick_samples, above)) for name, above in heights],
         "pole": [_pair(body, pole, body.name) for body in bodies],
@@ -186,30 +188,30 @@ def _arm(case: dict, links: Sequence, angles: np.ndarray) -> tuple[list[_Capsule
             )
         name = "the base" if link == _BASE else f"link {link + 1}"
         capsules.append(_Capsule(name, link, first, second, case["arm.capsule_radius"][:, k, None]))
-    wide = case["arm.shield_half"][:, None]
-    half = np.stack([np.full_like(wide, 0.5 * THICKNESS), wide, wide])
-    middle = shield_middle(case, turns, positions) - 0.5 * THICKNESS * turns[5][:, 0]
-    return capsules, _Box("the shield", middle, turns[5], half)
+    wide, high = case["arm.shield_half"].T[..., None]
+    half = np.stack([np.full_like(wide, 0.5 * THICKNESS), wide, high])
+    turn, face = shield_pose(case, turns, positions)
+    return capsules, _Box("the shield", face - 0.5 * THICKNESS * turn[:, 0], turn, half)
 
 
-def _beside_shield(case: dict, links: Sequence, capsules: list[_Capsule]) -> list[_Capsule]:
-    """Return the capsules of links 2 to 4 for the test against the shield.
+def _beside_shield(case: dict, arm: Any, capsules: list[_Capsule]) -> list[_Capsule]:
+    """Return the capsules for the test against the shield.
 
-    Link 4 is wider than thick, and the shield approaches only its narrow sides. A capsule that
-    contains the wide sides would overlap the shield. Its radius is therefore reduced so that it
-    just touches the shield if all joint angles are 0.
+    A link can be wider than thick, and the shield approaches only its narrow sides. A capsule that
+    contains the wide sides would overlap the shield. The arm states a smaller radius for such a
+    capsule. Here its radius is reduced so that it just touches the shield if all joint angles
+    are 0.
     """
     num_lanes = len(case["arm.shield_half"])
-    straight, shield = _arm(case, links, np.zeros((6, num_lanes, 1)))
-    beside = []
-    for each, unbent in zip(capsules, straight, strict=True):
-        if each.link == 3:
-            bare = dataclasses.replace(unbent, radius=np.zeros((num_lanes, 1)))
-            here = np.arange(num_lanes), np.zeros(num_lanes, int)
-            gap = _distance(bare.at(*here), shield.at(*here))[:, None]
-            each = dataclasses.replace(each, radius=np.minimum(each.radius, gap))
-        if 1 <= each.link <= 3:
-            beside.append(each)
+    straight, shield = _arm(case, arm.capsule_link, np.zeros((len(arm.joint_names), num_lanes, 1)))
+    beside, here = [], (np.arange(num_lanes), np.zeros(num_lanes, int))
+    for k in arm.shield_pairs:
+        bare = dataclasses.replace(straight[k], radius=np.zeros((num_lanes, 1)))
+        gap = _distance(bare.at(*here), shield.at(*here))[:, None]
+        whole = capsules[k].radius
+        is_thin = case["arm.shield_gap_radius"][:, k, None] < whole
+        radius = np.where(is_thin, np.minimum(whole, gap), whole)
+        beside.append(dataclasses.replace(capsules[k], radius=radius))
     return beside
 
 

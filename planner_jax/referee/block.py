@@ -8,11 +8,12 @@ first observation of the ball.
 
 import dataclasses
 import functools
+from typing import Any
 
 import numpy as np
 
 from planner_jax.referee import judging
-from planner_jax.referee.arm_clearance import KINDS, clearances, links_of, shield_middle
+from planner_jax.referee.arm_clearance import KINDS, clearances, links_of, shield_pose
 from planner_jax.referee.solids import rotate_back
 
 _SENTENCES = {
@@ -42,18 +43,22 @@ LIMITS = tuple(_SENTENCES)
 _UNBOUNDED_LEAVES = ("arm.lower", "arm.upper", "offset", "tilt")
 _SIDES = ("lower", "upper")
 _CASE_SHAPES: dict[str, tuple[int, ...]] = {
-    **{"ball.pos": (3,), "ball.vel": (3,), "angles": (6,), "rates": (6,), "gravity": ()},
+    **{"ball.pos": (3,), "ball.vel": (3,), "gravity": ()},
     **{"delay": (), "ends_at_rest": (), "offset": (), "tilt": ()},
-    **{"arm.origin": (6, 3), "arm.turn": (6, 4), "arm.axis": (6, 3), "arm.base_box": (2, 3)},
-    **{"arm.lower": (6,), "arm.upper": (6,), "arm.shield_centre": (3,), "arm.shield_half": ()},
-    **{"limits.velocity": (6,), "limits.acceleration": (6,), "scene.pole": (2,)},
+    **{"arm.base_box": (2, 3), "scene.pole": (2,)},
+    **{"arm.shield_centre": (3,), "arm.shield_turn": (4,), "arm.shield_half": (2,)},
     **{"scene.pole_radius": (), "scene.has_pole": (), "scene.floor": ()},
     **{f"scene.{box}.{side}": (3,) for box in ("inner", "outer") for side in _SIDES},
 }
-_JOINTS = np.array([f"joint {k}" for k in range(1, 7)])
+# Shapes of leaves for each of the n joints.
+_JOINT_SHAPES: dict[str, tuple[int, ...]] = {
+    **{"angles": (), "rates": (), "arm.lower": (), "arm.upper": ()},
+    **{"arm.origin": (3,), "arm.turn": (4,), "arm.axis": (3,)},
+    **{"limits.velocity": (), "limits.acceleration": ()},
+}
 
 LONGEST_STEP = 0.002  # [s], greatest time between two samples of the arm's motion
-# [rad] Greatest change between two samples, as the norm of the six joint angles' changes.
+# [rad] Greatest change between two samples, as the norm of the joint angles' changes.
 LARGEST_TURN = 0.017
 # [rad/s] The samples' distance in time is `LARGEST_TURN` / (norm of the joint rates). A norm above
 # this number counts as this number, which limits the number of samples.
@@ -85,7 +90,7 @@ class BlockVerdict(judging.Verdict):
     floor_clearance: np.ndarray  # (B,) [m], least distance of arm and shield from the floor
     pole_clearance: np.ndarray  # (B,) [m], least distance of arm and shield from the pole
     rig_clearance: np.ndarray  # (B,) [m], least distance of arm and shield from the rig's beams
-    base_clearance: np.ndarray  # (B,) [m], least distance of links 2 to 6 and shield from the base
+    base_clearance: np.ndarray  # (B,) [m], least distance of shield and links from the base
     self_clearance: np.ndarray  # (B,) [m], least distance between two parts of the arm
     miss: np.ndarray  # (B,) [m], ball to the shield's middle at the contact, in the face's plane
     height: np.ndarray  # (B,) [m], of the ball above the plane of the shield's face at the contact
@@ -114,7 +119,7 @@ def referee_blocks(
     Args:
         cases: object with the fields of `BlockCase`, for B cases; gravity > 0.
         plans: object with the fields of `BlockPlan`, for B plans of M polynomial pieces of degree
-            D: coefficients (B, M, D + 1, 6), durations (B, M).
+            D: coefficients (B, M, D + 1, n), durations (B, M).
         tolerance: relative tolerance of velocities, accelerations, and the case's `offset` and
             `tilt` at the contact; absolute tolerance of the start and of jumps between pieces
             [rad], [rad/s], and of joint angles beyond their limits [rad].
@@ -130,38 +135,45 @@ def referee_blocks(
     Raises:
         ValueError: a leaf has the wrong shape.
     """
-    leaves, links = _read(cases, plans)
-    judge = functools.partial(_judge, links=links, relative=tolerance, contact=contact_tolerance)
+    leaves, arm = _read(cases, plans), cases.arm
+    judge = functools.partial(_judge, arm=arm, relative=tolerance, contact=contact_tolerance)
     return BlockVerdict(**judging.judge_in_chunks(judge, leaves, chunk=256))
 
 
-def _read(cases, plans) -> tuple[dict[str, np.ndarray], tuple[int, ...]]:
+def _read(cases, plans) -> dict[str, np.ndarray]:
     coeffs = np.asarray(plans.motion.coeffs)
-    if coeffs.ndim != 4 or coeffs.shape[-1] != 6 or 0 in coeffs.shape[1:]:
-        raise ValueError(f"plan.motion.coeffs must be (B, M, D + 1, 6), got {coeffs.shape}")
+    num = len(cases.arm.joint_names)
+    if coeffs.ndim != 4 or coeffs.shape[-1] != num or 0 in coeffs.shape[1:]:
+        raise ValueError(f"plan.motion.coeffs must be (B, M, D + 1, {num}), got {coeffs.shape}")
     links = tuple(int(link) for link in cases.arm.capsule_link)
-    if not all(-1 <= link <= 5 for link in links):
-        raise ValueError(f"arm.capsule_link must be in -1, ..., 5, got {links}")
+    if not all(-1 <= link < num for link in links):
+        raise ValueError(f"arm.capsule_link must be in -1, ..., {num - 1}, got {links}")
     beams = np.shape(cases.scene.beam_radius)
     if len(beams) != 2:
         raise ValueError(f"scene.beam_radius must be ({len(coeffs)}, N), got {beams}")
     num_lanes, capsules = len(coeffs), len(links)
-    shapes = _CASE_SHAPES | {
-        "arm.capsule_ends": (capsules, 2, 3),
-        "arm.capsule_radius": (capsules,),
-        "scene.beam_ends": (*beams[1:], 2, 3),
-        "scene.beam_radius": beams[1:],
-    }
+    of_joints = {name: (num, *shape) for name, shape in _JOINT_SHAPES.items()}
+    shapes = (
+        _CASE_SHAPES
+        | of_joints
+        | {
+            "arm.capsule_ends": (capsules, 2, 3),
+            "arm.capsule_radius": (capsules,),
+            "arm.shield_gap_radius": (capsules,),
+            "scene.beam_ends": (*beams[1:], 2, 3),
+            "scene.beam_radius": beams[1:],
+        }
+    )
     leaves = {"plan.motion.coeffs": coeffs} | judging.read_leaves(cases, shapes, num_lanes)
     of_plan = {"motion.durations": coeffs.shape[1:2], "contact_time": ()}
     leaves |= judging.read_leaves(plans, of_plan, num_lanes, "plan.")
     absent = leaves["scene.has_pole"] == 0
     leaves["scene.pole"] = np.where(absent[:, None], 0.0, leaves["scene.pole"])
     leaves["scene.pole_radius"] = np.where(absent, 0.0, leaves["scene.pole_radius"])
-    return leaves, links
+    return leaves
 
 
-def _judge(case: dict, links: tuple, relative: float, contact: float) -> dict:
+def _judge(case: dict, arm: Any, relative: float, contact: float) -> dict:
     finite = judging.finite_lanes(case, _UNBOUNDED_LEAVES)
     execution = case["plan.motion.durations"].sum(axis=1)
     # Time [s] from the end of the arm's motion to the contact with the ball.
@@ -181,9 +193,9 @@ def _judge(case: dict, links: tuple, relative: float, contact: float) -> dict:
     rest, parts["rest"] = _rest(case, motion, stays)
     tests["rest"] = rest
     turning = np.sqrt((np.abs(extremes[1][0]).max(axis=0) ** 2).sum(axis=0))
-    near = _clearances(case, links, motion, turning)
+    near = _clearances(case, arm, motion, turning)
     measured |= {f"{kind}_clearance": least for kind, (least, _, _) in near.items()}
-    for kind, (least, time, part) in _put_start_first(case, links, motion, near, contact).items():
+    for kind, (least, time, part) in _put_start_first(case, arm, motion, near, contact).items():
         tests[kind], parts[kind] = (-least > contact, -least, time), part
     measured = {name: np.where(sound, value, np.nan) for name, value in measured.items()}
     measured |= {"contact_time": case["plan.contact_time"], "execution_time": execution}
@@ -207,7 +219,7 @@ def _times(case: dict, stays: np.ndarray) -> tuple:
 class _Motion:
     """Joint angles of B arms as polynomials of degree D in M pieces."""
 
-    # (D + 1, 6, B, M), coefficients of rising powers of the time [s] since the piece's start.
+    # (D + 1, n, B, M), coefficients of rising powers of the time [s] since the piece's start.
     coeffs: np.ndarray
     durations: np.ndarray  # (B, M) [s]
     starts: np.ndarray  # (B, M) [s]
@@ -239,7 +251,7 @@ def _worst(excess: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarra
     lanes, top = np.arange(len(by_lane)), by_lane.argmax(axis=1)
     k, joint, piece = np.unravel_index(top, (*excess.shape[:2], excess.shape[3]))
     time = np.broadcast_to(times, excess.shape)[k, joint, lanes, piece]
-    return by_lane[lanes, top], time, _JOINTS[joint]
+    return by_lane[lanes, top], time, np.char.add("joint ", (joint + 1).astype(str))
 
 
 def _judge_limits(case: dict, motion: _Motion, extremes: list, relative: float) -> tuple:
@@ -285,7 +297,7 @@ def _final(motion: _Motion, stays: np.ndarray) -> np.ndarray:
     return judging.derivative(motion.coeffs[..., -1], motion.durations[:, -1] + beyond, 0)
 
 
-def _clearances(case: dict, links: tuple, motion: _Motion, turning: np.ndarray) -> dict[str, tuple]:
+def _clearances(case: dict, arm: Any, motion: _Motion, turning: np.ndarray) -> dict[str, tuple]:
     """Return by kind of obstacle each plan's least distance [m], its time [s], and the arm's part.
 
     `turning` (B, M) [rad/s] bounds the norm of the joint rates in each piece.
@@ -304,7 +316,7 @@ def _clearances(case: dict, links: tuple, motion: _Motion, turning: np.ndarray) 
         sample = np.arange(most[lanes[0]])
         times, angles = _sample(motion, lanes, count[lanes], sample)
         of_lanes = {name: leaf[lanes] for name, leaf in case.items()}
-        near = clearances(of_lanes, links, angles, sample < most[lanes, None])
+        near = clearances(of_lanes, arm, angles, sample < most[lanes, None])
         for kind, (least, at, part) in near.items():
             found[kind].append((least, times[np.arange(len(lanes)), at], part))
     back = np.argsort(order)
@@ -315,7 +327,7 @@ def _clearances(case: dict, links: tuple, motion: _Motion, turning: np.ndarray) 
 
 
 def _put_start_first(
-    case: dict, links: tuple, motion: _Motion, near: dict[str, tuple], contact: float
+    case: dict, arm: Any, motion: _Motion, near: dict[str, tuple], contact: float
 ) -> dict[str, tuple]:
     """Return the clearances `near`, with those of the start pose where the arm starts in contact.
 
@@ -329,7 +341,7 @@ def _put_start_first(
     angles = motion.coeffs[0][:, hit, :1]
     found = {}
     only = np.ones(angles.shape[1:], bool)
-    for kind, (least, _, part) in clearances(of_hit, links, angles, only).items():
+    for kind, (least, _, part) in clearances(of_hit, arm, angles, only).items():
         start = least, motion.starts[hit, 0], part
         is_inside = hit & (-least[index] > contact)
         pairs = zip(start, near[kind], strict=True)
@@ -353,13 +365,13 @@ def _judge_contact(case: dict, angles: np.ndarray, relative: float, contact: flo
     time, fall = case["plan.contact_time"], np.array([[0.0], [0.0], [1.0]]) * case["gravity"]
     ball = case["ball.pos"].T + case["ball.vel"].T * time - 0.5 * fall * time**2
     turns, positions = links_of(case, angles[..., None])
-    turn, middle = turns[5][..., 0], shield_middle(case, turns, positions)[..., 0]
+    turn, middle = (each[..., 0] for each in shield_pose(case, turns, positions))
     height, *beside = rotate_back(turn, ball - middle)
     toward, *across = rotate_back(turn, fall * time - case["ball.vel"].T)
     miss, tilt = np.hypot(*beside), np.arctan2(np.hypot(*across), toward)
     is_off = np.abs(height) > contact
     is_beside = (miss > case["offset"] * (1.0 + relative)) | (
-        np.abs(beside).max(axis=0) > case["arm.shield_half"] + contact
+        (np.abs(beside) > case["arm.shield_half"].T + contact).any(axis=0)
     )
     tests = {
         "ball": (is_off | is_beside, np.where(is_off, np.abs(height), miss), time),

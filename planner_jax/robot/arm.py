@@ -1,7 +1,8 @@
-"""An arm with a square shield at its flange: kinematics, limits, and plans of the joints.
+"""An arm of n joints with a flat shield at its flange: kinematics, limits, and plans of the joints.
 
-Positions are in the robot's base frame, z up, SI units; angles of n joints are (n,) [rad]. The
-frame of a link lies at its joint and turns with it, as in MuJoCo's files (see `robot.arm_mjcf`).
+The joints are hinges in a chain, six or seven of them. Positions are in the robot's base frame, z
+up, SI units; joint angles are (n,) [rad]. The frame of a link lies at its joint and turns with it,
+as in MuJoCo's model files.
 """
 
 import dataclasses
@@ -18,8 +19,16 @@ from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
 
 
 @struct.dataclass
+class ArmLimits:
+    """Greatest magnitudes of joint velocities and accelerations; `Arm` has the limits of angles."""
+
+    velocity: Array  # (n,) [rad/s]
+    acceleration: Array  # (n,) [rad/s^2]
+
+
+@struct.dataclass
 class Arm:
-    """An arm of n hinge joints: joints, links 1 to n, capsules around links, base and shield."""
+    """An arm of n joints: links 1 to n, capsules around the links, base and shield."""
 
     origin: Array  # (n, 3) [m], position of each joint in the frame of the previous link
     turn: Array  # (n, 4) unit quaternion w, x, y, z: rotation of the joint's frame at angle 0
@@ -27,29 +36,34 @@ class Arm:
     lower: Array  # (n,) [rad], least joint angles
     upper: Array  # (n,) [rad], greatest joint angles
     home: Array  # (n,) [rad], joint angles at which the arm waits
+    limits: ArmLimits  # greatest rates and accelerations of the joints
     mass: Array  # (n,) [kg], of each link
     centre: Array  # (n, 3) [m], centre of mass of each link, in the link's frame
     inertia: Array  # (n, 3, 3) [kg m^2], of each link about its centre of mass, link's axes
     capsule_ends: Array  # (C, 2, 3) [m], ends of each capsule's axis in the frame of its link
     capsule_radius: Array  # (C,) [m]
+    shield_gap_radius: Array  # (C,) [m], radius of each capsule in its distance from the shield
     base_box: Array  # (2, 3) [m], lowest and highest corner of the box around the base
     shield_centre: Array  # (3,) [m], middle of the shield's front face, in the frame of link n
-    shield_half: Array  # () [m], half of an edge; outward normal +x of link n, edges y and z
+    # (4,) unit quaternion w, x, y, z: rotation of the shield's frame in the frame of link n. The
+    # axes of the shield's frame are the outward normal and the directions of the two edges.
+    shield_turn: Array
+    shield_half: Array  # (2,) [m], halves of the shield's edges
     # (C,) link of each capsule: 0 to n - 1 are links 1 to n, -1 is the base.
     capsule_link: tuple[int, ...] = struct.field(pytree_node=False)
+    # Bodies that must not touch: pairs of capsules, the first one of the later link; capsules and
+    # the shield; capsules and the base box, which the shield must not touch either.
+    pairs: tuple[tuple[int, int], ...] = struct.field(pytree_node=False)
+    shield_pairs: tuple[int, ...] = struct.field(pytree_node=False)
+    base_pairs: tuple[int, ...] = struct.field(pytree_node=False)
+    joint_names: tuple[str, ...] = struct.field(pytree_node=False)
+    # Whether the last joint turns the shield in its own plane, about its middle.
+    turns_in_plane: bool = struct.field(pytree_node=False)
 
     @property
     def num(self) -> int:
         """Number n of joints; leading axes of a batch of arms are not counted."""
         return self.origin.shape[-2]
-
-
-@struct.dataclass
-class ArmLimits:
-    """Greatest magnitudes of joint velocities and accelerations; `Arm` has the limits of angles."""
-
-    velocity: Array  # (n,) [rad/s]
-    acceleration: Array  # (n,) [rad/s^2]
 
 
 @struct.dataclass
@@ -128,7 +142,9 @@ def shield_pose(arm: Arm, angles: Array) -> tuple[Array, Array]:
     The columns of the rotation are the outward normal and the two edges, in the base frame.
     """
     rotations, positions = link_frames(arm, angles)
-    return rotations[-1], positions[-1] + product(rotations[-1], jnp.asarray(arm.shield_centre))
+    last, turn = rotations[-1], quaternion_rotation(jnp.asarray(arm.shield_turn))
+    middle = positions[-1] + product(last, jnp.asarray(arm.shield_centre))
+    return product(last, turn), middle
 
 
 def shield_jacobian(arm: Arm, angles: Array) -> Array:

@@ -14,6 +14,7 @@ import re
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable
 
+import jax
 import numpy as np
 from numpy.typing import DTypeLike
 from scipy.spatial.transform import Rotation
@@ -22,7 +23,7 @@ from planner_jax.core.arithmetic import host_leaf
 from planner_jax.core.choices import require
 from planner_jax.core.errors import ArgumentError
 from planner_jax.host.files import open_plain
-from planner_jax.robot.arm import Arm
+from planner_jax.robot.arm import REGIMES, Arm
 from planner_jax.robot.arm_ik import explain_misfit
 
 # Elements that the reader ignores: at the top of the file (`_AROUND`) and in a body (`_IGNORED`).
@@ -31,6 +32,7 @@ _IGNORED = {"light", "camera", "site"}
 _FRAME = {"name", "pos", "quat", "euler"}
 _APPEARANCE = {"rgba", "group", "material"}
 _ORIGIN = (0.0, 0.0, 0.0)
+_FORK = 0.71  # see `_beside_shield`
 
 
 @functools.cache
@@ -92,14 +94,39 @@ def read_arm(path_or_xml: str, *, dtype: DTypeLike = np.float32) -> Arm:
         "capsule_radius": [radius for _, _, radius in shapes],
         "base_box": base_box,
         "shield_centre": shield_centre,
-        "shield_half": shield_half,
+        "shield_turn": (1.0, 0.0, 0.0, 0.0),
+        "shield_half": (shield_half, shield_half),
     }
+    leaves["shield_gap_radius"] = _beside_shield(leaves, [k for k, _, _ in shapes])
     arrays = {name: host_leaf(leaf, dtype) for name, leaf in leaves.items()}
-    arm = Arm(**arrays, capsule_link=tuple(k for k, _, _ in shapes))
+    link = tuple(k for k, _, _ in shapes)
+    every, numbered = range(len(link)), enumerate(links, start=1)
+    arm = Arm(
+        **arrays,
+        limits=jax.tree.map(lambda leaf: host_leaf(leaf, dtype), REGIMES["R2"].limits),
+        capsule_link=link,
+        pairs=tuple((k, j) for k in every for j in every if link[k] >= 2 and link[j] == 0),
+        shield_pairs=tuple(k for k in every if 0 <= link[k] <= 3),
+        base_pairs=tuple(k for k in every if link[k] >= 1),
+        joint_names=tuple(_one(link, "joint").get("name", f"joint_{k}") for k, link in numbered),
+        turns_in_plane=True,
+    )
     reason = explain_misfit(arm)
     if reason is not None:
         raise ValueError(f"inverse kinematics has no closed form for this arm: {reason}")
     return arm
+
+
+def _beside_shield(leaves: dict, links: list[int]) -> np.ndarray:
+    """Return the radii (C,) [m] of the capsules in their distances from the shield.
+
+    The forearm, link 4, ends in a fork around the wrist, and its capsule extends beyond the fork.
+    The capsule's radius is therefore reduced to a fraction of the distance between the wrist and
+    the shield's face.
+    """
+    radius = np.array(leaves["capsule_radius"], float)
+    wrist = np.linalg.norm(np.add(leaves["origin"][5], leaves["shield_centre"]))
+    return np.where(np.equal(links, 3), np.minimum(radius, _FORK * wrist), radius)
 
 
 class _Reader:

@@ -10,7 +10,7 @@ import jax
 import numpy as np
 
 from planner_jax.core.planner import Planner
-from planner_jax.referee.arm_clearance import links_of, shield_middle
+from planner_jax.referee.arm_clearance import links_of, shield_pose
 from planner_jax.runs.columns import BOOL, LIST, NUMBER, TEXT, Column, leaves_of
 from planner_jax.runs.style import draw
 from planner_jax.runs.summary import percent
@@ -300,7 +300,8 @@ def _balls(cases: BlockCase, flights: BlockFlights, lanes: np.ndarray) -> np.nda
     times, met = flown.times, flights.contact[lanes]
     free = np.moveaxis(ball_places(case, times), 0, 2)
     turns, places = links_of(case, flown.angles[lanes].transpose(2, 0, 1))
-    middle, normal = shield_middle(case, turns, places), turns[5][:, 0]
+    turn, middle = shield_pose(case, turns, places)
+    normal = turn[:, 0]
     rows = np.arange(len(lanes))
     at = np.clip(np.searchsorted(times, np.nan_to_num(met)), 1, len(times) - 1)
     shield = ((middle[:, rows, at] - middle[:, rows, at - 1]) / FRAME).T

@@ -18,7 +18,8 @@ import numpy as np
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.plan_files import leaves_by_name
 from planner_jax.core.protocol import is_solved
-from planner_jax.referee.arm_clearance import clearances, links_of, shield_middle
+from planner_jax.robot.arm import Arm
+from planner_jax.referee.arm_clearance import clearances, links_of, shield_pose
 from planner_jax.referee.block import times_inside
 from planner_jax.referee.solids import from_segment, rotate, rotate_back
 from planner_jax.runs.timing import measure_plans
@@ -272,7 +273,7 @@ def score(cases: BlockCase, plans: BlockPlan, flown: Executed, budget: Budget) -
     case, times = referee_leaves(cases), flown.times
     angles = flown.angles.transpose(2, 0, 1)
     turns, places = links_of(case, angles)
-    middle, turn = shield_middle(case, turns, places), turns[5]
+    turn, middle = shield_pose(case, turns, places)
     ball = ball_places(case, times)
     height, *beside = rotate_back(turn, ball - middle)
     gap, beside = height - BALL_RADIUS, np.stack(beside)
@@ -283,21 +284,21 @@ def score(cases: BlockCase, plans: BlockPlan, flown: Executed, budget: Budget) -
     when = times[:-1] + share * FRAME
     there = beside[..., :-1] + share * (beside[..., 1:] - beside[..., :-1])
     miss = np.where(comes & (when < entry[:, None]), np.linalg.norm(there, axis=0), np.inf)
-    over = np.abs(there).max(axis=0) <= case["arm.shield_half"][:, None]
+    half = case["arm.shield_half"].T[:, :, None]
+    over = np.all(np.abs(there) <= half, axis=0)
     lanes, first = np.arange(len(entry)), np.where(over, miss, np.inf).argmin(axis=1)
     hit = over[lanes, first] & np.isfinite(miss[lanes, first])
     nearest = miss.argmin(axis=1)
     at = np.where(hit, first, nearest)
     contact = np.where(hit, when[lanes, at], np.inf)
-    links = cases.arm.capsule_link
-    strikes = _strikes(case, links, turns, places, ball)
+    strikes = _strikes(case, cases.arm.capsule_link, turns, places, ball)
     struck = np.any(strikes & (times < np.minimum(contact, entry)[:, None]), axis=1)
     blocked = hit & ~struck
 
     touching = ball_places(case, np.where(blocked, contact, 0.0)[:, None])[..., 0].T
     until = np.where(np.isfinite(contact), contact, entry)
     before = times <= until[:, None]
-    least, name = _least(case, links, angles, before)
+    least, name = _least(case, cases.arm, angles, before)
     planned, unknown = np.asarray(is_solved(plans.status)), np.full(len(entry), np.nan)
     return BlockFlights(
         first_plan=plans,
@@ -311,7 +312,7 @@ def score(cases: BlockCase, plans: BlockPlan, flown: Executed, budget: Budget) -
         struck=struck,
         clearance=least,
         nearest=name,
-        clearance_after=_least(case, links, angles, ~before)[0],
+        clearance_after=_least(case, cases.arm, angles, ~before)[0],
         planned=planned,
         motions=planned.astype(int),
         fit_error=unknown,
@@ -337,13 +338,13 @@ def _strikes(
 
 
 def _least(
-    case: dict[str, np.ndarray], links: Sequence[int], angles: np.ndarray, included: np.ndarray
+    case: dict[str, np.ndarray], arm: Arm, angles: np.ndarray, included: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     least, names = [], []
     for begin in range(0, len(included), _LANES):
         some = slice(begin, begin + _LANES)
         own = {name: leaf[some] for name, leaf in case.items()}
-        found = clearances(own, links, angles[:, some], included[some])
+        found = clearances(own, arm, angles[:, some], included[some])
         distances = np.stack([distance for distance, _, _ in found.values()])
         which, lanes = distances.argmin(axis=0), np.arange(distances.shape[1])
         parts = np.stack([np.char.add(part, f", {kind}") for kind, (_, _, part) in found.items()])

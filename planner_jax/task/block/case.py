@@ -35,15 +35,15 @@ RULES: Table = (
     Field("ball.vel", (3,)),
     Field("gravity", (), rules.POSITIVE),
     Field("delay", (), rules.NOT_NEGATIVE),
-    Field("angles", (6,), _IN_RANGE),
-    Field("rates", (6,)),
-    Field("arm.lower", (6,), rules.below("arm.upper")),
-    Field("arm.upper", (6,)),
-    Field("arm.mass", (6,), rules.POSITIVE),
+    Field("angles", ("J",), _IN_RANGE),
+    Field("rates", ("J",)),
+    Field("arm.lower", ("J",), rules.below("arm.upper")),
+    Field("arm.upper", ("J",)),
+    Field("arm.mass", ("J",), rules.POSITIVE),
     Field("arm.capsule_radius", ("C",), rules.NOT_NEGATIVE),
-    Field("arm.shield_half", (), rules.POSITIVE),
-    Field("limits.velocity", (6,), rules.POSITIVE),
-    Field("limits.acceleration", (6,), rules.POSITIVE),
+    Field("arm.shield_half", (2,), rules.POSITIVE),
+    Field("limits.velocity", ("J",), rules.POSITIVE),
+    Field("limits.acceleration", ("J",), rules.POSITIVE),
     Field("ends_at_rest", (), kind=np.bool_),
     Field("offset", (), rules.POSITIVE),
     Field("tilt", (), rules.within(0.0, np.pi, "in [0, pi]")),
@@ -80,8 +80,8 @@ class BlockCase:
     ball: BallState  # position and velocity at time 0; the ball flies without drag
     gravity: Array  # () [m/s^2], magnitude
     delay: Array  # () [s], time at which the arm may start to move
-    angles: Array  # (6,) [rad], joint angles at the time `delay`
-    rates: Array  # (6,) [rad/s], joint rates at the time `delay`
+    angles: Array  # (n,) [rad], joint angles at the time `delay`
+    rates: Array  # (n,) [rad/s], joint rates at the time `delay`
     arm: Arm
     limits: ArmLimits
     ends_at_rest: Array  # () bool, whether the arm must be at rest at the contact
@@ -96,7 +96,7 @@ class BlockCase:
         return np.shape(self.gravity)
 
     def clearances(self, angles: Array) -> Array:
-        """Return the arm's least distances (N,) [m] from obstacles in N poses at angles (N, 6)."""
+        """Return the arm's least distances (N,) [m] from obstacles in N poses at angles (N, n)."""
         return least_clearances(self.arm, self.scene, angles)
 
 
@@ -105,7 +105,8 @@ def case(
     ball_vel: ArrayLike,
     *,
     delay: ArrayLike = 0.0,
-    regime: str = "R2",
+    regime: str | None = None,
+    limits: ArmLimits | None = None,
     wide: bool = False,
     anywhere: bool = False,
     scene: Scene | None = None,
@@ -122,18 +123,21 @@ def case(
         ball_vel: (3,) or (B, 3) [m/s], velocity of the ball at time 0.
         delay: () or (B,) [s], time at which the arm may start to move, >= 0. Delay, angles, rates
             and gravity are one value for all cases, or one value for each case.
-        regime: joint limits, and whether the motion ends at rest; a key of
+        regime: joint limits of an IRB 1600, and whether the motion ends at rest; a key of
             `planner_jax.robot.arm.REGIMES`. "R1": limits in the code of [Natarajan2024], any
-            velocity at the end. "R2": speeds of the robot's data sheet and 30 rad/s^2, at rest at
-            the end. "R3": limits of "R1", at rest at the end.
+            velocity at the end. "R2", the default: speeds of the robot's data sheet and
+            30 rad/s^2, at rest at the end. "R3": limits of "R1", at rest at the end. A regime is
+            not allowed for another arm, whose motions end at rest.
+        limits: greatest joint rates and accelerations, without batch axes; by default those of the
+            regime, or else of the arm.
         wide: whether the ball may meet the shield up to 0.1 m from its middle and tilted by up to
             30 degrees, instead of 2 mm and half a degree.
         anywhere: whether the ball may meet the shield anywhere and at any angle. This suits motions
             that were planned for another ball.
         scene: obstacles, without batch axes; by default the scene of [Natarajan2024].
         arm: without batch axes; by default an IRB 1600 with a shield.
-        angles: (6,) [rad], joint angles at the start; by default those at which the arm waits.
-        rates: (6,) [rad/s], joint rates at the start.
+        angles: (n,) [rad], joint angles at the start; by default those at which the arm waits.
+        rates: (n,) [rad/s], joint rates at the start.
         gravity: [m/s^2], magnitude, > 0.
         dtype: type of every floating leaf.
 
@@ -141,7 +145,6 @@ def case(
         ValueError: the regime is unknown, a shape is wrong, or a number breaks a rule.
         TypeError: an argument has a wrong type.
     """
-    require_name(REGIMES, "regime", regime)
     require_switch("wide", wide)
     require_switch("anywhere", anywhere)
     scene = paper_scene() if scene is None else scene
@@ -150,9 +153,18 @@ def case(
     require_kind("arm", arm, Arm)
     rule = "one with a capsule around at least one link"
     require(max(arm.capsule_link, default=-1) >= 0, "arm", rule, shown="none")
+    own, ends_at_rest = arm.limits, True
+    if regime is not None:
+        require_name(REGIMES, "regime", regime)
+        is_known = np.array_equal(arm.limits.velocity, REGIMES["R2"].limits.velocity)
+        require(is_known, "regime", "left out for an arm with limits of its own", regime)
+        own, ends_at_rest = REGIMES[regime].limits, REGIMES[regime].ends_at_rest
+    limits = own if limits is None else limits
+    require_kind("limits", limits, ArmLimits)
     angles = arm.home if angles is None else angles
-    rates = np.full(6, rates) if shape_of("rates", rates) == () else rates
-    vectors = {"ball_pos": (ball_pos, 3), "ball_vel": (ball_vel, 3), "angles": (angles, 6)}
+    num = arm.num
+    rates = np.full(num, rates) if shape_of("rates", rates) == () else rates
+    vectors = {"ball_pos": (ball_pos, 3), "ball_vel": (ball_vel, 3), "angles": (angles, num)}
     shapes = [batch_of(name, *given) for name, given in vectors.items()]
     shapes += [shape_of("delay", delay), shape_of("gravity", gravity)]
     batch, dtype = max(shapes, key=len), floating(dtype)
@@ -169,11 +181,11 @@ def case(
         ball=BallState(pos=leaf("ball_pos", ball_pos, 3), vel=leaf("ball_vel", ball_vel, 3)),
         gravity=leaf("gravity", gravity),
         delay=leaf("delay", delay),
-        angles=leaf("angles", angles, 6),
-        rates=leaf("rates", rates, 6),
+        angles=leaf("angles", angles, num),
+        rates=leaf("rates", rates, num),
         arm=jax.tree.map(repeat, arm),
-        limits=jax.tree.map(repeat, REGIMES[regime].limits),
-        ends_at_rest=jnp.broadcast_to(jnp.asarray(REGIMES[regime].ends_at_rest), batch),
+        limits=jax.tree.map(repeat, limits),
+        ends_at_rest=jnp.broadcast_to(jnp.asarray(ends_at_rest), batch),
         offset=leaf("offset", offset),
         tilt=leaf("tilt", tilt),
         scene=jax.tree.map(repeat, scene),

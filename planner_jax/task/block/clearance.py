@@ -1,8 +1,8 @@
 """Distances of an arm and its shield from obstacles, and between the arm's own links.
 
 The links are represented by capsules, and the shield by a plate of 0.01 m with rounded edges. The
-obstacles are a pole, the floor, beams, the base and other links. Distances between neighbouring
-links are not computed, nor distances of the links 5 and 6 from the shield, which they carry.
+obstacles are a pole, the floor, beams, the base and other links. The arm states which of its bodies
+must not touch each other.
 
 The functions process N poses of the arm at once. N is the last axis of arrays, so that a processor
 works on several poses with one instruction.
@@ -16,38 +16,33 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from planner_jax.robot.arm import Arm, link_frames
+from planner_jax.robot.arm import Arm, link_frames, quaternion_rotation
 from planner_jax.space import distances as space
 from planner_jax.task.block.scene import Scene
 
 FAR = 10.0  # [m], added to the distances from the pole if the scene has no pole
-# The forearm ends in a fork around the wrist, and the forearm's capsule extends beyond the fork.
-# For distances from the shield, the capsule's radius is therefore reduced to at most this fraction
-# of the distance between the wrist and the shield's face.
-_FORK = 0.71
 _HALF_THICKNESS = 0.005  # [m], of the shield
-_SHIELD_LINK = 5
 
 
 class _Poses(NamedTuple):
     ends: Array  # (2, 3, C, N) [m], ends of the capsules' axes
     middle: Array  # (3, N) [m], middle of the shield's plate
     edges: Array  # (2, 3, N) [m], half edges of the plate
-    axes: Array  # (6, 3, N), directions of the joints
-    origins: Array  # (6, 3, N) [m], positions of the joints
+    axes: Array  # (n, 3, N), directions of the joints
+    origins: Array  # (n, 3, N) [m], positions of the joints
 
 
 class _Pairs(NamedTuple):
     measure: Callable  # function of `space.distances` that returns the distance of two shapes
     bodies: tuple[Array, ...]  # arguments of `measure`; their last axes are (P or 1, N)
     thick: Array | float  # (P, 1) or () [m], sum of the radii around both bodies
-    link: np.ndarray | int  # (P,) or (), 0 to 5, link of the moving body
+    link: np.ndarray | int  # (P,) or (), 0 to n - 1, link of the moving body
     fixed: np.ndarray | int = -1  # link of the other body; -1 if it does not move
     first: bool = True  # whether the moving body is the first argument of `measure`
 
 
 def clearances(arm: Arm, scene: Scene, angles: Array) -> Array:
-    """Return the distances (R, N) [m] of R pairs of bodies, in N poses at angles (N, 6) [rad].
+    """Return the distances (R, N) [m] of R pairs of bodies, in N poses at angles (N, n) [rad].
 
     A pair is a link or the shield, and a body that it must not touch. A distance is negative
     if the bodies overlap. The first `num_of_pole(arm)` of the R rows are distances from the pole.
@@ -57,7 +52,7 @@ def clearances(arm: Arm, scene: Scene, angles: Array) -> Array:
 
 
 def least_clearances(arm: Arm, scene: Scene, angles: Array) -> Array:
-    """Return the least distance (N,) [m] of bodies that must not touch, at angles (N, 6) [rad]."""
+    """Return the least distance (N,) [m] of bodies that must not touch, at angles (N, n) [rad]."""
     return jnp.min(clearances(arm, scene, angles), axis=0)
 
 
@@ -67,14 +62,14 @@ def clearances_and_slopes(
     """Return distances (R, N) [m] of R pairs of bodies in N poses, and their derivative function.
 
     The function takes the indices (W,) of W of the N poses, and returns the derivatives of the R
-    distances at these poses by the joint angles, (R, 6, W) [m/rad]. The derivative by a joint that
+    distances at these poses by the joint angles, (R, n, W) [m/rad]. The derivative by a joint that
     moves both bodies of a pair as one is zero.
     """
     poses = _poses(arm, angles)
     every = _pairs(arm, scene, poses)
     found = [space.nearest_points(pairs.measure, *pairs.bodies) for pairs in every]
     distances = [each - pairs.thick for (each, _), pairs in zip(found, every, strict=True)]
-    joint = np.arange(6)[:, None]
+    joint = np.arange(arm.num)[:, None]
 
     def slopes_at(index: Array) -> Array:
         def at(array: Array) -> Array:  # selects poses; keeps arrays without poses
@@ -83,12 +78,12 @@ def clearances_and_slopes(
         # A joint turns about the axis a through the point o. The derivative of a distance along the
         # unit vector n at the point p is  a . ((p - o) x n), and  a . (o x n) = (a x o) . n.
         axes, origins = (tuple(jnp.moveaxis(at(each), 1, 0)[:, None]) for each in poses[3:])
-        arms = space.cross(axes, origins)  # 3 times (1, 6, W)
+        arms = space.cross(axes, origins)  # 3 times (1, n, W)
         slopes = []
         for (_, nearest), pairs in zip(found, every, strict=True):
             line = space.approach(pairs.measure, *jax.tree.map(at, (nearest, *pairs.bodies)))
             direction, moment = (tuple(each[:, None] for each in vector) for vector in line)
-            slope = space.dot(axes, moment) - space.dot(arms, direction)  # (P, 6, W)
+            slope = space.dot(axes, moment) - space.dot(arms, direction)  # (P, n, W)
             of_link, of_fixed = (np.reshape(each, (-1, 1, 1)) for each in (pairs.link, pairs.fixed))
             between = (joint > of_fixed) & (joint <= of_link)
             slopes.append(jnp.where(between, slope if pairs.first else -slope, 0.0))
@@ -99,11 +94,11 @@ def clearances_and_slopes(
 
 def num_of_pole(arm: Arm) -> int:
     """Return the number of bodies whose distance from the pole is computed: capsules and shield."""
-    return len(_from_link(arm, 1)) + 1
+    return len(_moving(arm)) + 1
 
 
-def _from_link(arm: Arm, first: int) -> np.ndarray:
-    return np.flatnonzero(np.asarray(arm.capsule_link) >= first - 1)
+def _moving(arm: Arm) -> np.ndarray:
+    return np.flatnonzero(np.asarray(arm.capsule_link) >= 0)
 
 
 def _poses(arm: Arm, angles: Array) -> _Poses:
@@ -122,14 +117,15 @@ def _poses(arm: Arm, angles: Array) -> _Poses:
     link = np.asarray(arm.capsule_link, np.int32)
     of_links = jnp.concatenate([rotations, fixed])[link]
     positions = jnp.concatenate([origins, jnp.zeros((1, 3, num), origins.dtype)])[link]
-    shield = rotations[_SHIELD_LINK]
-    face = origins[_SHIELD_LINK] + rotate(shield, jnp.asarray(arm.shield_centre))
+    face = origins[-1] + rotate(rotations[-1], jnp.asarray(arm.shield_centre))
+    columns = quaternion_rotation(jnp.asarray(arm.shield_turn)).T
+    normal, *edges = (rotate(rotations[-1], column) for column in columns)
     ends = [rotate(of_links, arm.capsule_ends[:, k]) + positions for k in range(2)]
     return lax.optimization_barrier(
         _Poses(
             ends=jnp.swapaxes(jnp.stack(ends), 1, 2),
-            middle=face - _HALF_THICKNESS * shield[:, 0],
-            edges=arm.shield_half * jnp.swapaxes(shield[:, 1:], 0, 1),
+            middle=face - _HALF_THICKNESS * normal,
+            edges=jnp.asarray(arm.shield_half)[:, None, None] * jnp.stack(edges),
             axes=rotate(rotations, jnp.asarray(arm.axis)),
             origins=origins,
         )
@@ -138,9 +134,8 @@ def _poses(arm: Arm, angles: Array) -> _Poses:
 
 def _pairs(arm: Arm, scene: Scene, poses: _Poses) -> list[_Pairs]:
     link, radius = np.asarray(arm.capsule_link), jnp.asarray(arm.capsule_radius)
-    turning, swung, far = (_from_link(arm, first) for first in (1, 2, 3))
-    trunk = np.flatnonzero(link == 0)
-    before = np.flatnonzero((link >= 0) & (link <= 3))
+    turning = _moving(arm)
+    swung, before = (np.array(each, int) for each in (arm.base_pairs, arm.shield_pairs))
     middle, edges = poses.middle[:, None], poses.edges[:, :, None]
     signs = ((1, 1), (1, -1), (-1, -1), (-1, 1))
     corners = [middle + a * edges[0] + b * edges[1] for a, b in signs]
@@ -153,22 +148,21 @@ def _pairs(arm: Arm, scene: Scene, poses: _Poses) -> list[_Pairs]:
     def with_beams(index: np.ndarray) -> Array:
         return jnp.concatenate([poses.ends[:, :, index], beams], axis=2)
 
-    wrist = jnp.sqrt(jnp.sum((arm.origin[5] + arm.shield_centre) ** 2))
-    thin = jnp.where(link[before] == 3, jnp.minimum(radius[before], _FORK * wrist), radius[before])
+    thin = jnp.asarray(arm.shield_gap_radius)[before]
     near_to = jnp.concatenate([thin, scene.beam_radius])[:, None] + _HALF_THICKNESS
-    # Pairs of links 3 to 6 with link 1, the trunk, and of links 1 to 6 with the beams. Link 2 is
-    # not paired with the trunk, because a joint connects both.
-    fixed = with_beams(trunk)
-    every = ((k, j) for k in turning for j in range(fixed.shape[2]))
-    moving, fixture = np.array([(k, j) for k, j in every if j >= len(trunk) or k in far]).T
-    against = fixed[:, :, fixture]
-    fixed_radius = jnp.concatenate([radius[trunk], scene.beam_radius])
+    # Pairs of the arm's own capsules, and pairs of each moving capsule with each beam.
+    others = np.unique([other for _, other in arm.pairs]).astype(int)
+    own = [(k, np.searchsorted(others, other)) for k, other in arm.pairs]
+    own += [(k, len(others) + beam) for k in turning for beam in range(num_beams)]
+    moving, fixture = np.array(own, int).reshape(-1, 2).T
+    against = with_beams(others)[:, :, fixture]
+    fixed_radius = jnp.concatenate([radius[others], scene.beam_radius])
     between = (radius[moving] + fixed_radius[fixture])[:, None]
-    of_fixed = np.where(fixture < len(trunk), 0, -1)
+    of_fixed = np.append(link[others], np.full(num_beams, -1))[fixture]
     near, (lower, upper) = with_beams(before), jnp.asarray(arm.base_box)
     of_near = np.append(link[before], np.full(num_beams, -1))
     pole = jnp.where(scene.has_pole, scene.pole_radius, -FAR)
-    thick, plate, shield, half = radius[:, None], (middle, edges), _SHIELD_LINK, _HALF_THICKNESS
+    thick, plate, shield, half = radius[:, None], (middle, edges), arm.num - 1, _HALF_THICKNESS
     to_pole = thick[turning] + pole
 
     boxed = jnp.concatenate([poses.ends[:, :, swung], outline], axis=2)

@@ -224,7 +224,8 @@ class OnlineBlock(Planner):
             return (k < straight + tries + kept) & (compares | ~is_solved(best.status))
 
         num, dtype = len(self._starts()[0]), case.angles.dtype
-        empty = levenberg.start_search(jnp.zeros(6 * self.pieces + 1, dtype), solver)
+        size = case.arm.num * self.pieces + 1
+        empty = levenberg.start_search(jnp.zeros(size, dtype), solver)
         searches = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (num, *leaf.shape)), empty)
         costs, best = jnp.full(num, jnp.inf, dtype), make_empty_plan(case, self.pieces)
         turn = (jnp.zeros((), jnp.int32), searches, costs, best)
@@ -329,10 +330,10 @@ class OnlineBlock(Planner):
         """Split the unknowns into joint rates and a duration.
 
         Returns:
-            The rates after each of K pieces (K, 6) and at the start (6,), both multiplied by the
+            The rates after each of K pieces (K, n) and at the start (n,), both multiplied by the
             duration [rad], and the duration () [s].
         """
-        steps = point[:-1].reshape(self.pieces, 6)
+        steps = point[:-1].reshape(self.pieces, case.arm.num)
         duration = jnp.maximum(point[-1] - case.delay, 1e-3)
         last = jnp.where(case.ends_at_rest, 0.0, steps[-1])
         return steps.at[-1].set(last), case.rates * duration, duration
@@ -353,7 +354,7 @@ class OnlineBlock(Planner):
         is_of_pole = np.arange(gaps.shape[0]) < num_of_pole(case.arm)
         margins = np.where(is_of_pole, self.pole_margin, 1.3 * self.margin)[:, None]
         near, worst = lax.top_k(jnp.max(margins - gaps, axis=0), self.worst)
-        slopes = slopes_at(worst)  # (R, 6, W)
+        slopes = slopes_at(worst)  # (R, n, W)
         short = jnp.maximum(margins - gaps[:, worst], 0.0) * self.weights.clearance  # (R, W)
         active = jnp.where(short > 0.0, -self.weights.clearance, 0.0)
         lifts, short = lax.optimization_barrier((slopes * active[:, None], short))
@@ -370,11 +371,11 @@ class OnlineBlock(Planner):
         of_first, of_steps = (jnp.asarray(each, dtype) for each in weights)
         chosen = jnp.append(worst, self.samples - 1)
         lift = of_steps[chosen]  # (W + 1, K)
-        drift = of_first[chosen][:, None] * case.rates[None]  # (W + 1, 6)
+        drift = of_first[chosen][:, None] * case.rates[None]  # (W + 1, n)
         gradient, curvature = motion.lift_to_unknowns(lift, drift, grams, pushes, joints)
-        size = 6 * pieces
+        size = case.arm.num * pieces
         ends_free = jnp.where(case.ends_at_rest, 0.0, 1.0)
-        free = jnp.ones(size + 1, dtype).at[size - 6 : size].set(ends_free)
+        free = jnp.ones(size + 1, dtype).at[size - case.arm.num : size].set(ends_free)
         too_near = near[0] - 0.3 * self.margin
         return Model(
             cost=joints.cost + jnp.sum(rows**2) + jnp.sum(short**2),

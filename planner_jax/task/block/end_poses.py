@@ -26,7 +26,7 @@ class EndPoses:
     A straight motion turns all joints in proportion from the start to the pose.
     """
 
-    angles: Array  # (C, 6) [rad], joint angles
+    angles: Array  # (C, n) [rad], joint angles
     time: Array  # (C,) [s], of the contact of shield and ball
     # (C,), greatest ratio of a joint's rate or acceleration to its limit in the straight motion;
     # infinite if the arm cannot reach the pose.
@@ -74,11 +74,11 @@ def profile_peaks(pieces: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def end_poses(
     case: BlockCase, flight: Flight, points: int, pieces: int, *, quickest: bool = False
 ) -> EndPoses:
-    """Return the eight arm poses that meet the ball at each of `points` points of its path.
+    """Return the arm poses that meet the ball at each of `points` points of its path.
 
-    The points lie where the ball has entered the outer box but not the inner box. The eight poses
-    are the branches of the inverse kinematics. Joint 6 keeps its angle, because it only turns the
-    shield in its own plane. A straight motion of `pieces` pieces leads to each pose. Its speed
+    The points lie where the ball has entered the outer box but not the inner box. The poses are the
+    solutions of the inverse kinematics. The last joint keeps its angle if it only turns the shield
+    in its own plane. A straight motion of `pieces` pieces leads to each pose. Its speed
     profile is the one that stays farthest below the joints' limits; with `quickest`, motions that
     end at rest have the profile that can be executed in the least time.
     """
@@ -92,8 +92,10 @@ def end_poses(
         return inverse_kinematics(case.arm, rotation, ball.pos + shift)
 
     angles, found = jax.vmap(solve_point)(time, offset)
-    angles = angles.at[:, :, 5].set(case.angles[5]).reshape(-1, 6)
-    time = jnp.repeat(time, 8)
+    if case.arm.turns_in_plane:
+        angles = angles.at[:, :, -1].set(case.angles[-1])
+    time = jnp.repeat(time, angles.shape[1])
+    angles = angles.reshape(-1, case.arm.num)
     duration = jnp.maximum(time - case.delay, 1e-3)
     turned = jnp.abs(angles - coast(case, duration, pieces))
     rates, rises, rests = profile_peaks(pieces)
@@ -117,13 +119,14 @@ def end_poses(
 
 
 def coast(case: BlockCase, duration: Array, pieces: int) -> Array:
-    """Return the joint angles (..., 6) [rad] at standstill after braking in a motion's first piece.
+    """Return the joint angles (..., n) [rad] at standstill after braking in a motion's first piece.
 
     The motion has `pieces` equal pieces and the `duration` (...) [s]. It starts at the case's joint
     angles and rates.
     """
     of_first = step_weights(pieces, (1.0,))[0][0]
-    angles, rates = (jnp.broadcast_to(x, (*duration.shape, 6)) for x in (case.angles, case.rates))
+    shape = *duration.shape, case.arm.num
+    angles, rates = (jnp.broadcast_to(x, shape) for x in (case.angles, case.rates))
     return angles + of_first * duration[..., None] * rates
 
 
@@ -142,14 +145,14 @@ def frame_of(normal: Array) -> Array:
 def contact_terms(
     case: BlockCase, flight: Flight, angles: Array, time: Array, weights: Weights
 ) -> tuple[Array, Array, Array]:
-    """Return the residuals of the contact of shield and ball at angles (6,) [rad] and a time [s].
+    """Return the residuals of the contact of shield and ball at angles (n,) [rad] and a time [s].
 
     Returns:
         rows: (6,), weighted residuals: the ball's distance from the shield's plane; its offset from
             the shield's middle in the plane (2); the shield's tilt (2); the time by which the
             contact is before the interval `flight` or after it. Offset and tilt count only beyond
             the tolerances of the case.
-        slopes: (6, 7), derivatives of the rows by the angles and the time.
+        slopes: (6, n + 1), derivatives of the rows by the angles and the time.
         excess: (), largest relative excess over a tolerance, without weights.
     """
     rotation, middle = shield_pose(case.arm, angles)
@@ -158,7 +161,7 @@ def contact_terms(
     velocity = ball.vel
     normal = rotation[:, 0]
     away = ball.pos - middle
-    turns = jacobian[3:].T  # (6, 3), joint axes
+    turns = jacobian[3:].T  # (n, 3), joint axes
     moves = jacobian[:3].T
     by_normal = jnp.cross(turns, normal)
     # Distance of the ball from the plane of the shield.
@@ -209,7 +212,7 @@ def contact_terms(
             weights.meeting * off_slope[None],
             is_beside * product(beside_slope, across).T,
             is_tilted * tilt_rows.T,
-            pace * jnp.zeros((1, 7), angles.dtype).at[0, 6].set(edge),
+            pace * jnp.zeros((1, angles.size + 1), angles.dtype).at[0, -1].set(edge),
         ]
     )
     excess = jnp.stack(

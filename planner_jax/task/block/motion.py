@@ -1,6 +1,6 @@
 """Joint motions of an arm whose rates are linear in time between equidistant knots.
 
-A motion has K pieces. Its parameters are the steps (K, 6) [rad]: the joint rates at the ends of the
+A motion has K pieces. Its parameters are the steps (K, n) [rad]: the joint rates at the ends of the
 pieces, multiplied by the duration. The angles then do not depend on the duration. They are
 quadratic in time between knots. Rates have their extremes at knots, and accelerations are constant
 between knots, so that checks at the knots suffice for the limits of both.
@@ -53,10 +53,10 @@ def step_weights(pieces: int, shares: tuple[float, ...]) -> tuple[np.ndarray, np
 
 
 def angles_at(start: Array, first: Array, steps: Array, shares: tuple[float, ...]) -> Array:
-    """Return the joint angles (N, 6) [rad] of a motion at N times: `shares` of its duration.
+    """Return the joint angles (N, n) [rad] of a motion at N times: `shares` of its duration.
 
-    The motion has K pieces and the initial angles `start` (6,) [rad]. The initial rates are `first`
-    (6,), and the rates after each piece `steps` (K, 6), both multiplied by the duration [rad].
+    The motion has K pieces and the initial angles `start` (n,) [rad]. The initial rates are `first`
+    (n,), and the rates after each piece `steps` (K, n), both multiplied by the duration [rad].
     """
     of_first, of_steps = step_weights(steps.shape[0], shares)
     turned = jnp.matmul(jnp.asarray(of_steps, steps.dtype), steps, precision=lax.Precision.HIGHEST)
@@ -71,8 +71,8 @@ class JointTerms(NamedTuple):
     """
 
     cost: Array  # (), r . r, summed over the joints
-    gradient: Array  # (6, K + 1), J^T r
-    curvature: Array  # (6, K + 1, K + 1), J^T J
+    gradient: Array  # (n, K + 1), J^T r
+    curvature: Array  # (n, K + 1, K + 1), J^T J
     excess: Array  # (), largest relative excess over a limit
 
 
@@ -81,7 +81,7 @@ def joint_terms(
 ) -> JointTerms:
     """Compute the cost of the joints' limits and accelerations, with its derivatives.
 
-    The joint rates at the start are `first` (6,) [rad], and at the ends of K pieces `steps` (K, 6)
+    The joint rates at the start are `first` (n,) [rad], and at the ends of K pieces `steps` (K, n)
     [rad], both multiplied by the motion's `duration` () [s]. Rates, accelerations and angles are
     penalised above `most` times their limits.
     """
@@ -133,9 +133,9 @@ def joint_terms(
 
 
 def bump_steps(height: Array, pieces: int) -> Array:
-    """Return offsets (K, 6) [rad] of a motion's parameters that add a detour to its joint angles.
+    """Return offsets (K, n) [rad] of a motion's parameters that add a detour to its joint angles.
 
-    The detour height sin^2(pi s), with time s as a fraction of the duration, reaches `height` (6,)
+    The detour height sin^2(pi s), with time s as a fraction of the duration, reaches `height` (n,)
     [rad] at half of the duration and ends at zero. The offsets are its rates at the ends of the
     K = `pieces` pieces, multiplied by the duration: pi height sin(2 pi s).
     """
@@ -146,8 +146,8 @@ def bump_steps(height: Array, pieces: int) -> Array:
 def polynomial(start: Array, first: Array, steps: Array, duration: Array) -> PiecewisePolynomial:
     """Convert a motion of `duration` [s] to K polynomial pieces of degree 2.
 
-    The joint angles start at `start` (6,) [rad]. The joint rates at the start are `first` (6,), and
-    at the ends of the pieces `steps` (K, 6), both multiplied by the duration [rad].
+    The joint angles start at `start` (n,) [rad]. The joint rates at the start are `first` (n,), and
+    at the ends of the pieces `steps` (K, n), both multiplied by the duration [rad].
     """
     pieces = steps.shape[0]
     step = duration / pieces
@@ -166,7 +166,7 @@ def speed_up(
 ) -> tuple[PiecewisePolynomial, Array]:
     """Shorten the duration of a motion along its path until a joint reaches one of its limits.
 
-    The motion is piecewise quadratic, from rest to rest; the limits are (6,) [rad/s], [rad/s^2].
+    The motion is piecewise quadratic, from rest to rest; the limits are (n,) [rad/s], [rad/s^2].
 
     Returns:
         motion: the motion with the same path and the shorter duration.
@@ -224,32 +224,33 @@ def lift_to_unknowns(
 ) -> tuple[Array, Array]:
     """Return J^T r and J^T J, where J is the Jacobian of all residuals r by all unknowns.
 
-    The unknowns are the rates of each of the six joints after K pieces of the motion, multiplied by
+    The unknowns are the rates of each of the n joints after K pieces of the motion, multiplied by
     its duration, and the time of contact.
 
     Args:
         lift: (W, K), derivatives of a joint's angle at W samples by the K unknowns of the joint.
-        drift: (W, 6), derivatives of the joint angles at the samples by the time of contact.
-        grams: (W, 7, 7), J^T J of the residuals at each sample, here with the Jacobian J by the six
-            joint angles and the time.
-        pushes: (W, 7), J^T r of the residuals at each sample, with the same J.
+        drift: (W, n), derivatives of the joint angles at the samples by the time of contact.
+        grams: (W, n + 1, n + 1), J^T J of the residuals at each sample, here with the Jacobian J by
+            the n joint angles and the time.
+        pushes: (W, n + 1), J^T r of the residuals at each sample, with the same J.
         joints: terms of the joints' limits and accelerations.
     """
-    grams_q, grams_t = grams[:, :6, :6], grams[:, :6, 6]
+    num = drift.shape[1]
+    grams_q, grams_t = grams[:, :num, :num], grams[:, :num, num]
     moved = jnp.einsum("wij,wj->wi", grams_q, drift, precision=_HIGHEST) + grams_t
-    time_stiffness = jnp.sum(grams[:, 6, 6] + jnp.sum(drift * (moved + grams_t), axis=1))
-    time_push = jnp.sum(pushes[:, 6] + jnp.sum(drift * pushes[:, :6], axis=1))
+    time_stiffness = jnp.sum(grams[:, num, num] + jnp.sum(drift * (moved + grams_t), axis=1))
+    time_push = jnp.sum(pushes[:, num] + jnp.sum(drift * pushes[:, :num], axis=1))
     stiffness = jnp.einsum("wk,wl,wij->kilj", lift, lift, grams_q, precision=_HIGHEST)
     coupling = jnp.einsum("wk,wi->ki", lift, moved, precision=_HIGHEST)
-    steps_push = jnp.einsum("wk,wi->ki", lift, pushes[:, :6], precision=_HIGHEST)
-    each = jnp.eye(6, dtype=lift.dtype)
+    steps_push = jnp.einsum("wk,wi->ki", lift, pushes[:, :num], precision=_HIGHEST)
+    each = jnp.eye(num, dtype=lift.dtype)
     of_each = joints.curvature[:, :-1, :-1]
     stiffness += jnp.einsum("ikl,ij->kilj", of_each, each, precision=_HIGHEST)
     coupling += joints.curvature[:, :-1, -1].T
     steps_push += joints.gradient[:, :-1].T
     time_push += jnp.sum(joints.gradient[:, -1])
     time_stiffness += jnp.sum(joints.curvature[:, -1, -1])
-    size = 6 * lift.shape[1]
+    size = num * lift.shape[1]
     curvature = jnp.zeros((size + 1, size + 1), lift.dtype)
     curvature = curvature.at[:size, :size].set(stiffness.reshape(size, size))
     curvature = curvature.at[:size, size].set(coupling.reshape(-1))

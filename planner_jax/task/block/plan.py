@@ -25,7 +25,7 @@ class BlockPlan(ArmPlan):
 def make_empty_plan(case: BlockCase, pieces: int) -> BlockPlan:
     """Return a plan with the status INFEASIBLE in which the arm stands still for 1 s."""
     none = jnp.full((), jnp.inf, case.angles.dtype)
-    still = jnp.zeros((pieces, 6), case.angles.dtype)
+    still = jnp.zeros((pieces, case.arm.num), case.angles.dtype)
     second = jnp.ones((), case.angles.dtype)
     return BlockPlan(
         motion=polynomial(case.angles, still[0], still, second),

@@ -111,8 +111,8 @@ class ReplanBlock(Planner):
 
         `previous` is the plan of `cases` that is executed, `elapsed` () or (B,) [s] >= 0 the time
         since its start. `ball` is the estimated ball at time 0 of the cases, by default the ball of
-        the cases. `angles` [rad] and `rates` [rad/s] at the start of the new motion are (6,), or
-        (B, 6) for B cases. By default they are taken from the previous plan, whose motion is
+        the cases. `angles` [rad] and `rates` [rad/s] at the start of the new motion are (n,), or
+        (B, n) for B cases. By default they are taken from the previous plan, whose motion is
         followed by braking.
         """
         elapsed, batch = check_elapsed(cases, elapsed), cases.batch_shape

@@ -17,7 +17,7 @@ import numpy as np
 from jax import Array
 from scipy.spatial.transform import Rotation
 
-from planner_jax.referee.arm_clearance import links_of, shield_middle
+from planner_jax.referee.arm_clearance import links_of, shield_pose
 from planner_jax.robot.arm import Arm
 from planner_jax.robot.arm_mjcf import read_arm
 from planner_jax.sims.model import World
@@ -47,7 +47,7 @@ def lanes_of(arm: Arm) -> dict[str, np.ndarray]:
 
     The names, such as "arm.origin", are the names that the referee's function `links_of` reads.
     """
-    names = ("origin", "turn", "axis", "shield_centre")
+    names = ("origin", "turn", "axis", "shield_centre", "shield_turn")
     return {f"arm.{name}": np.asarray(getattr(arm, name), float)[None] for name in names}
 
 
@@ -90,7 +90,7 @@ class ShieldArm:
             f'<geom type="box" pos="{xml_numbers(*middle)}" size="{xml_numbers(*half)}" '
             f'rgba=".3 .3 .3 1" {VISUAL}/>'
         )
-        plate = [0.5 * _THICKNESS, arm.shield_half, arm.shield_half]
+        plate = [0.5 * _THICKNESS, *arm.shield_half]
         behind = arm.shield_centre - [0.5 * _THICKNESS, 0.0, 0.0]
         solids[5].append(
             f'<geom name="shield" type="box" pos="{xml_numbers(*behind)}" '
@@ -204,7 +204,7 @@ class ShieldArm:
         """Return the centre of the shield's face, (..., 3) [m], at joint angles (..., 6)."""
         case = lanes_of(self.arm)
         angles = np.moveaxis(np.reshape(poses, (1, -1, 6)), 2, 0)
-        middle = shield_middle(case, *links_of(case, angles))[:, 0].T
+        middle = shield_pose(case, *links_of(case, angles))[1][:, 0].T
         return middle.reshape(*np.shape(poses)[:-1], 3) + [0.0, 0.0, self.base_height]
 
     def find_held_ball(self, pose: np.ndarray) -> np.ndarray:

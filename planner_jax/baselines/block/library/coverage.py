@@ -49,7 +49,7 @@ def coverage(library: Library) -> Coverage:
     tunnel = tunnels(library.table.layout, scene.inner, scene.outer)
     row = unpack_rows(np.asarray(library.table.rows))
     far = np.asarray(_farthest(tunnel.outer, tunnel.inner, row))
-    half = float(np.asarray(library.setting.arm.shield_half))
+    half = float(np.min(library.setting.arm.shield_half))
     return Coverage(
         is_feasible=tunnel.is_feasible,
         is_centred=tunnel.is_centred,

@@ -28,6 +28,7 @@ from planner_jax.baselines.block.library.table import (
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.plan_files import UNREADABLE, build_tree, leaves_by_name
 from planner_jax.host.files import open_plain, replacing
+from planner_jax.robot.arm import Arm
 
 VERSION = 1
 # Version of the planning method. An interrupted build continues only with the same version.
@@ -48,7 +49,7 @@ def save_library(path: str | os.PathLike, library: Library) -> None:
     header: dict[str, object] = {
         "fingerprint": fingerprint(setting),
         "layout": dataclasses.asdict(table.layout),
-        "links": list(setting.arm.capsule_link),
+        "arm": {name: getattr(setting.arm, name) for name in _named_parts()},
     }
     offsets, end = {}, 0
     for name, array in arrays.items():
@@ -124,8 +125,19 @@ def _map_library(path: str | os.PathLike, header: dict[str, PyTree]) -> Library:
         )
     )
     rows, homes = arrays.pop("rows"), arrays.pop("homes")
-    setting = build_tree(Setting, "", arrays | {"arm.capsule_link": tuple(header["links"])})
+    parts = {f"arm.{name}": _freeze(value) for name, value in header["arm"].items()}
+    setting = build_tree(Setting, "", arrays | parts)
     return library_of(rows, homes, layout, setting)
+
+
+def _named_parts() -> list[str]:
+    """Return the names of an arm's fields that are not arrays."""
+    fields = dataclasses.fields(Arm)
+    return [field.name for field in fields if not field.metadata.get("pytree_node", True)]
+
+
+def _freeze(value: PyTree) -> PyTree:
+    return tuple(map(_freeze, value)) if isinstance(value, list) else value
 
 
 def _to_stored(leaf: ArrayLike) -> np.ndarray:

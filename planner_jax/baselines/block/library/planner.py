@@ -128,7 +128,7 @@ def _plan_from_answer(table: Table, case: BlockCase, home: Array) -> BlockPlan:
     angle = jnp.arccos(jnp.clip(answer.cosine, -1.0, 1.0))
     excess = [
         early - 1.0,
-        jnp.max(jnp.abs(beside)) / case.arm.shield_half - 1.0,
+        jnp.max(jnp.abs(beside) / case.arm.shield_half) - 1.0,
         jnp.sqrt(jnp.maximum(jnp.sum(beside**2), 1e-12)) / case.offset - 1.0,
         angle / case.tilt - 1.0,
         -answer.slack / 1e-3,

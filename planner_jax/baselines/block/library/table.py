@@ -44,7 +44,9 @@ def setting_of(case: BlockCase) -> Setting:
 
 def fingerprint(setting: Setting) -> str:
     """Return a hash of arm, limits and scene in float32, as twelve hexadecimal digits."""
-    digest = hashlib.sha256(repr(setting.arm.capsule_link).encode())
+    arm = setting.arm
+    bodies = arm.capsule_link, arm.pairs, arm.shield_pairs, arm.base_pairs
+    digest = hashlib.sha256(repr(bodies).encode())
     for path, leaf in jax.tree_util.tree_leaves_with_path(setting):
         value = np.asarray(leaf)
         value = value.astype("<f4") if value.dtype.kind == "f" else value.astype("<i4")
