@@ -42,6 +42,7 @@ from .planning.batch import Progress as Progress
 from .planning.gradient import gradient as gradient
 from .planning.plan import plan as plan
 from .planning.plan import solve as solve
+from .planning.plan import warm_up as warm_up
 from .planning.replan import replan as replan
 from .recovery.planner import RecoveryPlanner as RecoveryPlanner
 from .recovery.with_recovery import RecoveringPlanner as RecoveringPlanner

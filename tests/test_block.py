@@ -14,6 +14,7 @@ from planner_jax.referee.arm_clearance import KINDS
 from planner_jax.referee.arm_clearance import clearances as referee_clearances
 from planner_jax.robot.arm import REGIMES
 from planner_jax.robot.arm_mjcf import irb1600
+from planner_jax.runs.timing import CompileClock
 from planner_jax.sweep.block.settings import REGIMES as SWEPT
 from planner_jax.task.block.clearance import clearances, clearances_and_slopes, num_of_pole
 from planner_jax.task.block.default_planner import (
@@ -324,3 +325,15 @@ def test_an_arm_has_limits_of_its_own_and_no_regime_of_another_arm():
     assert case.ends_at_rest
     with pytest.raises(ValueError, match="regime must be left out for an arm with limits of its"):
         throw(arm=foreign, regime="R1")
+
+
+def test_after_a_warm_up_no_case_waits_for_the_compiler():
+    planner, hard = pj.block.planner(), throw()
+    easy = pj.block.case(hard.ball.pos, hard.ball.vel, scene=paper_scene(has_pole=False))
+    pj.warm_up(planner, easy)
+    with CompileClock() as clock:
+        assert pj.plan(planner, easy).iterations == 0
+        assert pj.plan(planner, hard).iterations > 0
+    assert clock.seconds == 0.0
+    with pytest.raises(ValueError, match="case must be one case, got batch shape"):
+        pj.warm_up(planner, pj.block.draw(2))

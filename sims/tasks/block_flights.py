@@ -18,10 +18,10 @@ import numpy as np
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.plan_files import leaves_by_name
 from planner_jax.core.protocol import is_solved
-from planner_jax.robot.arm import Arm
 from planner_jax.referee.arm_clearance import clearances, links_of, shield_pose
 from planner_jax.referee.block import times_inside
 from planner_jax.referee.solids import from_segment, rotate, rotate_back
+from planner_jax.robot.arm import Arm
 from planner_jax.runs.timing import measure_plans
 from planner_jax.sims.execution import FRAME, TIMESTEP, Executed, execute
 from planner_jax.sims.launch import flight_keys
