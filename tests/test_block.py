@@ -12,7 +12,7 @@ from planner_jax.core.plan_files import leaves_by_name
 from planner_jax.optimise.levenberg import LevenbergConfig
 from planner_jax.referee.arm_clearance import KINDS
 from planner_jax.referee.arm_clearance import clearances as referee_clearances
-from planner_jax.robot.arm import REGIMES
+from planner_jax.robot.arm import REGIMES, reach_of
 from planner_jax.robot.arm_mjcf import irb1600
 from planner_jax.runs.timing import CompileClock
 from planner_jax.sweep.block.settings import REGIMES as SWEPT
@@ -337,3 +337,16 @@ def test_after_a_warm_up_no_case_waits_for_the_compiler():
     assert clock.seconds == 0.0
     with pytest.raises(ValueError, match="case must be one case, got batch shape"):
         pj.warm_up(planner, pj.block.draw(2))
+
+
+def test_throws_at_another_arm_are_scaled_to_its_reach():
+    arm = irb1600()
+    small = dataclasses.replace(arm, origin=0.5 * arm.origin, shield_centre=0.5 * arm.shield_centre)
+    cases, usual = pj.block.draw(4, "pole", arm=small), pj.block.draw(4, "pole")
+    np.testing.assert_allclose(reach_of(small), 0.5 * reach_of(arm), rtol=1e-6)
+    np.testing.assert_allclose(cases.scene.inner.upper, 0.5 * usual.scene.inner.upper, rtol=1e-6)
+    np.testing.assert_allclose(cases.scene.pole, 0.5 * usual.scene.pole, rtol=1e-6)
+    flight = jax.vmap(flight_of)(cases)
+    assert flight.comes.all()
+    with pytest.raises(ValueError, match="size must be > 0"):
+        paper_scene(size=0.0)

@@ -95,15 +95,17 @@ _BRISK = (Search(tries=0), *_LEAST_SQUARES)
 
 
 @functools.cache
-def read_learned_starts(num: int = 0) -> tuple[np.ndarray, np.ndarray]:
+def read_learned_starts(num: int = 0, joints: int = 6) -> tuple[np.ndarray, np.ndarray]:
     """Read the stored starting points, each a straight motion in joint space plus a detour.
 
     If there are fewer than `num`, further ones are drawn: the ranks in turn, and detours from the
-    normal distribution with the stored detours' mean and standard deviation for each joint.
+    normal distribution with the stored detours' mean and standard deviation for each joint. The
+    detours were learned for an arm of six joints. For an arm of seven joints, the additional joint
+    is the third one, which turns the upper arm about its axis, and has no detour.
 
     Returns:
         ranks: (N,) int32, index of the motion's end pose among poses in order of rising effort.
-        bumps: (N, 6), detour of each joint [rad] at half of the motion's duration.
+        bumps: (N, n), detour of each joint [rad] at half of the motion's duration.
     """
     starts = json.loads((Path(__file__).parent / "learned_starts.json").read_text())
     ranks = np.array([start["rank"] for start in starts], np.int32)
@@ -112,7 +114,8 @@ def read_learned_starts(num: int = 0) -> tuple[np.ndarray, np.ndarray]:
     drawn = np.random.default_rng(0).normal(size=(more, bumps.shape[1]))
     drawn = (bumps.mean(axis=0) + bumps.std(axis=0) * drawn).astype(np.float32)
     turns = (np.arange(more) % (1 + ranks.max())).astype(np.int32)
-    return np.append(ranks, turns), np.concatenate([bumps, drawn])
+    every = np.insert(np.concatenate([bumps, drawn]), [2] * (joints - bumps.shape[1]), 0.0, axis=1)
+    return np.append(ranks, turns), every
 
 
 def _combine_excess(joints: Array, contact: Array, too_near: Array) -> Array:
@@ -223,7 +226,7 @@ class OnlineBlock(Planner):
             compares = (k < straight) if self.brisk else False
             return (k < straight + tries + kept) & (compares | ~is_solved(best.status))
 
-        num, dtype = len(self._starts()[0]), case.angles.dtype
+        num, dtype = len(self._starts(case)[0]), case.angles.dtype
         size = case.arm.num * self.pieces + 1
         empty = levenberg.start_search(jnp.zeros(size, dtype), solver)
         searches = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (num, *leaf.shape)), empty)
@@ -297,11 +300,12 @@ class OnlineBlock(Planner):
         in_time = jnp.sum(poses.effort <= 1.0 - self.slack)
         return jnp.where(flight.comes, jnp.minimum(in_time, attempt.straight), 0)
 
-    def _starts(self) -> tuple[np.ndarray, np.ndarray]:
-        return read_learned_starts(max(search.first + search.tries for search in self.searches))
+    def _starts(self, case: BlockCase) -> tuple[np.ndarray, np.ndarray]:
+        most = max(search.first + search.tries for search in self.searches)
+        return read_learned_starts(most, case.arm.num)
 
     def _encode_start(self, case: BlockCase, poses: EndPoses, order: Array, k: Array) -> Array:
-        ranks, bumps = (jnp.asarray(each) for each in self._starts())
+        ranks, bumps = (jnp.asarray(each) for each in self._starts(case))
         k = jnp.minimum(k, len(ranks) - 1)
         point = self.encode_straight(case, poses, order[ranks[k]])
         bump = motion.bump_steps(bumps[k].astype(point.dtype), self.pieces)

@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike
 
 from planner_jax.ball.flight import BallState, drag_free_fall_time
 from planner_jax.core.arithmetic import host_leaf
+from planner_jax.core.choices import require
 
 INNER_HALF, INNER_HEIGHT = 0.4, 1.35  # [m], half side and height of the protected box
 OUTER_HALF, OUTER_HEIGHT = 1.0, 1.85  # [m], half side and height of the box where balls are met
@@ -41,15 +42,17 @@ class Scene:
     beam_radius: Array  # (N,) [m]
 
 
-def paper_scene(*, has_pole: bool = True) -> Scene:
+def paper_scene(*, has_pole: bool = True, size: float = 1.0) -> Scene:
     """Return the scene of the simulations in [Natarajan2024, Fig. 5], with NumPy float32 leaves.
 
     The sizes are from the model in the authors' repository. The model's box around the camera is
-    left out, since the arm touches this box in the pose in which the authors let it wait.
+    left out, since the arm touches this box in the pose in which the authors let it wait. All
+    lengths are multiplied by `size` > 0, which suits arms with another reach than the authors' arm.
     """
+    require(size > 0.0, "size", "> 0", size)
 
     def leaf(value: ArrayLike) -> Array:
-        return host_leaf(value, np.float32)
+        return host_leaf(size * np.asarray(value), np.float32)
 
     def box(half: float, height: float) -> Box:
         return Box(lower=leaf([-half, -half, 0.0]), upper=leaf([half, half, height]))

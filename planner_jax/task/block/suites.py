@@ -8,6 +8,8 @@ import numpy as np
 from jax.typing import DTypeLike
 
 from planner_jax.core.registry import suite_named
+from planner_jax.robot.arm import Arm, reach_of
+from planner_jax.robot.arm_mjcf import irb1600
 from planner_jax.task.arguments import make_generators
 from planner_jax.task.block import scene
 from planner_jax.task.block.case import BlockCase, case
@@ -27,10 +29,11 @@ def draw(
     seed: int = 0,
     *,
     first: int = 0,
-    regime: str = "R2",
+    regime: str | None = None,
     wide: bool = False,
     anywhere: bool = False,
     delay: float = 0.0,
+    arm: Arm | None = None,
     dtype: DTypeLike = jnp.float32,
 ) -> BlockCase:
     """Draw a batch of cases with random throws in float64, and cast them to `dtype`.
@@ -40,17 +43,20 @@ def draw(
     and seed is always the same; the batch has the cases from k = `first` >= 0 on. `ValueError` is
     raised for an unknown suite or a number out of its range.
 
-    * `regime`: joint limits: "R1" of [Natarajan2024], "R2" of the data sheet, with rest at the end,
-      "R3" as "R1" with rest at the end.
+    * `regime`: joint limits: "R1" of [Natarajan2024], "R2" (default) of the data sheet, with rest
+      at the end, "R3" as "R1" with rest at the end. It is left out for an `arm`.
     * `wide`: accept a ball 0.1 m from the shield's middle, 30 degrees from its normal; `anywhere`:
       accept every contact with the shield.
     * `delay`: [s], time at which the arm may start to move.
+    * `arm`: another arm than the IRB 1600. The scene and the points at which balls are aimed are
+      scaled by the ratio of both arms' reach; launch distances and speeds stay.
     """
     suite = suite_named(suite, "pole")
     if suite not in SUITES:
         return TASK.other_suite(suite)(num, seed, first)
     own, randoms = SUITES[suite], make_generators(suite, num, seed, first)
-    throws = np.array([_draw_throw(own, random) for random in randoms])
+    size = 1.0 if arm is None else float(reach_of(arm) / reach_of(irb1600()))
+    throws = np.array([_draw_throw(own, random, size) for random in randoms])
     return case(
         throws[:, 0],
         throws[:, 1],
@@ -58,41 +64,48 @@ def draw(
         regime=regime,
         wide=wide,
         anywhere=anywhere,
-        scene=scene.paper_scene(has_pole=own.has_pole),
+        scene=scene.paper_scene(has_pole=own.has_pole, size=size),
+        arm=arm,
         dtype=dtype,
     )
 
 
-def _draw_throw(suite: Suite, random: np.random.Generator) -> np.ndarray:
-    """Draw throws until one is valid; return position [m] and velocity [m/s] at launch, (2, 3)."""
+def _draw_throw(suite: Suite, random: np.random.Generator, size: float) -> np.ndarray:
+    """Draw throws until one is valid; return position [m] and velocity [m/s] at launch, (2, 3).
+
+    The lengths of the scene are multiplied by `size`.
+    """
+    inner = size * scene.INNER_HALF
     while True:
         azimuth, distance = random.uniform(-AZIMUTH, AZIMUTH), random.uniform(*suite.distance)
         pos = np.array(
             [distance * np.cos(azimuth), distance * np.sin(azimuth), random.uniform(*HEIGHT)]
         )
         duration = distance / random.uniform(*SPEED)
-        sides = [(0, 1.0)] + [(1, side) for side in (1.0, -1.0) if side * pos[1] > scene.INNER_HALF]
+        sides = [(0, 1.0)] + [(1, side) for side in (1.0, -1.0) if side * pos[1] > inner]
         axis, side = sides[random.integers(len(sides))]
         aim = np.empty(3)
-        aim[axis] = side * scene.INNER_HALF
-        aim[1 - axis] = random.uniform(-scene.INNER_HALF, scene.INNER_HALF)
-        aim[2] = random.uniform(0.0, scene.INNER_HEIGHT)
+        aim[axis] = side * inner
+        aim[1 - axis] = random.uniform(-inner, inner)
+        aim[2] = random.uniform(0.0, size * scene.INNER_HEIGHT)
         vel = (aim - pos) / duration
         vel[2] += 0.5 * GRAVITY * duration
-        if _is_valid(suite, pos, vel, duration):
+        if _is_valid(suite, pos, vel, duration, size):
             return np.stack([pos, vel])
 
 
-def _is_valid(suite: Suite, pos: np.ndarray, vel: np.ndarray, duration: float) -> bool:
+def _is_valid(suite: Suite, pos: np.ndarray, vel: np.ndarray, duration: float, size: float) -> bool:
     """Return whether a throw misses the pole, and stays in the outer box once it has entered."""
     times = np.linspace(0.0, duration, int(np.ceil(duration / _STEP)) + 1)[:-1]
     path = pos + vel * times[:, None]
     path[:, 2] -= 0.5 * GRAVITY * times**2
     if suite.has_pole:
-        if np.linalg.norm(path[:, :2] - scene.POLE, axis=1).min() < scene.POLE_RADIUS + BALL_RADIUS:
+        apart = np.linalg.norm(path[:, :2] - size * np.array(scene.POLE), axis=1)
+        if apart.min() < size * scene.POLE_RADIUS + BALL_RADIUS:
             return False
 
     def within(half: float, height: float) -> np.ndarray:
+        half, height = size * half, size * height
         return (np.abs(path[:, :2]) < half).all(axis=1) & (path[:, 2] > 0.0) & (path[:, 2] < height)
 
     outer = within(scene.OUTER_HALF, scene.OUTER_HEIGHT)
