@@ -147,10 +147,10 @@ def shield_pose(arm: Arm, angles: Array) -> tuple[Array, Array]:
     return product(last, turn), middle
 
 
-def reach_of(arm: Arm) -> np.ndarray:
-    """Return the greatest distance () [m] of the shield from joint 2: the sum of link lengths."""
+def reach_of(arm: Arm) -> float:
+    """Return the greatest distance [m] of the shield from joint 2: the sum of link lengths."""
     ends = np.concatenate([arm.origin[2:], np.asarray(arm.shield_centre)[None]])
-    return np.linalg.norm(ends, axis=1).sum()
+    return float(np.linalg.norm(ends, axis=1).sum())
 
 
 def shield_jacobian(arm: Arm, angles: Array) -> Array:

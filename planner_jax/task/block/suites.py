@@ -55,7 +55,7 @@ def draw(
     if suite not in SUITES:
         return TASK.other_suite(suite)(num, seed, first)
     own, randoms = SUITES[suite], make_generators(suite, num, seed, first)
-    size = 1.0 if arm is None else float(reach_of(arm) / reach_of(irb1600()))
+    size = 1.0 if arm is None else reach_of(arm) / reach_of(irb1600())
     throws = np.array([_draw_throw(own, random, size) for random in randoms])
     return case(
         throws[:, 0],
