@@ -1,6 +1,7 @@
 """Plans of quadrotor, car and arm from random numbers, and readers of exported files."""
 
 import io
+import warnings
 
 import numpy as np
 from mcap.reader import make_reader
@@ -55,12 +56,15 @@ PLANS = {"quadrotor": quadrotor(), "car": car(), "arm": arm()}
 
 def export_plan(plan, **options):
     """Export a plan without a recovery trajectory, which would need the limits of a case."""
-    return pj.export(plan, recovery=None, **options)
+    with warnings.catch_warnings():  # of an arm that does not end at standstill
+        warnings.simplefilter("ignore", UserWarning)
+        return pj.export(plan, recovery=None, **options)
 
 
 def table(path):
     """Return the column names of a CSV file, and its numbers as a float64 array (rows, columns)."""
-    header, *rows = path.read_text().splitlines()
+    lines = path.read_text().splitlines()
+    header, *rows = (line for line in lines if not line.startswith("#"))
     return header.split(","), np.array([row.split(",") for row in rows], float)
 
 

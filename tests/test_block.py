@@ -283,11 +283,12 @@ def boxes(half):
     """Return the scene whose outer box is a cube around the origin with edges of 2 `half` [m]."""
     scene = paper_scene()
     lower, upper = (np.full(3, side * half, np.float32) for side in (-1.0, 1.0))
-    return scene.replace(outer=scene.outer.replace(lower=lower, upper=upper))
+    outer = dataclasses.replace(scene.outer, lower=lower, upper=upper)
+    return dataclasses.replace(scene, outer=outer)
 
 
-BARE = irb1600().replace(
-    capsule_ends=np.zeros((0, 2, 3)), capsule_radius=np.zeros(0), capsule_link=()
+BARE = dataclasses.replace(
+    irb1600(), capsule_ends=np.zeros((0, 2, 3)), capsule_radius=np.zeros(0), capsule_link=()
 )
 
 

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import jax
 import numpy as np
 import pytest
-from flown_plans import PLANS, export_plan, quadrotor
+from flown_plans import PLANS, bag, export_plan, quadrotor
 
 import planner_jax as pj
 from planner_jax.cli.main import main
@@ -17,6 +17,7 @@ from planner_jax.robot.quadrotor import QuadrotorPlan
 from planner_jax.runs import columns as known
 from planner_jax.runs.run_folder import RunFolder
 from planner_jax.runs.source import Chunk
+from planner_jax.sweep import rows as sweep_rows
 from planner_jax.sweep.block.columns import COLUMNS as BLOCK
 from planner_jax.sweep.catch.columns import COLUMNS as CATCH
 from planner_jax.sweep.hit.columns import COLUMNS as HIT
@@ -120,6 +121,8 @@ def here(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write_run(tmp_path / "run")
     write_run(tmp_path / "arms", "block")
+    block = jax.tree.map(np.asarray, pj.block.case((9.0, 0.5, 0.3), (-8.0, -0.4, 5.4)))
+    monkeypatch.setattr(sweep_rows, "case_of_row", lambda folder, row: block)
     batch("quadrotor").save("three.npz")
     quadrotor().save("one.npz")
     return tmp_path
@@ -140,7 +143,8 @@ def run_export(capsys, words, recovery="none"):
         ("run --row 0 --to csv", "run-0-csv.csv"),
         ("run --row 0 --to px4 --rate 50", "run-0-px4.tlog"),
         ("run --row 0 --to crazyflie --out b.bin", "b.bin"),
-        ("arms --row 0 --to ros2", "arms-0-ros2.mcap"),
+        ("arms --row 0 --to csv", "arms-0-csv.csv"),
+        ("arms --row 0 --to urscript", "arms-0-urscript.script"),
         ("three.npz --row 1 --to csv", "three-1-csv.csv"),
         ("one.npz --to csv --out a.csv", "a.csv"),
     ],
@@ -160,6 +164,19 @@ def test_a_row_is_written_as_pj_export_writes_it_and_a_plan_that_fails_with_a_wa
     assert run_export(capsys, "run --row 1 --to csv") == (0, "run-1-csv.csv\n", warning)
 
 
+def test_an_arm_that_ends_moving_is_reported_and_its_joints_are_named(capsys, here):
+    code, out, err = run_export(capsys, "arms --row 0 --to ros2 --joint-names a,b,c,d,e,f")
+    assert (code, out) == (0, "arms-0-ros2.mcap\n")
+    assert err.startswith("planner-jax: warning: the plan ends at ") and err.count("\n") == 1
+    assert bag(here / out.strip())[1][0][3].joint_names == list("abcdef")
+    for names, shown in (("a,b", "('a', 'b')"), ("a,a,c,d,e,f", "('a', 'a', ")):
+        code, _, err = run_export(capsys, f"arms --row 0 --to csv --joint-names {names}")
+        says = f"planner-jax: error: --joint-names must be 6 different names, got {shown}"
+        assert code == 2 and err.startswith(says) and err.count("\n") == 1
+    code, _, err = run_export(capsys, "run --row 0 --to csv --joint-names a")
+    assert code == 2 and "--joint-names must be left out but for arms, got ['a']" in err
+
+
 def test_setpoints_are_sent_to_a_port(capsys, here):
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as ear:
         ear.bind(("127.0.0.1", 0))
@@ -176,7 +193,10 @@ def test_setpoints_are_sent_to_a_port(capsys, here):
     ("words", "says"),
     [
         ("run --row 0", "the following arguments are required: --to"),
-        ("run --row 0 --to cvs", "--to must be one of csv, ros2, px4, crazyflie, got 'cvs'; did"),
+        (
+            "run --row 0 --to cvs",
+            "--to must be one of csv, ros2, urscript, px4, crazyflie, got 'cvs'; did",
+        ),
         ("run --to csv", "--row must be from 0 to 2, got nothing"),
         ("run --row 2 --to csv", "plan must be solved, got the status INFEASIBLE: stationary with"),
         ("arms --row 0 --to px4", "--to must be a format for plans of the arm, got 'px4'"),

@@ -2,11 +2,18 @@
 
 import functools
 import sys
-import warnings
 from collections.abc import Callable, Sequence
 
 from planner_jax.cli import runs, single
-from planner_jax.cli.options import FAILED, BadOption, Options, Parser, Unfinished, fail
+from planner_jax.cli.options import (
+    FAILED,
+    BadOption,
+    Options,
+    Parser,
+    Unfinished,
+    fail,
+    warnings_in_one_line,
+)
 from planner_jax.core.errors import PlannerJaxError
 from planner_jax.core.registry import all_tasks, task_named
 from planner_jax.host import signals as stopping
@@ -23,12 +30,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     flags: dict[str, str] = {}  # options of the command by argument name, such as "num": "--num"
     try:
-        # Print a warning, such as that another package's task cannot be imported, in one line.
-        with warnings.catch_warnings():
-            warnings.simplefilter("always")
-            warnings.showwarning = lambda text, *_, **__: print(
-                f"planner-jax: warning: {text}", file=sys.stderr
-            )
+        with warnings_in_one_line():  # such as that another package's task cannot be imported
             words = sys.argv[1:] if arguments is None else arguments
             if any("\0" in word for word in words):
                 raise BadOption("arguments must not contain NUL")

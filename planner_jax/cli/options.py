@@ -5,12 +5,14 @@ stands for the option's value. `planner_jax.runs.settings.option` makes such fie
 """
 
 import argparse
+import contextlib
 import dataclasses
 import re
 import sys
 import typing
+import warnings
 from argparse import SUPPRESS
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from typing import Any, NoReturn
 
@@ -38,6 +40,17 @@ def fail(
         error = error.with_names(flags or {})
     print(f"planner-jax: error: {' '.join(str(error).split())}", file=sys.stderr)
     return code
+
+
+@contextlib.contextmanager
+def warnings_in_one_line() -> Iterator[None]:
+    """Print each warning for the user in one line while the `with` block runs."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", UserWarning)
+        warnings.showwarning = lambda text, *_, **__: print(
+            f"planner-jax: warning: {text}", file=sys.stderr
+        )
+        yield
 
 
 class Parser(argparse.ArgumentParser):

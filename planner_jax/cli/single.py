@@ -9,7 +9,14 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from planner_jax.cli.options import FAILED, Options, Parser, add_settings, pop_out
+from planner_jax.cli.options import (
+    FAILED,
+    Options,
+    Parser,
+    add_settings,
+    pop_out,
+    warnings_in_one_line,
+)
 from planner_jax.core.choices import CHOICES, require
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.registry import Task
@@ -95,16 +102,19 @@ def add_export(parser: Parser) -> None:
     parser.add("--udp", type=int, metavar="PORT", help=port)
     rest = "recovery trajectory behind a plan that does not end at rest"
     parser.add("--recovery", metavar="NAME", help=f"{rest}: {', '.join(CHOICES)} (default: brake)")
+    names = "names of an arm's joints, separated by commas (default: the names of the arm's file)"
+    parser.add("--joint-names", metavar="NAMES", help=names)
     parser.set_defaults(command=_export)
 
 
 def _export(given: Options) -> None:
     from planner_jax.core.plan_files import PlanFileError
     from planner_jax.export import api
+    from planner_jax.robot.arm import ArmPlan
 
     source, row = given.pop("plans"), given.pop("row", None)
     out, udp = pop_out(given, "file"), given.pop("udp", None)
-    name = given.pop("recovery", "brake")
+    name, names = given.pop("recovery", "brake"), given.pop("joint_names", None)
     recovery = recovery_options(name).get("recovery")
     if out is not None and udp is not None:
         raise ArgumentError("udp", "given with --out", udp, verb="not be")
@@ -112,9 +122,12 @@ def _export(given: Options) -> None:
         out = out or api.default_name(source, row, given["to"])
         plan, against = _plan_of(source, row)
         lacks = recovery is not None and api.lacks_recovery(plan)
-        given |= {"recovery": recovery, "case": _case_of(source, row, name) if lacks else None}
+        needs_case = lacks or (isinstance(plan, ArmPlan) and os.path.isdir(source))
+        given |= {"recovery": recovery, "case": _case_of(source, row, name) if needs_case else None}
         if udp is None:
-            written = str(api.export(plan, out=out, **given))
+            names = names and names.split(",")
+            with warnings_in_one_line():
+                written = str(api.export(plan, out=out, joint_names=names, **given))
         else:
             written = f"{api.stream(plan, udp=udp, **given)} setpoints sent"
     except PlanFileError as error:

@@ -4,9 +4,8 @@ import dataclasses
 import difflib
 import os
 import pkgutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import BinaryIO
 
 from planner_jax.core.choices import RECOVERIES, require, require_one_of
 from planner_jax.core.errors import (
@@ -18,12 +17,13 @@ from planner_jax.core.errors import (
 )
 from planner_jax.core.protocol import Plan
 from planner_jax.core.rules import Case
-from planner_jax.export.setpoints import DEFAULT_RATE, require_one, robot_of
+from planner_jax.export.setpoints import DEFAULT_RATE, joints_of, require_one, robot_of
 from planner_jax.host.files import new_file_problem, replacing
 from planner_jax.recovery.after_plan import append_recovery, is_rested
+from planner_jax.robot.arm import ArmPlan
 from planner_jax.robot.quadrotor import QuadrotorPlan
 
-Writer = Callable[[Plan, float | None, BinaryIO], None]
+Writer = Callable[..., None]  # arguments: plan, rate [Hz] or None, binary file; of arms: joints
 _ALL = ("quadrotor", "car", "arm")
 
 
@@ -41,6 +41,9 @@ class Format:
 FORMATS = {
     "csv": Format("a table of setpoints with units", _ALL, {".csv": "csv_rows:write"}),
     "ros2": Format("a message of trajectory_msgs", _ALL, {".mcap": "mcap_files:write_trajectory"}),
+    "urscript": Format(
+        "a program for arms of Universal Robots", ("arm",), {".script": "urscript:write"}
+    ),
     "px4": Format(
         "setpoints over MAVLink, or as messages TrajectorySetpoint",
         ("quadrotor",),
@@ -67,6 +70,7 @@ def export(
     rate: float | None = None,
     recovery: str | None = "brake",
     case: Case | None = None,
+    joint_names: Sequence[str] | None = None,
 ) -> Path:
     """Write one plan for a controller into a new file; after an error there is no partial file.
 
@@ -74,13 +78,14 @@ def export(
     |---|---|---|---|
     | `csv` | `.csv` | setpoints, header with units | ENU, FLU |
     | `ros2` | `.mcap` | a message of `trajectory_msgs` (extra `export`) | ENU, FLU |
+    | `urscript` | `.script` | a program with `movej` and `servoj` | angles of 6 joints |
     | `px4` | `.tlog` | MAVLink SET_POSITION_TARGET_LOCAL_NED (extra `export`) | NED, FRD |
     | `px4` | `.mcap`, `.csv` | messages or rows of TrajectorySetpoint (extra `export`) | NED, FRD |
     | `crazyflie` | `.csv`, `.bin` | polynomials of degree 7, a row or 132 bytes a piece | ENU |
 
     ENU and NED are world frames (x east, y north, z up; x north, y east, z down), FLU and FRD body
     frames (forward, left, up; forward, right, down). `csv` and `ros2` support quadrotors, cars and
-    arms, the other formats quadrotors only. All units are SI.
+    arms, `urscript` arms, and the other formats quadrotors only. All units are SI.
 
     Args:
         plan: one solved plan. `pj.take(plans, k)` selects one from a batch.
@@ -90,7 +95,10 @@ def export(
         recovery: which trajectory to standstill is appended to a plan that does not end at
             standstill. "brake" stops at any position, "home" at the robot's first position. None
             exports the plan up to its last contact.
-        case: case of the plan, whose limits the recovery trajectory keeps.
+        case: case of the plan, whose limits the recovery trajectory keeps. The files of arms
+            contain the names and limits of its arm's joints.
+        joint_names: names of an arm's joints in the file, by default the names of the case's arm,
+            or joint_1, joint_2, ... without a case.
 
     Returns:
         The path of the file.
@@ -113,9 +121,12 @@ def export(
         rate = DEFAULT_RATE if rate is None else rate
     elif rate is not None:
         raise ArgumentError("rate", f"given for {to}, which has polynomials", rate, verb="not be")
+    is_arm = isinstance(plan, ArmPlan)
+    require(joint_names is None or is_arm, "joint_names", "left out but for arms", joint_names)
+    of_arm = {"joints": joints_of(plan, joint_names, case)} if is_arm else {}
     plan = bring_to_rest(plan, recovery, case)
     with replacing(path) as scratch, open(scratch, "wb") as file:
-        write(plan, rate, file)
+        write(plan, rate, file, **of_arm)
     return path
 
 

@@ -7,6 +7,7 @@ from mcap_ros2.writer import Writer
 
 from planner_jax.core.protocol import Plan
 from planner_jax.export import px4, ros2
+from planner_jax.export.setpoints import Joints
 from planner_jax.robot.quadrotor import QuadrotorPlan
 
 SETPOINT, SETPOINT_TOPIC = "px4_msgs/TrajectorySetpoint", "/fmu/in/trajectory_setpoint"
@@ -17,9 +18,9 @@ _TYPES = {
 }
 
 
-def write_trajectory(plan: Plan, rate: float, file: BinaryIO) -> None:
+def write_trajectory(plan: Plan, rate: float, file: BinaryIO, joints: Joints | None = None) -> None:
     """Write a plan as one message of ROS's `trajectory_msgs`, with setpoints at `rate` [Hz]."""
-    kind, fields = ros2.trajectory(plan, rate)
+    kind, fields = ros2.trajectory(plan, rate, joints)
     with Writer(file) as writer:
         schema = writer.register_msgdef(_full_name(kind), _definition(kind))
         writer.write_message(ros2.TOPICS[kind], schema, fields, log_time=0)

@@ -1,26 +1,29 @@
 """Export of plans for ROS 2: one message of the package `trajectory_msgs` with all setpoints.
 
 World frame ENU and body frame FLU (REP 103). A quadrotor or a car is one joint with six degrees of
-freedom, whose velocities are in the world frame. An arm has six joints.
+freedom, whose velocities are in the world frame. The message of an arm is a goal that the
+controller `joint_trajectory_controller` accepts: it ends at standstill, and its times rise.
 """
 
 import pkgutil
+import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from jaxtyping import PyTree
 
 from planner_jax.core.errors import MissingExtra
 from planner_jax.core.protocol import Plan
 from planner_jax.export.frames import rotate
-from planner_jax.export.setpoints import DEFAULT_RATE, setpoints_of
-from planner_jax.robot.arm import ArmSetpoints
+from planner_jax.export.setpoints import DEFAULT_RATE, Joints, joints_of, setpoints_of
+from planner_jax.recovery.after_plan import is_rested
+from planner_jax.robot.arm import ArmPlan, ArmSetpoints
 from planner_jax.robot.car import CarSetpoints
 from planner_jax.robot.quadrotor import QuadrotorSetpoints
 
 Json = Any  # plain numbers and texts, lists and dictionaries
 WORLD, BODY = "world", "base_link"
-JOINTS = [f"joint_{k}" for k in range(1, 7)]  # joint names in the ROS packages of the arm's maker
 BODIES, ARM = "trajectory_msgs/MultiDOFJointTrajectory", "trajectory_msgs/JointTrajectory"
 TOPICS = {BODIES: "/command/trajectory", ARM: "/joint_trajectory_controller/joint_trajectory"}
 # For each ROS message type, and for the types of its fields: the types and names of the fields.
@@ -46,12 +49,20 @@ TYPES = {
 _NOW = {"sec": 0, "nanosec": 0}  # time stamp for which controllers start a trajectory at once
 
 
-def trajectory_message(plan: Plan, rate: float = DEFAULT_RATE) -> object:
+def trajectory_message(
+    plan: Plan,
+    rate: float = DEFAULT_RATE,
+    *,
+    joint_names: Sequence[str] | None = None,
+    case: PyTree | None = None,
+) -> object:
     """Convert a plan to an object of ROS 2's own class, which can be published.
 
     Args:
         plan: one solved plan of a quadrotor, a car or an arm.
         rate: [Hz], setpoints per second.
+        joint_names: names of an arm's joints, by default the names in the file of the case's arm.
+        case: case of an arm's plan.
 
     Returns:
         `trajectory_msgs.msg.MultiDOFJointTrajectory` for a quadrotor or a car,
@@ -61,7 +72,8 @@ def trajectory_message(plan: Plan, rate: float = DEFAULT_RATE) -> object:
         ArgumentError: the plan cannot be exported, or the rate is out of its range.
         MissingExtra: ROS 2 is not installed for this Python.
     """
-    kind, fields = trajectory(plan, rate)
+    joints = joints_of(plan, joint_names, case) if isinstance(plan, ArmPlan) else None
+    kind, fields = trajectory(plan, rate, joints)
     try:
         return _make_message(kind, fields)
     except ModuleNotFoundError as error:
@@ -70,13 +82,22 @@ def trajectory_message(plan: Plan, rate: float = DEFAULT_RATE) -> object:
         raise missing from None
 
 
-def trajectory(plan: Plan, rate: float) -> tuple[str, dict[str, Json]]:
+def trajectory(
+    plan: Plan, rate: float, joints: Joints | None = None
+) -> tuple[str, dict[str, Json]]:
     """Convert a plan to a ROS message; return its type, a key of `TYPES`, and its fields."""
     setpoints = setpoints_of(plan, rate)
     nanoseconds = np.round(setpoints.time * 1e9).astype(int).tolist()
     times = [dict(zip(("sec", "nanosec"), divmod(t, 10**9), strict=True)) for t in nanoseconds]
-    if isinstance(setpoints, ArmSetpoints):
-        kind, joints = ARM, JOINTS
+    if isinstance(plan, ArmPlan) and isinstance(setpoints, ArmSetpoints):
+        if not is_rested(plan):
+            rate = np.abs(setpoints.rates[-1]).max()
+            warnings.warn(
+                f"the plan ends at {rate:.2g} rad/s, which joint_trajectory_controller rejects "
+                "by default; the recovery 'brake' continues it to standstill",
+                stacklevel=2,
+            )
+        kind, names = ARM, (joints or joints_of(plan)).names
         columns = (setpoints.angles, setpoints.rates, setpoints.accelerations)
         rows = zip(*(column.tolist() for column in columns), times, strict=True)
         points = [
@@ -84,7 +105,8 @@ def trajectory(plan: Plan, rate: float) -> tuple[str, dict[str, Json]]:
             for q, v, a, time in rows
         ]
     else:
-        kind, joints = BODIES, [BODY]
+        assert not isinstance(setpoints, ArmSetpoints)
+        kind, names = BODIES, (BODY,)
         rows = zip(*(column.tolist() for column in _motion(setpoints)), times, strict=True)
         points = [
             {
@@ -96,7 +118,7 @@ def trajectory(plan: Plan, rate: float) -> tuple[str, dict[str, Json]]:
             for pos, quat, vel, spin, acc, time in rows
         ]
     header = {"stamp": _NOW, "frame_id": WORLD}
-    return kind, {"header": header, "joint_names": joints, "points": points}
+    return kind, {"header": header, "joint_names": list(names), "points": points}
 
 
 def _motion(setpoints: QuadrotorSetpoints | CarSetpoints) -> tuple[np.ndarray, ...]:

@@ -3,15 +3,17 @@
 import dataclasses
 import operator
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import jax
 import numpy as np
+from jaxtyping import PyTree
 
 from planner_jax.core.choices import require
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.plan_files import PlanFileError, leaves_by_name, load_fitting
 from planner_jax.core.protocol import Plan, Status, is_solved, take
+from planner_jax.recovery.after_plan import is_rested
 from planner_jax.robot.arm import ArmPlan, ArmSetpoints
 from planner_jax.robot.car import CarPlan, CarSetpoints
 from planner_jax.robot.quadrotor import QuadrotorPlan, QuadrotorSetpoints
@@ -33,6 +35,7 @@ class Robot:
     shapes: Mapping[str, tuple[int | str, ...]]
     case_field: str  # name of a field that only the cases of this robot have
     durations: str  # dotted name of the plan's durations [s], whose sum is the plan's duration
+    rates: tuple[str, ...]  # names of the setpoints' quantities that are zero at standstill
 
     def end(self, plan: Plan) -> float:
         """Return the duration [s] of a plan."""
@@ -41,12 +44,63 @@ class Robot:
 
 _FLOWN = {"trajectory.coeffs": ("M", "D", 3), "trajectory.durations": ("M",), "gravity": ()}
 _DRIVEN = {"start": (3,), "time": (), "speed": ("K",), "curvature": ("K",)}
-_MOVED = {"motion.coeffs": ("M", "D", 6), "motion.durations": ("M",)}
+_MOVED = {"motion.coeffs": ("M", "D", "N"), "motion.durations": ("M",)}
+_FLIES = ("vel", "acc", "jerk", "body_rate")
+_DRIVES = ("speed", "acceleration", "yaw_rate")
 ROBOTS = (
-    Robot("quadrotor", QuadrotorPlan, _FLOWN, "head_state", "whole.durations"),
-    Robot("car", CarPlan, _DRIVEN, "movers", "time"),
-    Robot("arm", ArmPlan, _MOVED, "scene", "motion.durations"),
+    Robot("quadrotor", QuadrotorPlan, _FLOWN, "head_state", "whole.durations", _FLIES),
+    Robot("car", CarPlan, _DRIVEN, "movers", "time", _DRIVES),
+    Robot("arm", ArmPlan, _MOVED, "scene", "motion.durations", ("rates", "accelerations")),
 )
+
+
+@dataclasses.dataclass(frozen=True)
+class Joints:
+    """The joints of an arm in an exported file."""
+
+    names: tuple[str, ...]
+    ranges: tuple[str, ...] = ()  # one text for each joint with its limits, if they are known
+
+    def lines(self) -> list[str]:
+        """Return a line of text for each joint, with its columns' name, its name and its limits."""
+        ranges = self.ranges or ("",) * len(self.names)
+        pairs = zip(self.names, ranges, strict=True)
+        return [f"q{k}: {name}{text}" for k, (name, text) in enumerate(pairs, start=1)]
+
+
+def joints_of(
+    plan: ArmPlan, names: Sequence[str] | None = None, case: PyTree | None = None
+) -> Joints:
+    """Return the joints of an arm's plan for an exported file.
+
+    Args:
+        plan: one plan of an arm.
+        names: name of each joint, by default the arm's own names, or joint_1, joint_2, ... if there
+            is no case.
+        case: case of the plan, whose arm and limits are described.
+
+    Raises:
+        ArgumentError: there is not one name for each joint, a name occurs twice or is empty, or the
+            case is of another robot.
+    """
+    num = plan.motion.coeffs.shape[-1]
+    ranges: tuple[str, ...] = ()
+    own = tuple(f"joint_{k}" for k in range(1, num + 1))
+    if case is not None:
+        fits = "scene" in vars(case) and np.shape(case.angles) == (num,)
+        require(fits, "case", f"one case of an arm of {num} joints", shown=type(case).__name__)
+        own = case.arm.joint_names
+        rows = (case.arm.lower, case.arm.upper, case.limits.velocity, case.limits.acceleration)
+        ranges = tuple(
+            f", from {low:.6g} to {high:.6g} rad, at most {rate:.6g} rad/s and {rise:.6g} rad/s^2"
+            for low, high, rate, rise in zip(*map(np.asarray, rows), strict=True)
+        )
+    if names is None:
+        return Joints(own, ranges)
+    names = (names,) if isinstance(names, str) else tuple(names)
+    fits = len(set(names)) == len(names) == num and all(isinstance(n, str) and n for n in names)
+    require(fits, "joint_names", f"{num} different names", names)
+    return Joints(names, ranges)
 
 
 def robot_of(plan: Plan) -> Robot:
@@ -86,23 +140,34 @@ def _require_shapes(plan: Plan, robot: Robot) -> None:
 
 
 def setpoints_of(plan: Plan, rate: float) -> Setpoints:
-    """Sample the setpoints of one plan of a robot at a rate [Hz].
+    """Sample the setpoints of one plan of a robot at a rate [Hz], and at its exact end.
+
+    The last interval is half a period to one and a half periods long. If the plan ends at
+    standstill, all rates and accelerations of the last setpoint are exactly zero.
 
     Raises:
         ArgumentError: the plan cannot be exported (see `robot_of`) or is not finite; or the rate is
             not a number, or results in fewer than two setpoints or more than 100,000.
     """
-    end = robot_of(plan).end(plan)
+    robot = robot_of(plan)
+    end = robot.end(plan)
     low, high = 1.0 / end, (MOST - 1) / end
     is_number = not isinstance(rate, str | bool) and np.ndim(rate) == 0
     require(is_number, "rate", "a number", rate)
     rule = f"from {low:.4g} to {high:.4g} for a plan of {end:.4g} s"
     require(bool(low * (1.0 - 1e-6) <= rate <= high), "rate", rule, rate)
     assert isinstance(plan, QuadrotorPlan | CarPlan | ArmPlan)
-    setpoints = plan.sample(rate)
-    for name, values in vars(setpoints).items():
+    setpoints, last = plan.sample(rate), vars(plan.sample(1.0 / end))
+    before = setpoints.time < end - 0.5 / rate
+    found = {
+        name: np.concatenate([values[before], last[name][-1:]])
+        for name, values in vars(setpoints).items()
+    }
+    for name, values in found.items():
         require(bool(np.isfinite(values).all()), "plan", "finite", shown=f"{name} that is not")
-    return setpoints
+        if name in robot.rates and is_rested(plan):
+            values[-1] = 0.0
+    return dataclasses.replace(setpoints, **found)
 
 
 def pieces_of(plan: QuadrotorPlan) -> PiecewisePolynomial:
