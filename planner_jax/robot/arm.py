@@ -59,6 +59,8 @@ class Arm:
     joint_names: tuple[str, ...] = struct.field(pytree_node=False)
     # Whether the last joint turns the shield in its own plane, about its middle.
     turns_in_plane: bool = struct.field(pytree_node=False)
+    # Method of inverse kinematics, see `arm_ik.choose_ik`.
+    ik: str = struct.field(pytree_node=False, default="spherical")
 
     @property
     def num(self) -> int:

@@ -8,6 +8,7 @@ waits. Any other element inside the arm is an error, including MuJoCo's defaults
 elements. Elements around the arm, such as lights, cameras, actuators and sensors, are ignored.
 """
 
+import dataclasses
 import functools
 import importlib.resources
 import re
@@ -24,7 +25,7 @@ from planner_jax.core.choices import require
 from planner_jax.core.errors import ArgumentError
 from planner_jax.host.files import open_plain
 from planner_jax.robot.arm import REGIMES, Arm
-from planner_jax.robot.arm_ik import explain_misfit
+from planner_jax.robot.arm_ik import choose_ik
 
 # Elements that the reader ignores: at the top of the file (`_AROUND`) and in a body (`_IGNORED`).
 _AROUND = {"option", "visual", "statistic", "size", "asset", "actuator", "sensor", "contact"}
@@ -52,9 +53,8 @@ def read_arm(path_or_xml: str, *, dtype: DTypeLike = np.float32) -> Arm:
         dtype: type of every leaf.
 
     Raises:
-        ValueError: the text is not XML, an element is not supported, the arm is not a chain of six
-            hinge joints, or the closed form of inverse kinematics does not apply to it. The message
-            is one line that names the element.
+        ValueError: the text is not XML, an element is not supported, or the arm is not a chain of
+            six hinge joints. The message is one line that names the element.
         OSError: the file cannot be read.
     """
     text = path_or_xml
@@ -110,11 +110,9 @@ def read_arm(path_or_xml: str, *, dtype: DTypeLike = np.float32) -> Arm:
         base_pairs=tuple(k for k in every if link[k] >= 1),
         joint_names=tuple(_one(link, "joint").get("name", f"joint_{k}") for k, link in numbered),
         turns_in_plane=True,
+        ik="numerical",
     )
-    reason = explain_misfit(arm)
-    if reason is not None:
-        raise ValueError(f"inverse kinematics has no closed form for this arm: {reason}")
-    return arm
+    return dataclasses.replace(arm, ik=choose_ik(arm))
 
 
 def _beside_shield(leaves: dict, links: list[int]) -> np.ndarray:

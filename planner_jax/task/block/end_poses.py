@@ -89,7 +89,7 @@ def end_poses(
         ball = drag_free_flight(case.ball, time, case.gravity)
         rotation = frame_of(face_ball(ball.vel))
         shift = offset[0] * rotation[:, 1] + offset[1] * rotation[:, 2]
-        return inverse_kinematics(case.arm, rotation, ball.pos + shift)
+        return inverse_kinematics(case.arm, rotation, ball.pos + shift, is_roll_free=True)
 
     angles, found = jax.vmap(solve_point)(time, offset)
     if case.arm.turns_in_plane:
