@@ -3,6 +3,8 @@ from .api import planner as planner
 from .case import BlockCase as BlockCase
 from .case import case as case
 from .default_planner import OnlineBlock as OnlineBlock
+from .explain import Prospects as Prospects
+from .explain import prospects as prospects
 from .plan import BlockPlan as BlockPlan
 from .replan import ReplanBlock as ReplanBlock
 from .scene import Scene as Scene

@@ -32,6 +32,8 @@ class EndPoses:
     # infinite if the arm cannot reach the pose.
     effort: Array
     profile: Array  # (C,) int32, speed profile of the straight motion, index in `all_profiles`
+    # (C,) bool, whether the shield meets the ball within the limits of the joint angles.
+    is_found: Array
 
 
 @struct.dataclass
@@ -115,6 +117,7 @@ def end_poses(
         time=time,
         effort=jnp.where(exists, effort, jnp.inf),
         profile=profile.astype(jnp.int32),
+        is_found=found.reshape(-1) & flight.comes,
     )
 
 

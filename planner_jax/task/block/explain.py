@@ -1,0 +1,97 @@
+"""Reasons why an arm does not block a ball: no pose, no clear pose, or no clear pose in time."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from planner_jax.core.checks import require_kind
+from planner_jax.core.choices import require
+from planner_jax.task.block.case import BlockCase
+from planner_jax.task.block.end_poses import end_poses, flight_of
+
+_POINTS, _PIECES = (
+    192,
+    10,
+)  # points of the ball's path for which poses are computed; see `end_poses`
+
+
+@dataclasses.dataclass(frozen=True)
+class Prospects:
+    """How far an arm can get to a ball, whatever lies between its start and the poses.
+
+    In a pose the shield meets the ball where it may be blocked. The poses are those of the inverse
+    kinematics at 192 points of the ball's path.
+    """
+
+    poses: int  # number of poses within the limits of the joint angles
+    clear: int  # number of these poses in which the arm touches nothing
+    # [s], time by which the ball would have to come later for the clear pose that is reached
+    # soonest, negative if this pose is reached early. Each joint is given its own least time by its
+    # limits, and obstacles on the way are ignored. Infinite if there is no clear pose.
+    later: float
+
+    def sentence(self) -> str:
+        """Describe why the ball cannot be blocked, or that a search for a motion may succeed."""
+        if not self.poses:
+            return "the shield cannot get to the ball's path between the two boxes"
+        if not self.clear:
+            return f"the arm touches something in all {self.poses} poses that meet the ball"
+        if self.later > 0.0:
+            return f"the ball is too early: the arm is ready {self.later:.3f} s after it"
+        return (
+            f"{self.clear} of {self.poses} poses that meet the ball are clear, and one is reached "
+            f"{-self.later:.3f} s early if nothing is in the way"
+        )
+
+
+def prospects(case: BlockCase) -> Prospects:
+    """Return whether poses of the arm meet the ball, are free of collisions, and are in time.
+
+    Use the function for a case that no planner solves. If a clear pose is in time, either the
+    search failed, or no way round the obstacles is short enough.
+
+    Args:
+        case: one case.
+
+    Raises:
+        ValueError: there is a batch of cases instead of one case.
+        TypeError: the case is not a `BlockCase`.
+    """
+    require_kind("case", case, BlockCase)
+    require(case.batch_shape == (), "case", "one case", shown=f"batch shape {case.batch_shape}")
+    found, gaps, late = (np.asarray(each) for each in _measure(case))
+    is_clear = found & (gaps > 0.0)
+    later = float(np.min(late, initial=np.inf, where=is_clear))
+    return Prospects(poses=int(found.sum()), clear=int(is_clear.sum()), later=later)
+
+
+@jax.jit
+def _measure(case: BlockCase) -> tuple[Array, Array, Array]:
+    flight = flight_of(case)
+    poses = end_poses(case, flight, _POINTS, _PIECES)
+    least = jax.vmap(lambda angles: jnp.max(least_times(case, angles)))(poses.angles)
+    late = case.delay + least - poses.time
+    return poses.is_found, case.clearances(poses.angles), late
+
+
+def least_times(case: BlockCase, angles: Array) -> Array:
+    """Return the least time (n,) [s] in which each joint alone turns to its angle, without gravity.
+
+    A joint starts with its rate in the case. It ends at rest if the case requires this. The motion
+    has the greatest acceleration, then the greatest rate, and then the greatest deceleration.
+    """
+    most, rise = case.limits.velocity, case.limits.acceleration
+    away, rate = angles - case.angles, case.rates
+    stop = 0.5 * rate * jnp.abs(rate) / rise  # angle in which the joint stops
+    sign = jnp.where(away >= jnp.where(case.ends_at_rest, stop, 0.0), 1.0, -1.0)
+    away, rate = sign * away, sign * rate
+    ends = jnp.where(case.ends_at_rest, 1.0, 0.0)
+    # Rate at which the joint stops to accelerate: it reaches `away` at rest, or with this rate.
+    peak = jnp.sqrt(jnp.maximum((2.0 * rise * away + rate**2) / (1.0 + ends), 0.0))
+    peak = jnp.minimum(peak, most)
+    turned = ((1.0 + ends) * peak**2 - rate**2) / (2.0 * rise)
+    ramps = ((1.0 + ends) * peak - rate) / rise
+    return ramps + jnp.maximum(away - turned, 0.0) / jnp.maximum(peak, 1e-9)
