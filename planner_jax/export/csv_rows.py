@@ -51,7 +51,7 @@ def write(plan: Plan, rate: float, file: BinaryIO, joints: Joints | None = None)
         columns.append(values)
         every = [names.replace("#", str(k)) for k in range(1, values.shape[-1] + 1)]
         header += [f"{name} [{unit}]" for name in (every if "#" in names else names.split())]
-    write_table(file, header, columns, joints.lines() if joints else ())
+    write_table(file, header, columns, joints.lines if joints else ())
 
 
 def write_table(

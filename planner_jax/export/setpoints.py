@@ -59,13 +59,8 @@ class Joints:
     """The joints of an arm in an exported file."""
 
     names: tuple[str, ...]
-    ranges: tuple[str, ...] = ()  # one text for each joint with its limits, if they are known
-
-    def lines(self) -> list[str]:
-        """Return a line of text for each joint, with its columns' name, its name and its limits."""
-        ranges = self.ranges or ("",) * len(self.names)
-        pairs = zip(self.names, ranges, strict=True)
-        return [f"q{k}: {name}{text}" for k, (name, text) in enumerate(pairs, start=1)]
+    # For each joint a text: its number in the names of columns, its name and, if known, its limits.
+    lines: tuple[str, ...]
 
 
 def joints_of(
@@ -84,8 +79,7 @@ def joints_of(
             case is of another robot.
     """
     num = plan.motion.coeffs.shape[-1]
-    ranges: tuple[str, ...] = ()
-    own = tuple(f"joint_{k}" for k in range(1, num + 1))
+    own, ranges = tuple(f"joint_{k}" for k in range(1, num + 1)), ("",) * num
     if case is not None:
         fits = "scene" in vars(case) and np.shape(case.angles) == (num,)
         require(fits, "case", f"one case of an arm of {num} joints", shown=type(case).__name__)
@@ -95,12 +89,10 @@ def joints_of(
             f", from {low:.6g} to {high:.6g} rad, at most {rate:.6g} rad/s and {rise:.6g} rad/s^2"
             for low, high, rate, rise in zip(*map(np.asarray, rows), strict=True)
         )
-    if names is None:
-        return Joints(own, ranges)
-    names = (names,) if isinstance(names, str) else tuple(names)
+    names = own if names is None else (names,) if isinstance(names, str) else tuple(names)
     fits = len(set(names)) == len(names) == num and all(isinstance(n, str) and n for n in names)
     require(fits, "joint_names", f"{num} different names", names)
-    return Joints(names, ranges)
+    return Joints(names, tuple(f"q{k + 1}: {names[k]}{limits}" for k, limits in enumerate(ranges)))
 
 
 def robot_of(plan: Plan) -> Robot:

@@ -29,7 +29,7 @@ def write(plan: ArmPlan, rate: float, file: BinaryIO, joints: Joints | None = No
     assert isinstance(points, ArmSetpoints)
     start, *poses = (f"[{', '.join(f'{q:.7g}' for q in pose)}]" for pose in points.angles.tolist())
     rows = zip(poses, np.diff(points.time).tolist(), strict=True)
-    lines = [f"  # {line}" for line in joints.lines()]
+    lines = [f"  # {line}" for line in joints.lines]
     lines += [f"  movej({start}, a=1.4, v=1.05)  # to the start of the plan"]
     lines += [f"  servoj({pose}, 0, 0, {step:.6g}, lookahead_time, gain)" for pose, step in rows]
     body = "\n".join(lines)
