@@ -15,7 +15,7 @@ import time
 import numpy as np
 
 import planner_jax as pj
-from planner_jax.robot.arm_mjcf import irb1600
+from planner_jax.robot.arm_file import irb1600
 from planner_jax.task.block.default_planner import Search
 
 _STARTS = 192

@@ -27,7 +27,7 @@ import numpy as np
 
 import planner_jax as pj
 from planner_jax.benchmarks.run import argument_parser, begin
-from planner_jax.robot.arm_mjcf import irb1600
+from planner_jax.robot.arm_file import irb1600
 from planner_jax.sweep.block.settings import REGIMES
 from planner_jax.task.block.clearance import clearances, num_of_pole
 from planner_jax.task.block.default_planner import OnlineBlock, Search

@@ -49,7 +49,7 @@ from planner_jax.baselines.block.library.table import (
 )
 from planner_jax.benchmarks.run import Bench, argument_parser, begin, parse_names
 from planner_jax.robot.arm import REGIMES
-from planner_jax.robot.arm_mjcf import irb1600
+from planner_jax.robot.arm_file import irb1600
 from planner_jax.runs.timing import CompileClock
 from planner_jax.task.block.scene import paper_scene
 

@@ -49,7 +49,7 @@ from jax import Array
 import planner_jax as pj
 from planner_jax.ball.flight import BallState, drag_free_flight
 from planner_jax.benchmarks.run import Bench, argument_parser, begin, parse_names
-from planner_jax.robot.arm_mjcf import irb1600
+from planner_jax.robot.arm_file import irb1600
 from planner_jax.runs.summary import percent, wilson_interval
 from planner_jax.runs.timing import measure_warm
 from planner_jax.sims.perception.camera import project

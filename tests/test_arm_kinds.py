@@ -11,9 +11,9 @@ from arms import KINDS, mjcf_of
 from jaxpr import assert_full_precision
 
 from planner_jax.robot.arm import link_frames, shield_jacobian, shield_pose
+from planner_jax.robot.arm_file import irb1600
 from planner_jax.robot.arm_ik import choose_ik, inverse_kinematics
 from planner_jax.robot.arm_ik_numerical import STARTS
-from planner_jax.robot.arm_mjcf import irb1600
 
 float64 = pytest.mark.usefixtures("float64")
 of_each_kind = pytest.mark.parametrize("arm", KINDS.values(), ids=KINDS)

@@ -13,7 +13,7 @@ from planner_jax.optimise.levenberg import LevenbergConfig
 from planner_jax.referee.arm_clearance import KINDS
 from planner_jax.referee.arm_clearance import clearances as referee_clearances
 from planner_jax.robot.arm import REGIMES, reach_of
-from planner_jax.robot.arm_mjcf import irb1600
+from planner_jax.robot.arm_file import irb1600
 from planner_jax.runs.timing import CompileClock
 from planner_jax.sweep.block.settings import REGIMES as SWEPT
 from planner_jax.task.block.clearance import clearances, clearances_and_slopes, num_of_pole

@@ -17,7 +17,7 @@ from planner_jax.baselines.block.library.file import save_library
 from planner_jax.baselines.block.library.planner import LibraryBlock
 from planner_jax.baselines.block.library.table import Row, library_of, pack_rows
 from planner_jax.core.errors import ArgumentError
-from planner_jax.robot.arm_mjcf import irb1600
+from planner_jax.robot.arm_file import irb1600
 from planner_jax.task.block.default_planner import OnlineBlock
 from planner_jax.task.block.end_poses import contact_terms, end_poses, flight_of
 from planner_jax.task.block.motion import joint_terms, profiles

@@ -19,7 +19,7 @@ from planner_jax.benchmarks.block_library import OneBall
 from planner_jax.cli.main import main
 from planner_jax.core.errors import ArgumentError
 from planner_jax.robot.arm import REGIMES
-from planner_jax.robot.arm_mjcf import irb1600
+from planner_jax.robot.arm_file import irb1600
 from planner_jax.task.block.motion import profiles
 from planner_jax.task.block.scene import Box, paper_scene
 

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from planner_jax.referee import block, solids
 from planner_jax.referee.block import LIMITS, BlockVerdict, referee_blocks, times_inside
 from planner_jax.robot.arm import REGIMES, shield_pose
-from planner_jax.robot.arm_mjcf import irb1600
+from planner_jax.robot.arm_file import irb1600
 from planner_jax.task.block.case import case
 
 GRAVITY, DELAY, SPAN = 9.81, 0.1, 0.9

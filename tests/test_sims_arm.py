@@ -16,7 +16,7 @@ from planner_jax.cli.main import main
 from planner_jax.core.errors import ArgumentError
 from planner_jax.referee.arm_clearance import KINDS
 from planner_jax.robot.arm import shield_pose
-from planner_jax.robot.arm_mjcf import irb1600
+from planner_jax.robot.arm_file import irb1600
 from planner_jax.sims.execution import FRAME, TIMESTEP, Executed, execute
 from planner_jax.sims.film import draw_flight
 from planner_jax.sims.launch import flight_keys

@@ -7,7 +7,7 @@ import pytest
 
 import planner_jax as pj
 from planner_jax.ball.flight import drag_free_flight
-from planner_jax.robot.arm_mjcf import irb1600
+from planner_jax.robot.arm_file import irb1600
 from planner_jax.sims import camera as scene_camera
 from planner_jax.sims.board import calibrate_camera, show_board
 from planner_jax.sims.camera import RenderError, SceneCamera, measure_balls

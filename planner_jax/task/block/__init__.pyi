@@ -1,7 +1,10 @@
 from .api import judge as judge
 from .api import planner as planner
 from .case import BlockCase as BlockCase
+from .case import Shield as Shield
 from .case import case as case
+from .case import describe_arm as describe_arm
+from .case import read_arm as read_arm
 from .default_planner import OnlineBlock as OnlineBlock
 from .explain import Prospects as Prospects
 from .explain import prospects as prospects

@@ -17,7 +17,10 @@ from planner_jax.core.choices import require
 from planner_jax.core.registry import require_name
 from planner_jax.core.rules import Field, Table, require_sound
 from planner_jax.robot.arm import REGIMES, Arm, ArmLimits
-from planner_jax.robot.arm_mjcf import irb1600
+from planner_jax.robot.arm_file import Shield as Shield
+from planner_jax.robot.arm_file import describe_arm as describe_arm
+from planner_jax.robot.arm_file import irb1600
+from planner_jax.robot.arm_file import read_arm as read_arm
 from planner_jax.task.arguments import array_of, batch_of
 from planner_jax.task.block.clearance import least_clearances
 from planner_jax.task.block.scene import Scene, paper_scene

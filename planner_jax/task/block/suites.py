@@ -9,7 +9,7 @@ from jax.typing import DTypeLike
 
 from planner_jax.core.registry import suite_named
 from planner_jax.robot.arm import Arm, reach_of
-from planner_jax.robot.arm_mjcf import irb1600
+from planner_jax.robot.arm_file import irb1600
 from planner_jax.task.arguments import make_generators
 from planner_jax.task.block import scene
 from planner_jax.task.block.case import BlockCase, case

@@ -7,8 +7,6 @@ collisions afterwards.
 """
 
 import dataclasses
-import functools
-import importlib.resources
 from typing import Any, ClassVar
 
 import jax
@@ -19,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from planner_jax.referee.arm_clearance import links_of, shield_pose
 from planner_jax.robot.arm import Arm
-from planner_jax.robot.arm_mjcf import read_arm
+from planner_jax.robot.arm_file import irb1600
 from planner_jax.sims.model import World
 from planner_jax.sims.robot import Physics, Shape, Solid
 from planner_jax.sims.robots.arm.control import (
@@ -32,14 +30,7 @@ from planner_jax.sims.robots.arm.control import (
 )
 from planner_jax.sims.scenery import VISUAL, box_solid, capsule_solid, xml_numbers
 
-_MODELS = importlib.resources.files("planner_jax.robot") / "models"
-_IRB1600 = (_MODELS / "irb1600.xml").read_text("utf-8")
 _THICKNESS = 0.01  # [m], thickness of the shield
-
-
-@functools.cache
-def _arm(xml: str) -> Any:
-    return read_arm(xml, dtype=np.float64)
 
 
 def lanes_of(arm: Arm) -> dict[str, np.ndarray]:
@@ -53,10 +44,8 @@ def lanes_of(arm: Arm) -> dict[str, np.ndarray]:
 
 @dataclasses.dataclass(frozen=True)
 class ShieldArm:
-    """The simulated six-axis arm with a shield; static under `jax.jit`."""
+    """The simulated arm IRB 1600 with a shield; static under `jax.jit`."""
 
-    # MJCF text of the arm, in the form that `read_arm` accepts.
-    xml: str = dataclasses.field(default=_IRB1600, repr=False)
     base_height: float = 0.0  # [m], height of the base frame above the ground
     gains: Gains = Gains()
 
@@ -70,7 +59,7 @@ class ShieldArm:
     @property
     def arm(self) -> Any:
         """The `Arm` for which plans are made, with NumPy float64 leaves."""
-        return _arm(self.xml)
+        return irb1600(np.float64)
 
     def mjcf(self) -> tuple[str, str]:
         """Return two texts in MJCF, MuJoCo's format: the links with the shield, and the motors."""

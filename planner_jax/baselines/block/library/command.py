@@ -22,9 +22,8 @@ from planner_jax.core.choices import (
     require_seed,
     require_size,
 )
-from planner_jax.core.errors import ArgumentError
 from planner_jax.robot.arm import REGIMES
-from planner_jax.robot.arm_mjcf import irb1600, read_arm
+from planner_jax.robot.arm_file import irb1600, read_arm
 from planner_jax.runs import style
 from planner_jax.runs.environment import require_backend
 from planner_jax.task.block.scene import Box, paper_scene
@@ -46,9 +45,10 @@ def build_library(
     Args:
         path: path of the library file.
         layout: a key of `LAYOUTS`, the division of the two boxes around the arm into cells.
-        regime: a key of `REGIMES`, the joint limits, and whether motions end at standstill.
+        regime: a key of `REGIMES`: whether motions end at standstill, and the joint limits of the
+            IRB 1600. Another arm has the limits of its file.
         pole: whether the scene contains the pole.
-        arm: path of an MJCF file; by default the IRB 1600.
+        arm: path of an MJCF or URDF file; by default the IRB 1600.
         home: joint angles [rad] at which motions start, six for each start pose; by default one
             start pose of the arm.
 
@@ -68,15 +68,11 @@ def build_library(
     if Path(path).exists():
         load_library(path)  # raises for a file of another kind, which must not be overwritten
     require_backend()
-    try:
-        body = irb1600() if arm is None else read_arm(arm)
-    except ValueError as error:
-        raise ArgumentError("arm", f"an arm of six joints: {error}", shown="") from None
-    except OSError as error:
-        raise ArgumentError("arm", "a file", shown=f"{arm!r} ({error.strerror})") from None
+    body = irb1600() if arm is None else read_arm(arm)
     chosen, scene = REGIMES[regime], paper_scene(has_pole=pole)
+    limits = chosen.limits if arm is None else body.limits
     setting = Setting(
-        arm=body, limits=chosen.limits, ends_at_rest=host_leaf(chosen.ends_at_rest), scene=scene
+        arm=body, limits=limits, ends_at_rest=host_leaf(chosen.ends_at_rest), scene=scene
     )
     homes = np.reshape(body.home if home is None else home, (-1, 6))
     start = time.perf_counter()

@@ -16,7 +16,7 @@ def add_commands(command: Callable[[str, str], Callable[..., None]]) -> None:
     build("--layout", metavar="NAME", help="full, or A, B, C, D of fewer (default: full)")
     build("--regime", metavar="NAME", help="limits of the joints: R1, R2, R3 (default: R2)")
     build("--no-pole", dest="pole", action="store_false", help="the scene without its pole")
-    build("--arm", metavar="FILE", help="an MJCF file (default: the IRB 1600)")
+    build("--arm", metavar="FILE", help="an MJCF or URDF file (default: the IRB 1600)")
     angles = "six angles [rad] of the arm's home, or six for each of several homes"
     build("--home", type=float, nargs="+", metavar="Q", help=angles)
     show = command("show", "print coverage, memory and hashes of a library")

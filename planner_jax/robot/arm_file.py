@@ -1,0 +1,393 @@
+"""Reader of arms from MJCF and URDF files, by MuJoCo's own compiler; see `docs/arms.md`.
+
+The arm is a chain of six or seven hinge joints. A body without a joint of the chain belongs to the
+link that carries it. The joints of a gripper stay at their home positions.
+"""
+
+import dataclasses
+import functools
+import importlib.resources
+import itertools
+import os
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import DTypeLike
+from scipy.spatial.transform import Rotation
+
+from planner_jax.core.arithmetic import host_leaf
+from planner_jax.core.choices import require
+from planner_jax.referee import solids
+from planner_jax.robot.arm import Arm, ArmLimits
+from planner_jax.robot.arm_chain import BASE, OUTSIDE, ArmModel, Frame
+from planner_jax.robot.arm_ik import choose_ik
+from planner_jax.robot.arm_limits import Limits, limits_of
+from planner_jax.robot.capsule_fit import Cover, cover, measure_excess
+
+_THICKNESS = 0.01  # [m], of a shield's plate
+_FORK = 0.71  # see `irb1600`
+
+
+@dataclasses.dataclass(frozen=True)
+class Shield:
+    """A rectangular shield, 0.01 m thick, at the tip of an arm.
+
+    The origin of the shield's frame is the middle of the front face. The axis x is the outward
+    normal, y and z are parallel to the edges. By default x is the axis z of the tip, as for the
+    frame `tool0` of ROS.
+    """
+
+    half: tuple[float, float] = (0.15, 0.15)  # [m], halves of the edges along y and z
+    position: tuple[float, float, float] = (0.0, 0.0, 0.02)  # [m], in the frame of the tip
+    # Unit quaternion w, x, y, z: rotation of the shield's frame in the frame of the tip.
+    turn: tuple[float, float, float, float] = (0.5**0.5, 0.0, -(0.5**0.5), 0.0)
+    mass: float = 0.0  # [kg], spread evenly over the plate
+
+    def __post_init__(self) -> None:
+        require(min(self.half) > 0.0, "shield.half", "> 0", self.half)
+        require(self.mass >= 0.0, "shield.mass", ">= 0", self.mass)
+        require(any(self.turn), "shield.turn", "a quaternion other than zero", self.turn)
+
+
+class _Mount(NamedTuple):
+    """A shield in the frame of the last link."""
+
+    centre: np.ndarray  # (3,) [m], middle of the front face
+    turn: np.ndarray  # (3, 3), rotation of the shield's frame
+    half: np.ndarray  # (2,) [m], halves of the edges; 0 without a shield
+    mass: float = 0.0  # [kg], in addition to the masses of the file's bodies
+    geom: int = -1  # index of the file's geom that is the shield, or -1
+
+
+@functools.cache
+def irb1600(dtype: DTypeLike = np.float32) -> Arm:
+    """Return the arm ABB IRB 1600-6/1.2 with a square shield of 0.30 m (`models/irb1600.xml`).
+
+    Only pairs of bodies are checked that can touch: links 3 to 6 and link 1, links 1 to 4 and the
+    shield. Link 4 ends in a fork around the wrist, and its capsule extends beyond the fork. For
+    distances from the shield, the radius of this capsule is therefore at most a fraction of the
+    distance between the wrist and the shield's face.
+    """
+    models = importlib.resources.files("planner_jax.robot") / "models"
+    arm = read_arm(os.fspath(models / "irb1600.xml"), dtype=dtype)  # type: ignore[arg-type]
+    link, radius = np.array(arm.capsule_link), np.asarray(arm.capsule_radius)
+    wrist = np.linalg.norm(np.add(arm.origin[5], arm.shield_centre, dtype=float))
+    thin = np.where(link == 3, np.minimum(radius, _FORK * wrist), radius)
+    every = range(len(link))
+    return dataclasses.replace(
+        arm,
+        shield_gap_radius=host_leaf(thin, dtype),
+        pairs=tuple((k, j) for k in every for j in every if link[k] >= 2 and link[j] == 0),
+        shield_pairs=tuple(k for k in every if 0 <= link[k] <= 3),
+    )
+
+
+def read_arm(
+    path: str | os.PathLike,
+    *,
+    limits: Limits = None,
+    shield: Shield | None = None,
+    tip: str | None = None,
+    home: Iterable[float] | None = None,
+    dtype: DTypeLike = np.float32,
+) -> Arm:
+    """Read an arm from an MJCF or URDF file; its leaves are NumPy arrays.
+
+    The base frame is the frame of the outermost body that carries the arm. The pose of this body
+    in the world is ignored.
+
+    Args:
+        path: path of a file, or its text, which begins with "<".
+        limits: limits of the joints as a dictionary, or the path of a YAML file with them. By
+            default `NAME.limits.yaml` beside the file is read, if it exists.
+        shield: the shield. By default it is the box named "shield" of the file, if there is one.
+        tip: name of the body or the site at the end of the arm. By default the arm ends where its
+            chain of hinges branches or ends.
+        home: joint angles [rad] at which the arm waits. By default they are the key named home of
+            the file or its only key, or the angles nearest to 0 within the limits.
+        dtype: type of every leaf.
+
+    Raises:
+        ArgumentError: the file is no such arm, or lacks limits. The message is one line that names
+            the file, the element and the remedy.
+    """
+    return _read(path, limits, shield, tip, home, dtype)[0]
+
+
+def describe_arm(
+    path: str | os.PathLike,
+    *,
+    limits: Limits = None,
+    shield: Shield | None = None,
+    tip: str | None = None,
+    home: Iterable[float] | None = None,
+) -> str:
+    """Describe an arm as `read_arm` reads it: joints, fit of the capsules, pairs not checked.
+
+    The arguments and errors are those of `read_arm`.
+    """
+    return _read(path, limits, shield, tip, home, np.float32)[1]
+
+
+def _read(path, limits, shield, tip, home, dtype) -> tuple[Arm, str]:
+    """Return the arm of a file, and the text of `describe_arm`."""
+    model = ArmModel(path, tip)
+    stated = limits_of(model, limits)
+    lower, upper = stated["position"].T
+    home, source = model.home(home, lower, upper)
+    mount = _mount(model, shield)
+    before = [(np.zeros(3), np.eye(3)), *model.zero[:-1]]
+    steps = [
+        (turn.T @ (p - q), turn.T @ r) for (q, turn), (p, r) in zip(before, model.zero, strict=True)
+    ]
+    inertials = [_sum_inertias(model.bodies(k)) for k in range(model.num - 1)]
+    inertials.append(_sum_inertias([*model.bodies(model.num - 1), *_plate(mount)]))
+    mass, centre, inertia = zip(*inertials, strict=True)
+    covers, box = _cover(model, mount.geom)
+    link = tuple(k for k, each in covers for _ in each.radius)
+    ends = np.concatenate([np.zeros((0, 2, 3)), *(each.ends for _, each in covers)])
+    radius = np.concatenate([np.zeros(0), *(each.radius for _, each in covers)])
+    if box is None:  # a point inside the base, or else of the first joint
+        inside = ends[link.index(BASE)][0] if BASE in link else steps[0][0]
+        base_box = np.stack([inside, inside])
+    else:
+        base_box = box
+    axis = np.array([model.axis(k) for k in range(model.num)])
+    leaves = {
+        "origin": [origin for origin, _ in steps],
+        "turn": [_quaternion(turn) for _, turn in steps],
+        "axis": axis,
+        "lower": lower,
+        "upper": upper,
+        "home": home,
+        "mass": mass,
+        "centre": centre,
+        "inertia": inertia,
+        "capsule_ends": ends,
+        "capsule_radius": radius,
+        "shield_gap_radius": radius,
+        "base_box": base_box,
+        "shield_centre": mount.centre,
+        "shield_turn": _quaternion(mount.turn),
+        "shield_half": mount.half,
+    }
+    rest = [model.frames(angles) for angles in (home, np.zeros(model.num))]
+    checked = _pairs(link, ends, radius, box, mount, rest)
+    off_axis = np.cross([mount.turn[:, 0], mount.centre], axis[-1])
+    arrays = {name: host_leaf(leaf, dtype) for name, leaf in leaves.items()}
+    arm = Arm(
+        **arrays,
+        limits=ArmLimits(
+            velocity=host_leaf(stated["velocity"], dtype),
+            acceleration=host_leaf(stated["acceleration"], dtype),
+        ),
+        capsule_link=link,
+        pairs=checked.pairs,
+        base_pairs=checked.base_pairs,
+        shield_pairs=checked.shield_pairs,
+        joint_names=model.joint_names,
+        turns_in_plane=bool(np.max(np.abs(off_axis)) < 1e-6),
+        ik="numerical",
+    )
+    arm = dataclasses.replace(arm, ik=choose_ik(arm))
+    return arm, _describe(model, covers, source, checked.touching, stated["torque"])
+
+
+def _quaternion(turn: np.ndarray) -> np.ndarray:
+    return Rotation.from_matrix(turn).as_quat(canonical=True, scalar_first=True)
+
+
+def _sum_inertias(bodies: list) -> tuple[float, np.ndarray, np.ndarray]:
+    """Return mass [kg], centre (3,) [m] and inertia (3, 3) [kg m^2] of rigidly connected bodies."""
+    mass = sum(m for m, _, _ in bodies)
+    centre = sum((m * c for m, c, _ in bodies), np.zeros(3)) / (mass or 1.0)
+    inertia = np.zeros((3, 3))
+    for m, c, own in bodies:
+        off = c - centre
+        inertia += own + m * (off @ off * np.eye(3) - np.outer(off, off))
+    return mass, centre, inertia
+
+
+def _plate(mount: _Mount) -> list[tuple[float, np.ndarray, np.ndarray]]:
+    """Return mass, centre and inertia of a shield that is not a body of the file, in a list."""
+    if not mount.mass:
+        return []
+    squares = np.array([_THICKNESS, *(2.0 * mount.half)]) ** 2
+    moments = mount.mass / 12.0 * (np.sum(squares) - squares)
+    centre = mount.centre - 0.5 * _THICKNESS * mount.turn[:, 0]
+    return [(mount.mass, centre, mount.turn * moments @ mount.turn.T)]
+
+
+def _mount(model: ArmModel, shield: Shield | None) -> _Mount:
+    """Return the shield that is passed, or else the file's shield, or else one of size 0."""
+    origin, turn = model.tip
+    mj, kinds, last = model.model, model.mujoco.mjtGeom, model.num - 1
+    every = [(mj.ngeom, mj.geom), (mj.nsite, mj.site)]
+    geoms, sites = ([k for k in range(num) if at(k).name == "shield"] for num, at in every)
+    if shield is not None or not geoms:
+        own = shield or Shield(position=(0.0, 0.0, 0.0))
+        rotation = Rotation.from_quat(own.turn, scalar_first=True).as_matrix()
+        half = np.array(own.half, float) if shield else np.zeros(2)
+        return _Mount(origin + turn @ np.array(own.position), turn @ rotation, half, own.mass)
+    geom, half = geoms[0], mj.geom_size[geoms[0]]
+    if mj.geom_type[geom] != kinds.mjGEOM_BOX or model.link[mj.geom_bodyid[geom]] != last:
+        raise model.error(
+            'geom "shield"', "a box of the last link; rename it or pass shield=", "be"
+        )
+    middle, turn = model.pose_of("geom", geom, last)
+    if sites:
+        face = turn.T @ (model.pose_of("site", sites[0], last)[0] - middle)
+        k = int(np.argmax(np.abs(face) / half))
+    else:  # a broad face, whose outward normal points away from the link's origin
+        k, face = int(np.argmin(half)), turn.T @ middle
+    sign = -1.0 if face[k] < 0.0 else 1.0
+    front = sign * half[k] * np.eye(3)[k]
+    if sites and not np.allclose(face, front, rtol=0.0, atol=1e-6):
+        raise model.error('site "shield"', "in the middle of a face of the shield's box", "be")
+    y, z = (k + 1) % 3, (k + 2) % 3
+    own = np.eye(3)[[k, y, z]].T * [sign, 1.0, sign]
+    return _Mount(middle + turn @ front, turn @ own, half[[y, z]], geom=geom)
+
+
+def _cover(model: ArmModel, plate: int) -> tuple[list[tuple[int, Cover]], np.ndarray | None]:
+    """Return covers of the collision geoms with their links, and the base's box (2, 3) [m].
+
+    The largest geom of the base is covered by a box, parallel to the axes of the base frame, if
+    capsules would exceed the geom more.
+
+    Args:
+        model: the arm's model.
+        plate: index of the geom that is the shield, or -1.
+    """
+    geoms = model.model.geom_bodyid
+    shapes = [(k, int(model.link[geoms[k]]), model.shape(k)) for k in model.solids()]
+    hulls = [each for _, link, each in shapes if link == BASE and not isinstance(each, Cover)]
+    largest = max(hulls, key=lambda corners: np.prod(np.ptp(corners, axis=0)), default=None)
+    covers, chosen = [], None
+    for k, link, shape in shapes:
+        # A shield that is thicker than a plate is a body of the last link, too.
+        if k == plate and np.min(model.model.geom_size[k]) < 0.5 * _THICKNESS + 1e-6:
+            continue
+        if isinstance(shape, Cover):
+            fitted = shape
+        else:
+            box = np.stack([np.min(shape, axis=0), np.max(shape, axis=0)])
+            corners = np.array([*itertools.product(*box.T)])[:, None].repeat(2, axis=1)
+            around = Cover(corners[:0], np.zeros(0), *measure_excess(corners, np.zeros(8), shape))
+            fitted = around if around.mean < 1e-9 and shape is largest else cover(shape)
+            if shape is largest and around.mean <= fitted.mean:
+                fitted, chosen = around, box
+        covers.append((link, fitted))
+    return covers, chosen
+
+
+class _Checked(NamedTuple):
+    """Bodies that must not touch, as fields of `Arm`, and the pairs of links that are left out."""
+
+    pairs: tuple[tuple[int, int], ...]
+    base_pairs: tuple[int, ...]
+    shield_pairs: tuple[int, ...]
+    touching: tuple[tuple[int, int], ...]  # links that touch at rest; the shield has the index n
+
+
+def _pairs(
+    link: tuple[int, ...],
+    ends: np.ndarray,
+    radius: np.ndarray,
+    box: np.ndarray | None,
+    mount: _Mount,
+    rest: list[list[Frame]],
+) -> _Checked:
+    """Return the bodies that must not touch: bodies that do not touch at home or at angles 0.
+
+    Bodies of one link or of neighbouring links are left out. The shield is a body of the last link.
+    """
+    num, every = len(rest[0]), range(len(link))
+    poses = []  # ends of the capsules (C, 2, 3) [m] at home and at angles 0
+    for links in rest:
+        frames = [*links, (np.zeros(3), np.eye(3))]  # the base has the index -1
+        turned = [ends[k] @ frames[link[k]][1].T + frames[link[k]][0] for k in every]
+        poses.append(np.reshape(turned, (-1, 2, 3)))
+
+    def gap(k: int, j: int) -> float:
+        gaps = [
+            solids.between_segments(each[k, 0], each[k, 1], each[j, 0], each[j, 1])
+            for each in poses
+        ]
+        return min(gaps) - radius[k] - radius[j]
+
+    def box_gap(k: int) -> float:
+        if box is None:
+            return np.inf
+        middle, half = box.mean(axis=0), 0.5 * np.ptp(box, axis=0)
+        gaps = [
+            solids.segment_to_box(a - middle, b - middle, half) for a, b in (p[k] for p in poses)
+        ]
+        return min(gaps) - radius[k]
+
+    def shield_gap(k: int) -> float:
+        half, gaps = np.array([0.5 * _THICKNESS, *mount.half]), []
+        for links, each in zip(rest, poses, strict=True):
+            origin, turn = links[-1]
+            own = turn @ mount.turn
+            middle = origin + turn @ mount.centre - half[0] * own[:, 0]
+            first, second = (each[k] - middle) @ own
+            gaps.append(solids.segment_to_box(first, second, half))
+        return min(gaps) - radius[k]
+
+    base = [k for k in every if link[k] == BASE]
+    swung = [k for k in every if link[k] >= 1]
+    base_gaps = {k: min([box_gap(k), *(gap(k, j) for j in base)]) for k in swung}
+    base_pairs = [k for k in swung if np.isfinite(base_gaps[k]) and base_gaps[k] > 0.0]
+    touching = {(link[k], BASE) for k in swung if base_gaps[k] <= 0.0}
+    pairs = [(k, j) for k in base_pairs for j in base]
+    for k, j in itertools.product(every, every):
+        if link[j] != BASE and link[k] - link[j] > 1:
+            if gap(k, j) > 0.0:
+                pairs.append((k, j))
+            else:
+                touching.add((link[k], link[j]))
+    shield_pairs = [*base] if np.any(mount.half) else []
+    for k in every if np.any(mount.half) else ():
+        if 0 <= link[k] < num - 2:
+            if shield_gap(k) > 0.0:
+                shield_pairs.append(k)
+            else:
+                touching.add((num, link[k]))
+    left_out = tuple(sorted(touching))
+    return _Checked(tuple(pairs), tuple(base_pairs), tuple(shield_pairs), left_out)
+
+
+def _describe(
+    model: ArmModel,
+    covers: list[tuple[int, Cover]],
+    home: str,
+    touching: tuple[tuple[int, int], ...],
+    torque: np.ndarray,
+) -> str:
+    mj = model.model
+    frozen = [
+        mj.joint(j).name
+        for j in range(mj.njnt)
+        if j not in model.joints and model.link[mj.jnt_bodyid[j]] != OUTSIDE
+    ]
+    names = [*model.link_names, "the shield", "the base"]  # the base has the index -1
+    pairs = ", ".join(f"{names[a]} and {names[b]}" for a, b in touching) or "none"
+    lines = [
+        f"{model.name}: {model.num} hinges, {', '.join(model.joint_names)}",
+        f"Home: {home}. Joints that stay there: {', '.join(frozen) or 'none'}.",
+        f"Greatest torques [N m]: {', '.join(f'{each:g}' for each in torque)}.",
+        f"{'link':24}{'capsules':>10}{'greatest excess [mm]':>22}{'mean excess [mm]':>18}",
+    ]
+    for link in (BASE, *range(model.num)):
+        of_link = [each for k, each in covers if k == link]
+        num = sum(len(each.radius) for each in of_link)
+        greatest = 1e3 * max((each.greatest for each in of_link), default=0.0)
+        mean = 1e3 * sum(each.mean for each in of_link) / max(len(of_link), 1)
+        lines.append(f"{names[link]:24}{num:>10}{greatest:>22.1f}{mean:>18.1f}")
+    bare = [name for k, name in enumerate(model.link_names) if k not in dict(covers)]
+    lines.append(f"Links without a collision body: {', '.join(bare) or 'none'}.")
+    lines.append("Pairs of neighbouring links are not checked.")
+    lines.append(f"Not checked, because they touch at home or at angles 0: {pairs}.")
+    return "\n".join(lines)
