@@ -76,7 +76,7 @@ def _write_answer(single: "Single", answer: "Answer", out: Path, rate: float | N
         # The file of setpoints ends with the plan's own trajectory to standstill, if it has one.
         plan = answer.plan
         is_rested = isinstance(plan, QuadrotorPlan) and plan.recovery is not None
-        how = {"rate": rate, "recovery": "brake" if is_rested else None}
+        how = {"rate": rate, "recovery": "brake" if is_rested else None, "case": answer.case}
         written.append(export(answer.plan, to="csv", out=out / "setpoints.csv", **how))
     written += single.write_pictures(answer, out)
     print("\n" + "\n".join(map(str, written)))
