@@ -9,6 +9,7 @@ from planner_jax.core.choices import CHOICES, require, require_one_of
 from planner_jax.core.registry import Task, split_name
 from planner_jax.runs.manifest import Entries
 from planner_jax.runs.settings import option, recovery_option, recovery_options
+from planner_jax.sweep.block.settings import REGIMES
 from planner_jax.sweep.quadrotor_settings import resolve_robot, robot_option
 from planner_jax.task.catch.spec import DECISIONS, TRAINED
 from planner_jax.task.hit.spec import DRAG
@@ -48,6 +49,28 @@ class SingleInterceptSettings(PlanSettings):
     map: str = option(MISSING, "FILE", "YAML or JSON file with the arguments of pj.intercept.case")
 
     RUN: ClassVar[str] = "planner_jax.cli.plan.intercept:SingleIntercept"
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SingleBlockSettings(PlanSettings):
+    """Options of `planner-jax plan block`: ball, limits of the joints, and tolerances."""
+
+    pos: tuple[float, ...] = option(MISSING, "X Y Z", "initial position of the ball [m]")
+    vel: tuple[float, ...] = option(MISSING, "X Y Z", "initial velocity of the ball [m/s]")
+    delay: float = option(0.0, "S", "seconds until the arm may start")
+    regime: str = option("R2", "NAME", f"limits of the joints: {', '.join(REGIMES)}")
+    wide: bool = option(False, "", "accept a ball 0.1 m from the shield's middle, at 30 degrees")
+    no_pole: bool = option(False, "", "leave out the pole before the arm")
+
+    RUN: ClassVar[str] = "planner_jax.cli.plan.block:SingleBlock"
+
+    def __post_init__(self) -> None:
+        require_one_of(REGIMES, "regime", self.regime)
+        for name in ("pos", "vel"):
+            numbers = tuple(vars(self)[name])
+            object.__setattr__(self, name, numbers)
+            for number in numbers:
+                require(math.isfinite(number), name, "finite", number)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -6,6 +6,7 @@ from .case import case as case
 from .case import describe_arm as describe_arm
 from .case import read_arm as read_arm
 from .default_planner import OnlineBlock as OnlineBlock
+from .drawing import draw_plan as draw_plan
 from .explain import Prospects as Prospects
 from .explain import prospects as prospects
 from .plan import BlockPlan as BlockPlan

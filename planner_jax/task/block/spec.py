@@ -40,5 +40,6 @@ TASK = Task(
     sweep="planner_jax.sweep.block.settings:BlockSettings",
     flight="planner_jax.sims.settings:BlockFly",
     contact="contact_time",
+    single="planner_jax.cli.plan.settings:SingleBlockSettings",
     yardstick={"name": "brisk"},
 )

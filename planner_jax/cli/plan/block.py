@@ -1,0 +1,77 @@
+"""The command `planner-jax plan block`: one thrown ball that an arm blocks with its shield."""
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import PyTree
+
+from planner_jax.cli.plan.answer import Answer, Margin, Single, closest_to
+from planner_jax.cli.plan.settings import SingleBlockSettings
+from planner_jax.runs.style import draw
+from planner_jax.task.block.case import case
+from planner_jax.task.block.drawing import SIZE, draw_plan
+from planner_jax.task.block.explain import prospects
+from planner_jax.task.block.scene import paper_scene
+
+_RATE = 4000.0  # [Hz], rate of the samples that are compared with the limits
+
+
+class SingleBlock(Single[SingleBlockSettings]):
+    """One case in which an arm blocks a ball with its shield."""
+
+    NAMES = {"ball.pos": "pos", "ball.vel": "vel", "ball_pos": "pos", "ball_vel": "vel"}
+
+    def case(self) -> PyTree:
+        """Make the case of the specified ball."""
+        given = self.settings
+        return case(
+            given.pos,
+            given.vel,
+            delay=given.delay,
+            regime=given.regime,
+            wide=given.wide,
+            scene=paper_scene(has_pole=not given.no_pole),
+        )
+
+    def contact(self, answer: Answer) -> list[str]:
+        """Describe the contact of ball and shield in one sentence."""
+        verdict, end = answer.verdict, answer.plan.sample(_RATE).angles[-1]
+        return [
+            f"Blocked at {float(verdict.contact_time):.3f} s, {1e3 * float(verdict.miss):.1f} mm "
+            f"from the shield's middle; the arm moves for {float(verdict.execution_time):.3f} s, "
+            f"to the angles {np.array2string(end, precision=3)} rad."
+        ]
+
+    def describe(self, answer: Answer) -> list[str]:
+        """Describe the answer, and the reason if the ball is not blocked, in lines of text."""
+        lines = super().describe(answer)
+        if not answer.success:
+            lines.insert(1, f"Prospects: {prospects(answer.case).sentence()}.")
+        return lines
+
+    def task_margins(self, answer: Answer) -> list[Margin]:
+        """Return how close the joints come to their limits, and the ball to the shield's edge."""
+        limits, names = answer.case.limits, answer.case.arm.joint_names
+        moved = answer.plan.sample(_RATE)
+        times = float(answer.case.delay) + moved.time
+        margins = [
+            closest_to(times, f"{joint} [{unit}]", values, allowed)
+            for unit, sampled, most in (
+                ("rad/s", moved.rates, limits.velocity),
+                ("rad/s^2", moved.accelerations, limits.acceleration),
+            )
+            for joint, values, allowed in zip(names, np.abs(sampled).T, most, strict=True)
+        ]
+        miss, allowed = float(answer.verdict.miss), float(answer.case.offset)
+        words = "ball from the shield's middle [m]"
+        return [Margin(words, miss, allowed, float(answer.plan.contact_time)), *margins]
+
+    def margins(self, answer: Answer) -> list[Margin]:
+        """Return how close the plan comes to each limit of the arm."""
+        return self.task_margins(answer)
+
+    def write_pictures(self, answer: Answer, out: Path) -> list[Path]:
+        """Draw the arm and its rates into the folder `out`, and return the picture's path."""
+        path = out / "block.png"
+        draw(path, lambda figure: draw_plan(answer.case, answer.plan, figure), SIZE)
+        return [path]
