@@ -330,7 +330,7 @@ def test_bodies_that_touch_at_rest_are_left_out_and_named(folder, seven):
     apart = [links[k] - links[j] for k, j in seven.pairs if links[j] >= 0]
     assert min(apart) == 2
     report = describe_arm(folder / "seven.xml", limits=RATES)
-    assert "touch at home or at angles 0: " in report and "six and four" in report
+    assert "bodies touch at home or at angles 0: " in report and "six and four" in report
     assert not any({links[k], links[j]} == {5, 3} for k, j in seven.pairs)
     assert "Joints that stay there: l, r." in report
     assert "Greatest torques [N m]: inf, 70, inf, 15, inf, inf, inf." in report

@@ -152,10 +152,10 @@ def test_the_modules_are_those_of_the_wheel(installed, elsewhere):
 
 
 @pytest.mark.parametrize("arguments", ["fly catch --num 1", "fly hit --num 1"])
-def test_without_mujoco_a_flight_names_the_extra_in_one_line(
+def test_without_mjx_a_flight_names_the_extra_in_one_line(
     installed, elsewhere, tmp_path, arguments
 ):
-    (tmp_path / "sitecustomize.py").write_text("import sys\nsys.modules['mujoco'] = None\n")
+    (tmp_path / "sitecustomize.py").write_text("import sys\nsys.modules['mujoco.mjx'] = None\n")
     command = [installed[0] / "planner-jax", *arguments.split()]
     done = run(*command, cwd=elsewhere, PYTHONPATH=str(tmp_path))
     assert done.returncode == 2 and done.stderr.count("\n") == 1, done.stderr

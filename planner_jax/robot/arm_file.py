@@ -10,7 +10,7 @@ import importlib.resources
 import itertools
 import os
 from collections.abc import Iterable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import DTypeLike
@@ -115,27 +115,27 @@ def read_arm(
     return _read(path, limits, shield, tip, home, dtype)[0]
 
 
-def describe_arm(
-    path: str | os.PathLike,
-    *,
-    limits: Limits = None,
-    shield: Shield | None = None,
-    tip: str | None = None,
-    home: Iterable[float] | None = None,
-) -> str:
+def describe_arm(path: str | os.PathLike, **settings: Any) -> str:
     """Describe an arm as `read_arm` reads it: joints, fit of the capsules, pairs not checked.
 
     The arguments and errors are those of `read_arm`.
     """
-    return _read(path, limits, shield, tip, home, np.float32)[1]
+    return _read(path, **settings)[1]
 
 
-def _read(path, limits, shield, tip, home, dtype) -> tuple[Arm, str]:
+def _read(
+    path: str | os.PathLike,
+    limits: Limits = None,
+    shield: Shield | None = None,
+    tip: str | None = None,
+    home: Iterable[float] | None = None,
+    dtype: DTypeLike = np.float32,
+) -> tuple[Arm, str]:
     """Return the arm of a file, and the text of `describe_arm`."""
     model = ArmModel(path, tip)
     stated = limits_of(model, limits)
     lower, upper = stated["position"].T
-    home, source = model.home(home, lower, upper)
+    rest, source = model.home(home, lower, upper)
     mount = _mount(model, shield)
     before = [(np.zeros(3), np.eye(3)), *model.zero[:-1]]
     steps = [
@@ -160,7 +160,7 @@ def _read(path, limits, shield, tip, home, dtype) -> tuple[Arm, str]:
         "axis": axis,
         "lower": lower,
         "upper": upper,
-        "home": home,
+        "home": rest,
         "mass": mass,
         "centre": centre,
         "inertia": inertia,
@@ -172,8 +172,8 @@ def _read(path, limits, shield, tip, home, dtype) -> tuple[Arm, str]:
         "shield_turn": _quaternion(mount.turn),
         "shield_half": mount.half,
     }
-    rest = [model.frames(angles) for angles in (home, np.zeros(model.num))]
-    checked = _pairs(link, ends, radius, box, mount, rest)
+    poses = [model.frames(angles) for angles in (rest, np.clip(0.0, lower, upper))]
+    checked = _pairs(link, ends, radius, box, mount, poses)
     off_axis = np.cross([mount.turn[:, 0], mount.centre], axis[-1])
     arrays = {name: host_leaf(leaf, dtype) for name, leaf in leaves.items()}
     arm = Arm(
@@ -299,59 +299,54 @@ def _pairs(
     mount: _Mount,
     rest: list[list[Frame]],
 ) -> _Checked:
-    """Return the bodies that must not touch: bodies that do not touch at home or at angles 0.
+    """Return the bodies that must not touch: bodies that do not touch in the poses `rest`.
 
     Bodies of one link or of neighbouring links are left out. The shield is a body of the last link.
     """
     num, every = len(rest[0]), range(len(link))
-    poses = []  # ends of the capsules (C, 2, 3) [m] at home and at angles 0
+    poses = []  # ends of the capsules (C, 2, 3) [m] in each pose
     for links in rest:
         frames = [*links, (np.zeros(3), np.eye(3))]  # the base has the index -1
         turned = [ends[k] @ frames[link[k]][1].T + frames[link[k]][0] for k in every]
         poses.append(np.reshape(turned, (-1, 2, 3)))
 
     def gap(k: int, j: int) -> float:
-        gaps = [
-            solids.between_segments(each[k, 0], each[k, 1], each[j, 0], each[j, 1])
-            for each in poses
-        ]
+        gaps = [solids.between_segments(p[k, 0], p[k, 1], p[j, 0], p[j, 1]) for p in poses]
         return min(gaps) - radius[k] - radius[j]
 
-    def box_gap(k: int) -> float:
-        if box is None:
-            return np.inf
-        middle, half = box.mean(axis=0), 0.5 * np.ptp(box, axis=0)
-        gaps = [
-            solids.segment_to_box(a - middle, b - middle, half) for a, b in (p[k] for p in poses)
-        ]
-        return min(gaps) - radius[k]
-
-    def shield_gap(k: int) -> float:
-        half, gaps = np.array([0.5 * _THICKNESS, *mount.half]), []
-        for links, each in zip(rest, poses, strict=True):
-            origin, turn = links[-1]
-            own = turn @ mount.turn
-            middle = origin + turn @ mount.centre - half[0] * own[:, 0]
-            first, second = (each[k] - middle) @ own
+    def box_gap(k: int, half: np.ndarray, middles: list[Frame]) -> float:
+        gaps = []
+        for (middle, turn), ends in zip(middles, poses, strict=True):
+            first, second = (ends[k] - middle) @ turn
             gaps.append(solids.segment_to_box(first, second, half))
         return min(gaps) - radius[k]
 
     base = [k for k in every if link[k] == BASE]
-    swung = [k for k in every if link[k] >= 1]
-    base_gaps = {k: min([box_gap(k), *(gap(k, j) for j in base)]) for k in swung}
-    base_pairs = [k for k in swung if np.isfinite(base_gaps[k]) and base_gaps[k] > 0.0]
-    touching = {(link[k], BASE) for k in swung if base_gaps[k] <= 0.0}
-    pairs = [(k, j) for k in base_pairs for j in base]
-    for k, j in itertools.product(every, every):
-        if link[j] != BASE and link[k] - link[j] > 1:
+    pairs, base_pairs, touching = [], [], set()
+    for k in (k for k in every if link[k] >= 1):
+        gaps = [gap(k, j) for j in base]
+        if box is not None:
+            middle = box.mean(axis=0), np.eye(3)
+            gaps.append(box_gap(k, 0.5 * np.ptp(box, axis=0), [middle] * len(rest)))
+        if gaps and min(gaps) > 0.0:
+            base_pairs.append(k)
+            pairs += [(k, j) for j in base]
+        elif gaps:
+            touching.add((link[k], BASE))
+        for j in (j for j in every if 0 <= link[j] < link[k] - 1):
             if gap(k, j) > 0.0:
                 pairs.append((k, j))
             else:
                 touching.add((link[k], link[j]))
-    shield_pairs = [*base] if np.any(mount.half) else []
-    for k in every if np.any(mount.half) else ():
-        if 0 <= link[k] < num - 2:
-            if shield_gap(k) > 0.0:
+    shield_pairs = []
+    if np.any(mount.half):
+        half, plates = np.array([0.5 * _THICKNESS, *mount.half]), []
+        for links in rest:
+            origin, turn = links[-1]
+            own = turn @ mount.turn
+            plates.append((origin + turn @ mount.centre - half[0] * own[:, 0], own))
+        for k in (k for k in every if link[k] < num - 2):
+            if link[k] == BASE or box_gap(k, half, plates) > 0.0:
                 shield_pairs.append(k)
             else:
                 touching.add((num, link[k]))
@@ -389,5 +384,5 @@ def _describe(
     bare = [name for k, name in enumerate(model.link_names) if k not in dict(covers)]
     lines.append(f"Links without a collision body: {', '.join(bare) or 'none'}.")
     lines.append("Pairs of neighbouring links are not checked.")
-    lines.append(f"Not checked, because they touch at home or at angles 0: {pairs}.")
+    lines.append(f"Not checked, because bodies touch at home or at angles 0: {pairs}.")
     return "\n".join(lines)

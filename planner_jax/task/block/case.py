@@ -156,6 +156,8 @@ def case(
     require_kind("arm", arm, Arm)
     rule = "one with a capsule around at least one link"
     require(max(arm.capsule_link, default=-1) >= 0, "arm", rule, shown="none")
+    has_shield = bool(np.all(np.asarray(arm.shield_half) > 0.0))
+    require(has_shield, "arm", "one with a shield; pass shield= to read_arm", shown="none")
     own, ends_at_rest = arm.limits, True
     if regime is not None:
         require_name(REGIMES, "regime", regime)
