@@ -1,7 +1,8 @@
 """Numerical inverse kinematics by damped least squares, for arms without a closed form.
 
 Levenberg-Marquardt steps, whose damping is half of the squared error [Sugihara2011], lead from
-several starts to the pose. Joint angles that would leave their limits are projected onto them.
+several starts to the pose. Joint angles that would leave their limits are projected onto them. A
+search that is still far from the pose after some steps continues from another start.
 """
 
 import jax
@@ -12,13 +13,14 @@ from jax.scipy.linalg import cho_factor, cho_solve
 
 from planner_jax.robot.arm import Arm, product, shield_jacobian, shield_pose
 
-STARTS = 16  # number of starts, and so of candidates
+STARTS = 16  # number of searches, and so of candidates
 _POOL = 2048  # number of joint positions among which the starts are selected
-_STEPS = 20
+_PERIODS, _STEPS = 3, 9  # A search may have a new start in each of the periods of 9 steps.
+_HOPELESS = 0.03  # [m and rad], error at a period's end with which a search has a new start
 # Greatest errors of position [m] and angle [rad] of a solution.
 _POSITION, _ANGLE = 1e-5, 1e-4
 _APART = 1e-3  # [rad], least difference of two solutions in a joint angle
-_LEAST_DAMPING = 32.0  # divided by the precision of the numbers' type
+_LEAST_DAMPING = 32.0  # in units of the rounding error of 1
 
 
 def search_poses(
@@ -48,7 +50,9 @@ def search_poses(
     axes = slice(0, 1) if is_roll_free else slice(0, 3)
     turns, middles = jax.vmap(lambda angles: shield_pose(arm, angles))(pool)
     aligned = jnp.mean(jnp.sum((turns * rotation[None])[:, :, axes], axis=1), axis=1)
-    _, nearest = lax.top_k(aligned - jnp.sum((middles - middle[None]) ** 2, axis=1), STARTS)
+    _, nearest = lax.top_k(
+        aligned - jnp.sum((middles - middle[None]) ** 2, axis=1), _PERIODS * STARTS
+    )
 
     def error(turn: Array, place: Array) -> Array:
         """Return the error (6,) of a pose: of the position [m], and the rotation vector [rad]."""
@@ -58,9 +62,8 @@ def search_poses(
         sine = jnp.sqrt(jnp.maximum(jnp.sum(axis**2), 1e-12))
         return jnp.concatenate([middle - place, axis * jnp.arctan2(sine, cosine) / sine])
 
-    def step(_: Array, state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        """Return the current joint angles, their error, and the next joint angles."""
-        angles = state[2]
+    def step(angles: Array) -> tuple[Array, Array]:
+        """Return the error (6,) at joint angles, and the next joint angles."""
         off, slope = error(*shield_pose(arm, angles)), shield_jacobian(arm, angles)
         if is_roll_free:
             normal = jnp.concatenate([jnp.zeros(3, dtype), rotation[:, 0]])
@@ -72,15 +75,24 @@ def search_poses(
         factor = cho_factor(product(slope, slope.T) + damping * jnp.eye(6, dtype=dtype))
         change = product(cho_solve(factor, off), slope)
         change = jnp.where(jnp.isfinite(change), change, 0.0)
-        return angles, off, jnp.clip(angles + change, lower, upper)
+        return off, jnp.clip(angles + change, lower, upper)
 
-    def search(start: Array) -> tuple[Array, Array]:
-        state = start, jnp.zeros(6, dtype), start
-        angles, off, _ = lax.fori_loop(0, _STEPS, step, state)
+    def search(starts: Array) -> tuple[Array, Array]:
+        """Return the last angles of a search with starts (_PERIODS, n), and whether they solve."""
+
+        def advance(k: Array, state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+            angles = state[2]
+            off, following = step(angles)
+            is_hopeless = (k % _STEPS == _STEPS - 1) & (jnp.sum(off**2) > _HOPELESS**2)
+            renewed = starts[jnp.minimum(k // _STEPS + 1, _PERIODS - 1)]
+            return angles, off, jnp.where(is_hopeless, renewed, following)
+
+        state = starts[0], jnp.zeros(6, dtype), starts[0]
+        angles, off, _ = lax.fori_loop(0, _PERIODS * _STEPS, advance, state)
         squares = jnp.sum(off.reshape(2, 3) ** 2, axis=1)
         return angles, jnp.all(squares < jnp.array([_POSITION**2, _ANGLE**2], dtype))
 
-    angles, found = jax.vmap(search)(pool[nearest])
+    angles, found = jax.vmap(search, 1)(pool[nearest].reshape(_PERIODS, STARTS, -1))
     is_same = jnp.max(jnp.abs(angles[:, None] - angles[None]), axis=2) < _APART
     is_before = np.tri(STARTS, k=-1, dtype=bool)
     return angles, found & ~jnp.any(is_same & is_before & found[None], axis=1)
