@@ -60,5 +60,6 @@ from .task import catch as catch
 from .task import group as group
 from .task import hit as hit
 from .task import intercept as intercept
+from .task import reach as reach
 from .trajectory.polynomial import PiecewisePolynomial as PiecewisePolynomial
 from .trajectory.polynomial import evaluate as evaluate

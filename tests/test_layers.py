@@ -31,7 +31,7 @@ def is_of_pallas(found):
 
 
 def is_foreign_to_the_referee(found):
-    known = {"numpy", *sys.stdlib_module_names}
+    known = {"numpy", "mujoco", *sys.stdlib_module_names}
     is_own = found.package == "referee" or top_of(found) in known
     return package_of(found.path) == "referee" and not is_own
 
@@ -41,7 +41,7 @@ OFFENDERS = {
     "a module named in a string exists": is_missing,
     "the library names the folders beside it through its links": lambda f: top_of(f) in OUTSIDE,
     "one module imports Pallas, whose backend JAX deprecates": is_of_pallas,
-    "the referee imports NumPy and the standard library alone": is_foreign_to_the_referee,
+    "the referee imports NumPy, MuJoCo and the standard library alone": is_foreign_to_the_referee,
 }
 
 

@@ -8,6 +8,9 @@ of its axis minus its radius. Any frame, SI units; the ground is the x-y plane. 
 * a rectangle: its `middle` (3,) [m] and `edges` (2, 3) [m], halves of its edges as vectors from the
   middle, at right angles and longer than zero;
 * a box along the axes: its corners `lower` and `upper` (3,) [m], `lower` <= `upper`;
+* a turned box: its `middle` (3,) [m], its `axes` (3, 3), unit vectors along the edges, and `half`
+  (3,) [m], halves of the edges' lengths;
+* a cylinder: the `ends` (2, 3) [m] of its axis, which do not coincide, and its `radius` () [m];
 * a vertical line of infinite length, such as a pole's axis: its `position` (2,) [m].
 
 A distance is the least length |gap| of a vector between points of two bodies. The derivative of the
@@ -31,6 +34,7 @@ from jax import Array, lax
 
 Vector = tuple[Array, ...]
 
+_HALVINGS = 18  # bisections for the point of a segment that is nearest to a cylinder
 _TINY = 1e-24  # a smaller squared length [m^2] or squared area [m^4] counts as zero
 
 
@@ -47,6 +51,16 @@ def segment_to_rectangle(ends: Array, middle: Array, edges: Array) -> Array:
 def segment_to_box(ends: Array, lower: Array, upper: Array) -> Array:
     """Return the distance () [m] between a segment and a box; it is 0 if they intersect."""
     return _shortest(_nearest_of_box, _gap_to_box, (ends, lower, upper))
+
+
+def segment_to_turned_box(ends: Array, middle: Array, axes: Array, half: Array) -> Array:
+    """Return the distance () [m] between a segment and a turned box; it is 0 if they intersect."""
+    return _shortest(_nearest_of_turned_box, _gap_to_turned_box, (ends, middle, axes, half))
+
+
+def segment_to_cylinder(ends: Array, axis_ends: Array, radius: Array) -> Array:
+    """Return the distance () [m] between a segment and a cylinder; it is 0 if they intersect."""
+    return _shortest(_nearest_of_cylinder, _gap_to_cylinder, (ends, axis_ends, radius))
 
 
 def segment_to_vertical_line(ends: Array, position: Array) -> Array:
@@ -175,6 +189,83 @@ def _gap_to_box(shares: tuple[Array], ends: Array, lower: Array, upper: Array) -
     return tuple(
         x - jnp.clip(x, low, high) for x, low, high in zip(point, lower, upper, strict=True)
     )
+
+
+def _into_box(point: Vector, middle: Array, axes: Array) -> Vector:
+    away = _minus(point, tuple(middle))
+    return tuple(dot(away, tuple(axis)) for axis in axes)
+
+
+def _nearest_of_turned_box(ends: Array, middle: Array, axes: Array, half: Array) -> tuple[Array]:
+    start, end = (_into_box(point, middle, axes) for point in _rows(ends))
+    slabs = [
+        _slab(-reach - x, reach - x, speed, speed * speed)
+        for x, speed, reach in zip(start, _minus(end, start), half, strict=True)
+    ]
+    return (_share_nearest_to_slabs(slabs),)
+
+
+def _gap_to_turned_box(
+    shares: tuple[Array], ends: Array, middle: Array, axes: Array, half: Array
+) -> Vector:
+    inside = _into_box(_point(ends, shares[0]), middle, axes)
+    x, y, z = (each - jnp.clip(each, -h, h) for each, h in zip(inside, half, strict=True))
+    return tuple(x * axes[0][k] + y * axes[1][k] + z * axes[2][k] for k in range(3))
+
+
+def _split_by_axis(point: Vector, axis_ends: Array) -> tuple[Array, Vector, Vector, Array]:
+    """Split the vector from a cylinder's middle to a point into parts along and across the axis.
+
+    Returns:
+        height: (), the part along the axis.
+        across: the part across the axis.
+        axis: the unit vector along the axis.
+        half: (), half of the cylinder's length.
+    """
+    low, high = _rows(axis_ends)
+    step = _minus(high, low)
+    length = jnp.sqrt(dot(step, step))
+    axis = tuple(each / length for each in step)
+    away = tuple(x - 0.5 * (a + b) for x, a, b in zip(point, low, high, strict=True))
+    height = dot(away, axis)
+    across = tuple(x - height * a for x, a in zip(away, axis, strict=True))
+    return height, across, axis, 0.5 * length
+
+
+def _nearest_of_cylinder(ends: Array, axis_ends: Array, radius: Array) -> tuple[Array]:
+    """Return the fraction along the segment at which it is nearest to the cylinder.
+
+    The squared distance of the segment's point at a fraction is convex, so that bisection finds the
+    zero of its derivative.
+    """
+    start, end = _rows(ends)
+    height, across, axis, half = _split_by_axis(start, axis_ends)
+    step = _minus(end, start)
+    climb = dot(step, axis)
+    drift = tuple(x - climb * a for x, a in zip(step, axis, strict=True))
+
+    def halve(_: Array, bounds: tuple[Array, Array]) -> tuple[Array, Array]:
+        low, high = bounds
+        share = 0.5 * (low + high)
+        level = height + share * climb
+        beside = tuple(x + share * y for x, y in zip(across, drift, strict=True))
+        outside = jnp.maximum(
+            1.0 - radius * lax.rsqrt(jnp.maximum(dot(beside, beside), _TINY)), 0.0
+        )
+        slope = (level - jnp.clip(level, -half, half)) * climb + outside * dot(beside, drift)
+        return jnp.where(slope < 0.0, share, low), jnp.where(slope < 0.0, high, share)
+
+    none = jnp.zeros_like(height * radius + climb)
+    low, high = lax.fori_loop(0, _HALVINGS, halve, (none, none + 1.0))
+    return (0.5 * (low + high),)
+
+
+def _gap_to_cylinder(shares: tuple[Array], ends: Array, axis_ends: Array, radius: Array) -> Vector:
+    height, across, axis, half = _split_by_axis(_point(ends, shares[0]), axis_ends)
+    away = jnp.sqrt(jnp.maximum(dot(across, across), _TINY))
+    outside = jnp.maximum(1.0 - radius / away, 0.0)
+    beyond = height - jnp.clip(height, -half, half)
+    return tuple(outside * x + beyond * a for x, a in zip(across, axis, strict=True))
 
 
 def _nearest_of_rectangle(ends: Array, middle: Array, edges: Array) -> Any:
@@ -397,6 +488,8 @@ _PARTS: dict[Callable, tuple[Callable, Callable, Callable]] = {
     segment_to_segment: (_nearest_of_segments, _gap_of_segments, _point_of_segment),
     segment_to_rectangle: (_nearest_of_rectangle, _gap_to_rectangle, _point_of_segment),
     segment_to_box: (_nearest_of_box, _gap_to_box, _point_of_segment),
+    segment_to_turned_box: (_nearest_of_turned_box, _gap_to_turned_box, _point_of_segment),
+    segment_to_cylinder: (_nearest_of_cylinder, _gap_to_cylinder, _point_of_segment),
     segment_to_vertical_line: (_nearest_to_line, _gap_to_line, _point_of_segment),
     rectangle_to_vertical_line: (_nearest_of_projection, _gap_of_projection, _point_of_rectangle),
     lowest_of_segment: (_lowest_end, _gap_to_ground, _point_itself),

@@ -3,3 +3,4 @@ from . import catch as catch
 from . import group as group
 from . import hit as hit
 from . import intercept as intercept
+from . import reach as reach

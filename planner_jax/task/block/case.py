@@ -152,6 +152,8 @@ def case(
     require_switch("anywhere", anywhere)
     scene = paper_scene() if scene is None else scene
     require_kind("scene", scene, Scene)
+    has_solids = len(scene.box_half) or len(scene.cylinder_radius)
+    require(not has_solids, "scene", "one without boxes and cylinders", shown="some")
     arm = irb1600() if arm is None else arm
     require_kind("arm", arm, Arm)
     rule = "one with a capsule around at least one link"

@@ -1,8 +1,8 @@
 """Distances of an arm and its shield from obstacles, and between the arm's own links.
 
 The links are represented by capsules, and the shield by a plate of 0.01 m with rounded edges. The
-obstacles are a pole, the floor, beams, the base and other links. The arm states which of its bodies
-must not touch each other.
+obstacles are a pole, the floor, beams, boxes, cylinders, the base and other links. The arm states
+which of its bodies must not touch each other.
 
 The functions process N poses of the arm at once. N is the last axis of arrays, so that a processor
 works on several poses with one instruction.
@@ -134,13 +134,10 @@ def _poses(arm: Arm, angles: Array) -> _Poses:
 
 def _pairs(arm: Arm, scene: Scene, poses: _Poses) -> list[_Pairs]:
     link, radius = np.asarray(arm.capsule_link), jnp.asarray(arm.capsule_radius)
-    turning = _moving(arm)
+    turning, high = _moving(arm), np.flatnonzero(link > 0)  # link 1 cannot reach the floor
     swung, before = (np.array(each, int) for each in (arm.base_pairs, arm.shield_pairs))
     middle, edges = poses.middle[:, None], poses.edges[:, :, None]
-    signs = ((1, 1), (1, -1), (-1, -1), (-1, 1))
-    corners = [middle + a * edges[0] + b * edges[1] for a, b in signs]
-    ends_of_edges = (corners, corners[1:] + corners[:1])
-    outline = jnp.stack([jnp.concatenate(ends, axis=1) for ends in ends_of_edges])
+    outline = _outline(middle, edges)
     beams = jnp.moveaxis(jnp.asarray(scene.beam_ends), 0, 2)[..., None]  # (2, 3, N, 1)
     beams = jnp.broadcast_to(beams, (*beams.shape[:3], poses.middle.shape[-1]))
     num_beams = beams.shape[2]
@@ -177,7 +174,57 @@ def _pairs(arm: Arm, scene: Scene, poses: _Poses) -> list[_Pairs]:
         _Pairs(space.rectangle_to_vertical_line, (*plate, scene.pole), half + pole, shield),
         _Pairs(space.segment_to_segment, (ends(moving), against), between, link[moving], of_fixed),
         _Pairs(space.segment_to_rectangle, (near, *plate), near_to, shield, of_near, first=False),
-        _Pairs(space.lowest_of_segment, (ends(swung),), thick[swung] + scene.floor, link[swung]),
+        _Pairs(space.lowest_of_segment, (ends(high),), thick[high] + scene.floor, link[high]),
         _Pairs(space.lowest_of_rectangle, plate, half + scene.floor, shield),
         _Pairs(space.segment_to_box, (boxed, lower, upper), boxed_radius, boxed_link),
+        *_obstacles(arm, scene, poses),
     ]
+
+
+def _outline(middle: Array, edges: Array) -> Array:
+    """Return the edges of the shield's plate as segments (2, 3, 4, N) [m]."""
+    signs = ((1, 1), (1, -1), (-1, -1), (-1, 1))
+    corners = [middle + a * edges[0] + b * edges[1] for a, b in signs]
+    ends_of_edges = (corners, corners[1:] + corners[:1])
+    return jnp.stack([jnp.concatenate(ends, axis=1) for ends in ends_of_edges])
+
+
+def _obstacles(arm: Arm, scene: Scene, poses: _Poses) -> list[_Pairs]:
+    """Return the pairs of each link and the shield with each box and cylinder of the scene."""
+    link, shield = np.asarray(arm.capsule_link), arm.num - 1
+    moving, plate = np.flatnonzero(link >= 0), (poses.middle[:, None], poses.edges[:, :, None])
+    radius, num_poses = jnp.asarray(arm.capsule_radius)[moving], poses.middle.shape[-1]
+    sticks = jnp.zeros((2, 3, 0, 1), radius.dtype)  # segments whose distance from the shield counts
+    around = jnp.zeros(0, radius.dtype)  # [m], radii around them
+    pairs = []
+    if num := scene.box_half.shape[0]:
+        middle = jnp.asarray(scene.box_middle).T[..., None]  # (3, M, 1)
+        turns = quaternion_rotation(jnp.asarray(scene.box_turn))
+        axes = jnp.moveaxis(jnp.swapaxes(turns, 1, 2), 0, 2)[..., None]  # (3, 3, M, 1)
+        half = jnp.asarray(scene.box_half).T[..., None]
+        # The nearest points of the shield's plate and a box are on an edge of one of them.
+        segments = jnp.concatenate([poses.ends[:, :, moving], _outline(*plate)], axis=2)
+        of_link = np.append(link[moving], np.full(4, shield))
+        thick = jnp.append(radius, jnp.full(4, _HALF_THICKNESS, radius.dtype))
+        k, j = np.repeat(np.arange(len(of_link)), num), np.tile(np.arange(num), len(of_link))
+        bodies = (segments[:, :, k], middle[:, j], axes[:, :, j], half[:, j])
+        pairs.append(_Pairs(space.segment_to_turned_box, bodies, thick[k, None], of_link[k]))
+        signs = np.array([(-1.0, -1.0), (-1.0, 1.0), (1.0, -1.0), (1.0, 1.0)])
+        corners = [np.insert(sign, k, end) for k in range(3) for sign in signs for end in (-1, 1)]
+        corners = jnp.einsum("ec,cmx,cdmx->demx", jnp.asarray(corners, half.dtype), half, axes)
+        edges = (corners + middle[:, None]).reshape(3, 12, 2, num)
+        sticks = jnp.moveaxis(edges, 2, 0).reshape(2, 3, 12 * num, 1)
+        around = jnp.zeros(12 * num, radius.dtype)
+    if num := scene.cylinder_radius.shape[0]:
+        axis_ends = jnp.moveaxis(jnp.asarray(scene.cylinder_ends), 0, 2)[..., None]
+        wide = jnp.asarray(scene.cylinder_radius)
+        k, j = np.repeat(np.arange(len(moving)), num), np.tile(np.arange(num), len(moving))
+        bodies = (poses.ends[:, :, moving[k]], axis_ends[:, :, j], wide[j, None])
+        pairs.append(_Pairs(space.segment_to_cylinder, bodies, radius[k, None], link[moving[k]]))
+        # For distances from the shield, a cylinder is enclosed by a capsule.
+        sticks, around = jnp.concatenate([sticks, axis_ends], axis=2), jnp.append(around, wide)
+    if pairs:
+        bodies = (jnp.broadcast_to(sticks, (*sticks.shape[:3], num_poses)), *plate)
+        thick = around[:, None] + _HALF_THICKNESS
+        pairs.append(_Pairs(space.segment_to_rectangle, bodies, thick, shield, first=False))
+    return pairs

@@ -1,5 +1,8 @@
 """The box that the arm protects, and obstacles, in the robot's base frame [Natarajan2024]."""
 
+import dataclasses
+from collections.abc import Sequence
+
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
@@ -40,6 +43,12 @@ class Scene:
     floor: Array  # () [m], height of the floor
     beam_ends: Array  # (N, 2, 3) [m], ends of the axes of capsules around beams
     beam_radius: Array  # (N,) [m]
+    box_middle: Array  # (M, 3) [m], middles of boxes at any orientation
+    # (M, 4) unit quaternions w, x, y, z: rotations of the boxes' frames
+    box_turn: Array
+    box_half: Array  # (M, 3) [m], halves of the boxes' edges
+    cylinder_ends: Array  # (L, 2, 3) [m], ends of the cylinders' axes
+    cylinder_radius: Array  # (L,) [m]
 
 
 def paper_scene(*, has_pole: bool = True, size: float = 1.0) -> Scene:
@@ -73,7 +82,54 @@ def paper_scene(*, has_pole: bool = True, size: float = 1.0) -> Scene:
         floor=leaf(FLOOR),
         beam_ends=leaf(ends),
         beam_radius=leaf(np.full(4, RIG_RADIUS)),
+        **_solids((), ()),
     )
+
+
+def make_scene(
+    *,
+    boxes: Sequence[tuple[ArrayLike, ArrayLike, ArrayLike]] = (),
+    spheres: Sequence[tuple[ArrayLike, float]] = (),
+    capsules: Sequence[tuple[ArrayLike, float]] = (),
+    cylinders: Sequence[tuple[ArrayLike, float]] = (),
+    floor: float = -100.0,
+) -> Scene:
+    """Return a scene of solid obstacles, without a pole, with NumPy float32 leaves.
+
+    A program is compiled for each combination of numbers of obstacles.
+
+    Args:
+        boxes: for each box its middle (3,) [m], the lengths of its edges (3,) [m], and its rotation
+            as a quaternion w, x, y, z (4,) != 0.
+        spheres: for each sphere its middle (3,) [m] and its radius [m].
+        capsules: for each capsule the ends of its axis (2, 3) [m] and its radius [m].
+        cylinders: for each cylinder the different ends of its axis (2, 3) [m] and its radius [m].
+        floor: [m], height of the floor.
+    """
+    rounded = [(np.broadcast_to(middle, (2, 3)), radius) for middle, radius in spheres]
+    rounded += [*capsules]
+    return dataclasses.replace(
+        paper_scene(has_pole=False),
+        floor=host_leaf(floor, np.float32),
+        beam_ends=host_leaf([ends for ends, _ in rounded], np.float32).reshape(-1, 2, 3),
+        beam_radius=host_leaf([radius for _, radius in rounded], np.float32),
+        **_solids(boxes, cylinders),
+    )
+
+
+def _solids(boxes: Sequence, cylinders: Sequence) -> dict[str, Array]:
+    def column(solids: Sequence, k: int, *shape: int) -> np.ndarray:
+        return np.reshape([solid[k] for solid in solids], (-1, *shape)).astype(np.float32)
+
+    turn = column(boxes, 2, 4)
+    leaves = {
+        "box_middle": column(boxes, 0, 3),
+        "box_turn": turn / np.linalg.norm(turn, axis=1, keepdims=True),
+        "box_half": 0.5 * column(boxes, 1, 3),
+        "cylinder_ends": column(cylinders, 0, 2, 3),
+        "cylinder_radius": column(cylinders, 1),
+    }
+    return {name: host_leaf(leaf) for name, leaf in leaves.items()}
 
 
 def entry_time(box: Box, ball: BallState, gravity: Array) -> tuple[Array, Array]:

@@ -1,0 +1,123 @@
+"""Cases of the task `reach`: start and goals of an arm's motion, limits, and obstacles."""
+
+import functools
+from typing import ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax import Array
+from numpy.typing import ArrayLike, DTypeLike
+
+from planner_jax.core import rules
+from planner_jax.core.checks import floating, require_kind
+from planner_jax.core.errors import ArgumentError
+from planner_jax.core.rules import Field, Table, require_sound
+from planner_jax.robot.arm import Arm, ArmLimits
+from planner_jax.robot.arm_file import irb1600
+from planner_jax.task.arguments import array_of, batch_of
+from planner_jax.task.block.scene import Scene, paper_scene
+from planner_jax.task.block.scene import make_scene as make_scene  # for users of `pj.reach`
+
+# Shapes and ranges that `pj.require_sound` checks for the arrays of a `ReachCase`.
+RULES: Table = (
+    Field("angles", ("J",)),
+    Field("goals", ("G", "J")),
+    Field("arm.lower", ("J",), rules.below("arm.upper")),
+    Field("arm.upper", ("J",)),
+    Field("arm.capsule_radius", ("C",), rules.NOT_NEGATIVE),
+    Field("limits.velocity", ("J",), rules.POSITIVE),
+    Field("limits.acceleration", ("J",), rules.POSITIVE),
+    Field("scene.pole", (2,)),
+    Field("scene.pole_radius", (), rules.NOT_NEGATIVE),
+    Field("scene.has_pole", (), kind=np.bool_),
+    Field("scene.floor", ()),
+    Field("scene.beam_ends", ("N", 2, 3)),
+    Field("scene.beam_radius", ("N",), rules.NOT_NEGATIVE),
+    Field("scene.box_middle", ("M", 3)),
+    Field("scene.box_turn", ("M", 4)),
+    Field("scene.box_half", ("M", 3), rules.NOT_NEGATIVE),
+    Field("scene.cylinder_ends", ("L", 2, 3)),
+    Field("scene.cylinder_radius", ("L",), rules.NOT_NEGATIVE),
+)
+
+
+@struct.dataclass
+class ReachCase:
+    """One case, or a batch: an arm has to move from standstill to standstill at a goal.
+
+    Robot base frame, z up, SI units. The motion starts at time 0.
+    """
+
+    rules: ClassVar[Table] = RULES
+
+    angles: Array  # (n,) [rad], joint angles at the start
+    goals: Array  # (G, n) [rad], joint angles of which the motion may end at any one
+    arm: Arm
+    limits: ArmLimits
+    scene: Scene
+
+    @property
+    def batch_shape(self) -> tuple[int, ...]:
+        """Shape of the batch: () for one case, (B,) for a batch of B cases."""
+        return np.shape(self.angles)[:-1]
+
+
+def case(
+    goal: ArrayLike | None = None,
+    *,
+    goals: ArrayLike | None = None,
+    angles: ArrayLike | None = None,
+    arm: Arm | None = None,
+    limits: ArmLimits | None = None,
+    scene: Scene | None = None,
+    dtype: DTypeLike = jnp.float32,
+) -> ReachCase:
+    """Make one case of a motion of the joints, or a batch.
+
+    Args:
+        goal: (n,) [rad], joint angles at the end, or (B, n) for a batch of B cases.
+        goals: (G, n) or (B, G, n) [rad], instead of `goal`: the motion may end at any one of G
+            goals, for example the results of inverse kinematics for a pose of the tool.
+        angles: (n,) or (B, n) [rad], joint angles at the start; by default those at which the arm
+            waits.
+        arm: without batch axes; by default an IRB 1600 with a shield.
+        limits: greatest joint rates and accelerations, without batch axes; by default the arm's.
+        scene: obstacles, without batch axes, for example of `make_scene`; by default the pole, the
+            floor and the beams of [Natarajan2024].
+        dtype: type of every floating leaf.
+
+    Raises:
+        ValueError: a shape is wrong, or a number breaks a rule.
+        TypeError: an argument has a wrong type.
+    """
+    if (goal is None) == (goals is None):
+        raise ArgumentError("goal", "either goal or goals", verb="be", shown="both or none")
+    scene = paper_scene() if scene is None else scene
+    require_kind("scene", scene, Scene)
+    arm = irb1600() if arm is None else arm
+    require_kind("arm", arm, Arm)
+    limits = arm.limits if limits is None else limits
+    require_kind("limits", limits, ArmLimits)
+    angles = arm.home if angles is None else angles
+    name, ends = ("goal", goal) if goals is None else ("goals", goals)
+    own = (arm.num,) if goals is None else (*np.shape(goals)[-2:-1], arm.num)
+    batch = max(batch_of("angles", angles, arm.num), batch_of(name, ends, *own), key=len)
+    dtype = floating(dtype)
+    leaf = functools.partial(array_of, batch=batch, dtype=dtype)
+
+    def repeat(value: ArrayLike) -> Array:
+        value = np.asarray(value)
+        kind = np.dtype(dtype) if value.dtype.kind == "f" else value.dtype
+        return jnp.asarray(np.broadcast_to(value, batch + value.shape), kind)
+
+    cases = ReachCase(
+        angles=leaf("angles", angles, arm.num),
+        goals=leaf(name, ends, *own).reshape(*batch, -1, arm.num),
+        arm=jax.tree.map(repeat, arm),
+        limits=jax.tree.map(repeat, limits),
+        scene=jax.tree.map(repeat, scene),
+    )
+    require_sound(cases)
+    return cases
