@@ -221,6 +221,14 @@ def test_links_and_masses_of_a_urdf_are_where_mujoco_has_them(folder, six):
     np.testing.assert_allclose([six.lower, six.upper], [[-2.0] * 6, [1.5] * 6])
 
 
+def test_attributes_that_mujoco_has_dropped_do_not_matter(folder, seven):
+    old = '<option collision="dynamic" timestep="0.1"/><size njmax="500"/><compiler'
+    (folder / "old.xml").write_text(MJCF.replace("<compiler", old, 1))
+    arm = read_arm(folder / "old.xml", limits=RATES, dtype=np.float64)
+    np.testing.assert_array_equal(arm.origin, seven.origin)
+    np.testing.assert_array_equal(arm.capsule_ends, seven.capsule_ends)
+
+
 def test_a_body_with_two_hinges_is_two_links(folder):
     text = MJCF.replace('<joint name="a"/>', '<joint name="a"/><joint name="z" axis="1 0 0"/>')
     text = text.replace(".1 .2 .3", ".1 0 .2 .3")

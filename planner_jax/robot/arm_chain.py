@@ -39,7 +39,7 @@ class ArmModel:
         text = os.fspath(path)
         self.path = None if text.lstrip().startswith("<") else Path(text)
         self.name = "arm" if self.path is None else text
-        self.text, self._includes = text, {}
+        self.text, self._includes, self._is_changed = text, {}, self.path is None
         if self.path is not None:
             self.text = self._load(self.path, ArgumentError("arm", "an MJCF or URDF file", text))
         root = re.search(r"<(robot|mujoco)\b", self.text)
@@ -190,18 +190,22 @@ class ArmModel:
             r"<!--.*?-->", lambda found: "\n" * found[0].count("\n"), text, flags=re.DOTALL
         )
         while _DROPPED.search(text):
-            text = _DROPPED.sub(r"\1", text)
+            text, self._is_changed = _DROPPED.sub(r"\1", text), True
         for name in _INCLUDE.findall(text):
             if name not in self._includes:
-                place = Path(self.name).parent / name  # relative to the outermost file
-                missing = self.error(f'include "{name}"', f"the file {place}; put it there")
+                places = [Path(self.name).parent / name, path.parent / name]
+                place = places[0] if places[0].is_file() else places[1]
+                missing = self.error(f'include "{name}"', f"the file {places[0]}; put it there")
                 self._includes[name] = self._load(place, missing).encode()
         return text
 
     def _compile(self) -> tuple[Any, Any]:
         mujoco: Any = importlib.import_module("mujoco")  # slow to import
         try:
-            spec = mujoco.MjSpec.from_string(self.text, include=self._includes)
+            if self._is_changed:
+                spec = mujoco.MjSpec.from_string(self.text, include=self._includes)
+            else:
+                spec = mujoco.MjSpec.from_file(str(self.path))
             spec.modelfiledir = "" if self.path is None else str(self.path.absolute().parent)
             spec.compiler.fusestatic = False  # `tip` may name a body without a joint
             for mesh in spec.meshes:
