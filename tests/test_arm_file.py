@@ -236,6 +236,8 @@ def test_a_body_with_two_hinges_is_two_links(folder):
     arm = read_arm(folder / "eight.xml", limits=RATES, tip="six", dtype=np.float64)
     assert arm.joint_names == tuple("azbcdef")
     compare_with_mujoco(folder / "eight.xml", arm, "table")
+    with pytest.raises(ArgumentError, match="eight.xml: the arm must have 6 or 7 .*got 8: a, z"):
+        read_arm(folder / "eight.xml", limits=RATES)
 
 
 def surface(kind, size, num=4000):
@@ -434,6 +436,10 @@ SETTINGS = [
     ({"limits": RATES, "tip": "nose"}, "tip must be a site, or one of the bodies ball, .*got nose"),
     ({"limits": RATES, "tip": "three"}, r"must have 6 or 7 hinges .*tip=, got 3: a, b, c"),
     ({"limits": RATES, "tip": "left"}, 'joint "l" must be a hinge; weld it, or name the end of'),
+    (
+        {"limits": RATES, "shield": Shield(half=(0.01, 0.01), position=(0.0, 0.0, -0.1))},
+        "the shield must be outside of the links; move it by shield=",
+    ),
     ({"limits": RATES, "home": [0.0]}, "home must have 7 angles within the limits"),
 ]
 

@@ -261,7 +261,7 @@ class ArmModel:
             if path == [0]:  # leave out things beside the arm that move, such as a ball or a door
                 least = min(COUNTS[0], max((hinges[b] for b in above), default=0))
                 above = [b for b in above if hinges[b] >= least]
-            if len(above) > 1 and num not in COUNTS:
+            if len(above) > 1 and num < COUNTS[0]:
                 names = ", ".join(model.body(b).name or f"body {b}" for b in above)
                 rule = "one chain of hinges; name the end of the arm by tip="
                 raise self.error(f"body {model.body(path[-1]).name}", rule, "carry", names)

@@ -27,6 +27,7 @@ from planner_jax.robot.capsule_fit import Cover, cover, measure_excess
 
 _THICKNESS = 0.01  # [m], of a shield's plate
 _FORK = 0.71  # see `irb1600`
+_CORNERS = np.array([(0.0, a, b) for a in (-1.0, 1.0) for b in (-1.0, 1.0)])  # of a plate
 
 
 @dataclasses.dataclass(frozen=True)
@@ -174,6 +175,8 @@ def _read(
     }
     poses = [model.frames(angles) for angles in (rest, np.clip(0.0, lower, upper))]
     checked = _pairs(link, ends, radius, box, mount, poses)
+    if checked.is_buried:
+        raise model.error("the shield", "outside of the links; move it by shield=", "be")
     off_axis = np.cross([mount.turn[:, 0], mount.centre], axis[-1])
     arrays = {name: host_leaf(leaf, dtype) for name, leaf in leaves.items()}
     arm = Arm(
@@ -289,6 +292,7 @@ class _Checked(NamedTuple):
     base_pairs: tuple[int, ...]
     shield_pairs: tuple[int, ...]
     touching: tuple[tuple[int, int], ...]  # links that touch at rest; the shield has the index n
+    is_buried: bool  # whether links contain all corners of the shield at home
 
 
 def _pairs(
@@ -338,20 +342,28 @@ def _pairs(
                 pairs.append((k, j))
             else:
                 touching.add((link[k], link[j]))
-    shield_pairs = []
+    shield_pairs, is_buried = [], False
     if np.any(mount.half):
         half, plates = np.array([0.5 * _THICKNESS, *mount.half]), []
         for links in rest:
             origin, turn = links[-1]
             own = turn @ mount.turn
             plates.append((origin + turn @ mount.centre - half[0] * own[:, 0], own))
+        corners = plates[0][0] + _CORNERS * [0.0, *mount.half] @ plates[0][1].T
+        is_buried = all(
+            any(
+                solids.from_segment(corner, *ends) < r
+                for ends, r in zip(poses[0], radius, strict=True)
+            )
+            for corner in corners
+        )
         for k in (k for k in every if link[k] < num - 2):
             if link[k] == BASE or box_gap(k, half, plates) > 0.0:
                 shield_pairs.append(k)
             else:
                 touching.add((num, link[k]))
     left_out = tuple(sorted(touching))
-    return _Checked(tuple(pairs), tuple(base_pairs), tuple(shield_pairs), left_out)
+    return _Checked(tuple(pairs), tuple(base_pairs), tuple(shield_pairs), left_out, is_buried)
 
 
 def _describe(
