@@ -1,12 +1,15 @@
 """Measure how many throws arms from files block: `python -m benchmarks.block_arms FILE ...`.
 
-    python -m benchmarks.block_arms FILE [FILE ...] [--num 200] [--seed 977] [--suite open] [--long]
+    python -m benchmarks.block_arms FILE [FILE ...] [--tip NAME] [--limits FILE] [--num 200]
+        [--seed 977] [--suite open] [--wide] [--long]
 
-A file is an arm in MJCF or URDF that `pj.block.read_arm` reads, with limits in the file or beside
-it; "irb1600" is the arm of the library. The throws are those of the suite. The scene is scaled to
-the reach of each arm. The referee, an independent check in float64, decides which balls are
-blocked. With --long, throws that the planner fails to block are planned again from 192 starting
-points. The last column is then the share of blocks among the throws that one of both blocks.
+A file is an arm in MJCF or URDF that `pj.block.read_arm` reads; "irb1600" is the arm of the
+library. --tip is the body or site at which a shield of 0.30 m is mounted. --limits is a file with
+limits of the joints, by default the file beside that of the arm. The throws are those of the suite.
+The scene is scaled to the reach of each arm. The referee, an independent check in float64, decides
+which balls are blocked. With --long, throws that the planner fails to block are planned again from
+192 starting points. The last column is then the share of blocks among the throws that one of both
+blocks.
 """
 
 import argparse
@@ -25,6 +28,9 @@ def main() -> None:
     """Read the arms, and print one row of results for each."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("files", nargs="+", metavar="FILE")
+    parser.add_argument("--tip")
+    parser.add_argument("--limits")
+    parser.add_argument("--wide", action="store_true")
     parser.add_argument("--num", type=int, default=200)
     parser.add_argument("--seed", type=int, default=977)
     parser.add_argument("--suite", default="open")
@@ -37,8 +43,13 @@ def main() -> None:
 
 
 def _row(file: str, options: argparse.Namespace) -> str:
-    arm = irb1600() if file == "irb1600" else pj.block.read_arm(file)
-    cases = pj.block.draw(options.num, options.suite, options.seed, arm=arm)
+    if file == "irb1600":
+        arm = irb1600()
+    else:
+        own = {"tip": options.tip, "limits": options.limits}
+        arm = pj.block.read_arm(file, shield=pj.block.Shield(), **own)
+    draw = {"arm": arm, "wide": options.wide}
+    cases = pj.block.draw(options.num, options.suite, options.seed, **draw)
     planner, seconds, plans = pj.block.planner(), [], None
     for _ in range(2):
         start = time.perf_counter()

@@ -46,6 +46,9 @@ def test_a_ball_that_is_not_blocked_is_explained(capsys):
     [
         (["--regime", "R9"], "regime must be one of R1, R2, R3"),
         (["--pos", "nan", "0", "0"], "pos must be finite"),
+        (["--tip", "flange"], "tip must be left out without --arm"),
+        (["--arm", "arm.xml", "--regime", "R1"], "regime must be left out with --arm"),
+        (["--arm", "nowhere.xml"], "nowhere.xml"),
         (["--delay", "-1"], "delay must be >= 0"),
     ],
 )

@@ -116,6 +116,12 @@ def read_arm(
     return _read(path, limits, shield, tip, home, dtype)[0]
 
 
+def read_shield_arm(path: str, tip: str | None = None) -> Arm:
+    """Read an arm for blocks: as `read_arm`, with a shield of 0.30 m at `tip` if it has none."""
+    arm = read_arm(path, tip=tip)
+    return arm if np.all(arm.shield_half) else read_arm(path, tip=tip, shield=Shield())
+
+
 def describe_arm(path: str | os.PathLike, **settings: Any) -> str:
     """Describe an arm as `read_arm` reads it: joints, fit of the capsules, pairs not checked.
 

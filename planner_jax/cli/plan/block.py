@@ -8,10 +8,11 @@ from jaxtyping import PyTree
 from planner_jax.cli.plan.answer import Answer, Margin, Single, closest_to
 from planner_jax.cli.plan.settings import SingleBlockSettings
 from planner_jax.runs.style import draw
+from planner_jax.sweep.block.settings import arm_options
 from planner_jax.task.block.case import case
 from planner_jax.task.block.drawing import SIZE, draw_plan
 from planner_jax.task.block.explain import prospects
-from planner_jax.task.block.scene import paper_scene
+from planner_jax.task.block.suites import scene_for
 
 _RATE = 4000.0  # [Hz], rate of the samples that are compared with the limits
 
@@ -24,14 +25,9 @@ class SingleBlock(Single[SingleBlockSettings]):
     def case(self) -> PyTree:
         """Make the case of the specified ball."""
         given = self.settings
-        return case(
-            given.pos,
-            given.vel,
-            delay=given.delay,
-            regime=given.regime,
-            wide=given.wide,
-            scene=paper_scene(has_pole=not given.no_pole),
-        )
+        own = {"regime": given.regime} if given.arm is None else arm_options(given.arm, given.tip)
+        scene = scene_for(own.get("arm"), has_pole=not given.no_pole)
+        return case(given.pos, given.vel, delay=given.delay, wide=given.wide, scene=scene, **own)
 
     def contact(self, answer: Answer) -> list[str]:
         """Describe the contact of ball and shield in one sentence."""

@@ -5,7 +5,7 @@ import math
 from typing import ClassVar
 
 from planner_jax.core.choices import require, require_one_of
-from planner_jax.runs.settings import SweepSettings, option
+from planner_jax.runs.settings import Options, SweepSettings, option
 
 # Names of the sets of joint limits. They are repeated here, since `robot.arm` would import JAX.
 REGIMES = ("R1", "R2", "R3")
@@ -17,6 +17,20 @@ def require_moderate(name: str, value: float | None, most: float = _LONGEST) -> 
     if value is not None:
         require(0.0 <= value < math.inf, name, "finite and >= 0", value)
         require(value <= most, name, f"<= {most:g}", value)
+
+
+def require_own_limits(arm: str | None, tip: str | None, regime: str) -> None:
+    """Raise `ArgumentError` for a tip without an arm, or a regime of the IRB 1600 with an arm."""
+    require(arm is not None or tip is None, "tip", "left out without --arm", tip)
+    is_usual = arm is None or regime == REGIMES[1]
+    require(is_usual, "regime", "left out with --arm, which has limits of its own", regime)
+
+
+def arm_options(path: str, tip: str | None) -> Options:
+    """Return the arguments of `case` and `draw` for an arm from a file."""
+    from planner_jax.robot.arm_file import read_shield_arm  # imports JAX
+
+    return {"arm": read_shield_arm(path, tip), "regime": None}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,6 +48,12 @@ class BlockSettings(SweepSettings):
     )
     anywhere: bool = option(False, "", "accept a ball anywhere on the shield, at any angle")
     delay: float = option(0.0, "S", "seconds until the arm may start")
+    arm: str | None = option(
+        None, "FILE", "an arm in MJCF or URDF, with its own limits (default: the IRB 1600)"
+    )
+    tip: str | None = option(
+        None, "NAME", "body or site of this arm that carries a shield of 0.30 m, if it has none"
+    )
 
     RUN: ClassVar[str] = "planner_jax.sweep.block.sweep:BlockSweep"
     DRAW: ClassVar[tuple[str, ...]] = ("regime", "wide", "anywhere", "delay")
@@ -45,3 +65,9 @@ class BlockSettings(SweepSettings):
         super().__post_init__()
         require_one_of(REGIMES, "regime", self.regime)
         require_moderate("delay", self.delay)
+        require_own_limits(self.arm, self.tip, self.regime)
+
+    def draw_options(self) -> Options:
+        """Return the settings that are keyword arguments of the task's function `draw`."""
+        given = super().draw_options()
+        return given if self.arm is None else given | arm_options(self.arm, self.tip)

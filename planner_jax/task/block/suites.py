@@ -55,7 +55,7 @@ def draw(
     if suite not in SUITES:
         return TASK.other_suite(suite)(num, seed, first)
     own, randoms = SUITES[suite], make_generators(suite, num, seed, first)
-    size = 1.0 if arm is None else reach_of(arm) / reach_of(irb1600())
+    size = _size_for(arm)
     throws = np.array([_draw_throw(own, random, size) for random in randoms])
     return case(
         throws[:, 0],
@@ -64,10 +64,19 @@ def draw(
         regime=regime,
         wide=wide,
         anywhere=anywhere,
-        scene=scene.paper_scene(has_pole=own.has_pole, size=size),
+        scene=scene_for(arm, has_pole=own.has_pole),
         arm=arm,
         dtype=dtype,
     )
+
+
+def scene_for(arm: Arm | None, *, has_pole: bool = True) -> scene.Scene:
+    """Return the scene of [Natarajan2024], scaled to the reach of an arm; None: the IRB 1600."""
+    return scene.paper_scene(has_pole=has_pole, size=_size_for(arm))
+
+
+def _size_for(arm: Arm | None) -> float:
+    return 1.0 if arm is None else reach_of(arm) / reach_of(irb1600())
 
 
 def _draw_throw(suite: Suite, random: np.random.Generator, size: float) -> np.ndarray:
