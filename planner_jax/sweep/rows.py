@@ -55,9 +55,10 @@ def quadrotor_plan(row: Row, setting: Entries) -> QuadrotorPlan:
     )
 
 
-def arm_plan(row: Row, _: Entries) -> ArmPlan:
+def arm_plan(row: Row, setting: Entries) -> ArmPlan:
     """Restore an arm's plan from a run's row; the motion starts at the `delay` [s] of its case."""
-    motion = _polynomial(row["motion_coeffs"], row["motion_durations"], 6)
+    joints = int(setting.get("joints", 6))
+    motion = _polynomial(row["motion_coeffs"], row["motion_durations"], joints)
     return ArmPlan(**_outcome(row), motion=motion)
 
 

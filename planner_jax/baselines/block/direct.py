@@ -22,7 +22,6 @@ from planner_jax.task.block.end_poses import EndPoses, end_poses, flight_of
 from planner_jax.task.block.plan import BlockPlan, explain_status, make_empty_plan, mark_blocked
 from planner_jax.trajectory.polynomial import evaluate
 
-_BANG_BANG_PIECES = 13  # number of polynomial pieces of a bang-bang motion of six joints
 _PIECES = 10  # number of polynomial pieces of the straight motions that `end_poses` evaluates
 
 
@@ -71,7 +70,7 @@ class DirectBlock(Planner):
             index = order[k]
             return self.plan_to(case, poses.angles[index], poses.time[index], times[index])
 
-        best = select_first_solved(plan_of, num, make_empty_plan(case, _BANG_BANG_PIECES))
+        best = select_first_solved(plan_of, num, make_empty_plan(case, 2 * case.arm.num + 1))
         status = explain_status(poses, mark_blocked(case, best.status))
         return dataclasses.replace(best, status=status)
 

@@ -12,6 +12,7 @@ authors' code stops within 0.1 rad of the goal; here a path ends at the goal.
 """
 
 import dataclasses
+import functools
 import heapq
 import itertools
 
@@ -22,13 +23,14 @@ from planner_jax.baselines.block.pose_by_pose import Clock, Goal, PathThenTime
 from planner_jax.task.block.case import BlockCase
 
 CELL = 0.05  # [rad], edge length of the grid cells in which two states count as one
-STEPS = np.concatenate(
-    [
-        sign * np.deg2rad(size) * np.eye(6)[:num]
-        for num, size in ((4, 7.0), (6, 4.0))
-        for sign in (1, -1)
-    ]
-)
+
+
+@functools.cache
+def list_steps(joints: int) -> np.ndarray:
+    """Return the steps (S, n) [rad] of a search: of 7 degrees, but for two joints, and of 4."""
+    parts = ((joints - 2, 7.0), (joints, 4.0))
+    each = [np.deg2rad(size) * np.eye(joints)[:num] for num, size in parts]
+    return np.concatenate([sign * step for step in each for sign in (1, -1)])
 
 
 @dataclasses.dataclass
@@ -65,7 +67,7 @@ class OpenStates:
 
     def steps_from(self, state: State) -> list[State]:
         """Return neighbours in unexpanded grid cells to which no shorter path is known."""
-        neighbours = state.angles + STEPS
+        neighbours = state.angles + list_steps(state.angles.size)
         lengths = state.length + np.linalg.norm(neighbours - state.angles, axis=1)
         return [
             State(angles, length, state)

@@ -24,7 +24,7 @@ _BATCHES = (1, 64, 256, 1024)  # batch sizes for which programs are compiled
 
 @jax.jit
 def _nearest(arm: Arm, scene: Scene, angles: Array) -> Array:
-    """Return the arm's distance (N,) [m] from obstacles and itself, for N joint poses (N, 6)."""
+    """Return the arm's distance (N,) [m] from obstacles and itself, for N joint poses (N, n)."""
     return least_clearances(arm, scene, angles)
 
 
@@ -36,7 +36,7 @@ def _compile(tree: Hashable, layout: tuple, dtype: np.dtype) -> None:
     """
     arm, scene = jax.tree.unflatten(tree, [np.zeros(*leaf) for leaf in layout])
     for size in _BATCHES:
-        _nearest(arm, scene, np.zeros((size, 6), dtype))
+        _nearest(arm, scene, np.zeros((size, arm.num), dtype))
 
 
 class FreeSpace:
@@ -52,12 +52,12 @@ class FreeSpace:
         _compile(tree, tuple((leaf.shape, leaf.dtype) for leaf in leaves), self._dtype)
 
     def is_free(self, angles: np.ndarray) -> np.ndarray:
-        """Return which of N poses (N, 6) [rad] are within limits and collision-free, (N,) bool."""
+        """Return which of N poses (N, n) [rad] are within limits and collision-free, (N,) bool."""
         num, begin, gaps = len(angles), 0, []
         while begin < num:
             size = next((size for size in _BATCHES if size >= num - begin), _BATCHES[-1])
             some = angles[begin : begin + size]
-            filled = np.empty((size, 6), self._dtype)
+            filled = np.empty((size, len(self.lower)), self._dtype)
             filled[: len(some)], filled[len(some) :] = some, some[-1]
             gaps.append(np.asarray(_nearest(self._arm, self._scene, filled))[: len(some)])
             begin += size
@@ -91,11 +91,13 @@ class FreeSpace:
         It is checked at samples that are at most `RESOLUTION` apart in joint space.
 
         Args:
-            coeffs: (M, D + 1, 6), M pieces of degree D for six joints, lowest power of time first.
+            coeffs: (M, D + 1, n), M pieces of degree D for n joints, lowest power of time first.
             durations: (M,) [s], durations of the pieces.
         """
         rough = _sample_pieces(coeffs, durations, np.full(len(durations), 8))
-        lengths = np.linalg.norm(np.diff(rough.reshape(-1, 9, 6), axis=1), axis=2).sum(axis=1)
+        lengths = np.linalg.norm(
+            np.diff(rough.reshape(-1, 9, rough.shape[-1]), axis=1), axis=2
+        ).sum(axis=1)
         counts = np.maximum(np.ceil(1.1 * lengths / RESOLUTION), 1.0).astype(int)
         return bool(self.is_free(_sample_pieces(coeffs, durations, counts)).all())
 

@@ -87,7 +87,7 @@ class InsatBlock(PoseByPose):
 
     def plan_of(self, case: BlockCase) -> BlockPlan:
         """Return the plan of one case; compile first, so that only the search is timed."""
-        _compile(np.asarray(case.angles).dtype, self.solver)
+        _compile(case.arm.num, np.asarray(case.angles).dtype, self.solver)
         return super().plan_of(case)
 
     def motion_to(
@@ -109,9 +109,10 @@ class InsatBlock(PoseByPose):
             if found is not None:
                 return _motion(case, goal, *found[:2])
             neighbours = states.steps_from(state)
-            ends = np.stack([new.angles for new in neighbours]) if neighbours else np.zeros((0, 6))
-            for k in np.flatnonzero(free.are_edges_free(state.angles, ends)) if neighbours else ():
-                states.push(neighbours[k])
+            if neighbours:
+                ends = np.stack([new.angles for new in neighbours])
+                for k in np.flatnonzero(free.are_edges_free(state.angles, ends)):
+                    states.push(neighbours[k])
         return None
 
     def lift(self, case: BlockCase, free: FreeSpace, goal: Goal, state: State) -> bool:
@@ -159,7 +160,11 @@ class InsatBlock(PoseByPose):
         for some in (is_first, ~is_first):
             if good.any():
                 samples = splines.angles[good][:, some]
-                good[good] = free.is_free(samples.reshape(-1, 6)).reshape(samples.shape[:2]).all(1)
+                good[good] = (
+                    free.is_free(samples.reshape(-1, samples.shape[-1]))
+                    .reshape(samples.shape[:2])
+                    .all(1)
+                )
         last = good.shape[1] - 1 - np.argmax(good[:, ::-1], axis=1)
         each = np.arange(len(before))
         cost = TIME_WEIGHT * splines.time + LENGTH_WEIGHT * splines.length
@@ -173,10 +178,10 @@ class InsatBlock(PoseByPose):
 
 
 @functools.cache
-def _compile(dtype: np.dtype, config: lbfgs.LbfgsConfig) -> None:
+def _compile(num: int, dtype: np.dtype, config: lbfgs.LbfgsConfig) -> None:
     """Compile the spline programs before the search, so that its time does not count."""
-    joints = host_leaf(np.zeros(6, dtype))
-    guesses = np.zeros((ANCESTORS, CONTROL_POINTS, 6), dtype)
+    joints = host_leaf(np.zeros(num, dtype))
+    guesses = np.zeros((ANCESTORS, CONTROL_POINTS, num), dtype)
     bounds = Bounds(joints, joints, joints + 1, joints + 1)
     _optimise(joints, joints, host_leaf(guesses), host_leaf(False), bounds, config)
     _pieces(guesses[0], 1.0)
@@ -228,7 +233,7 @@ def _optimise(
         return jnp.matmul(a, b, precision=lax.Precision.HIGHEST)
 
     def points_of(x: Array) -> Array:
-        moved = _UNIT * x.reshape(num - 3, 6)
+        moved = _UNIT * x.reshape(num - 3, start.size)
         before = jnp.where(rests, end, moved[-1])
         return jnp.concatenate([start[None], start[None], moved[:-1], before[None], end[None]])
 
@@ -280,7 +285,7 @@ def _motion(case: BlockCase, goal: Goal, points: np.ndarray, time: float) -> Hos
     # An arm that may move at the end waits first, so that it arrives together with the ball.
     coeffs, durations = _pieces(points, time)
     if not case.ends_at_rest:
-        wait = np.zeros((1, DEGREE + 1, 6))
+        wait = np.zeros((1, DEGREE + 1, case.arm.num))
         wait[0, 0] = case.angles
         coeffs = np.concatenate([wait, coeffs])
         durations = np.append(goal.available - time, durations)

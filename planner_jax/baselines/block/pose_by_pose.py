@@ -47,7 +47,7 @@ class Goal:
 class HostMotion:
     """A joint motion of M polynomial pieces; time 0 is when the arm may start to move."""
 
-    coeffs: np.ndarray  # (M, D + 1, 6), of degree D for six joints [rad], lowest power first
+    coeffs: np.ndarray  # (M, D + 1, n), of degree D for n joints [rad], lowest power first
     durations: np.ndarray  # (M,) [s], durations of the pieces
     execution: float  # [s], duration of the motion without an initial wait
 
@@ -129,7 +129,7 @@ class PoseByPose(Planner, abc.ABC):
         """Return the plan of a motion, None for standstill, with the contact time `contact` [s]."""
         dtype = np.asarray(case.angles).dtype
         if motion is None:
-            stay = np.zeros((1, self.degree + 1, 6))
+            stay = np.zeros((1, self.degree + 1, case.arm.num))
             stay[0, 0] = case.angles
             coeffs, durations = stay, np.ones(1)
             contact, cost, violation = case.delay + 1.0, np.inf, np.inf
@@ -137,7 +137,7 @@ class PoseByPose(Planner, abc.ABC):
             coeffs, durations, cost = motion.coeffs, motion.durations, motion.execution
             violation = cost / (np.asarray(contact) - case.delay) - 1.0
             status = Status.FEASIBLE if violation <= 0.0 else Status.INFEASIBLE
-        rest = np.zeros((self.pieces - len(durations), self.degree + 1, 6))
+        rest = np.zeros((self.pieces - len(durations), self.degree + 1, case.arm.num))
         rest[:, 0] = sum(coeffs[-1, k] * durations[-1] ** k for k in range(self.degree + 1))
         return BlockPlan(
             motion=PiecewisePolynomial(

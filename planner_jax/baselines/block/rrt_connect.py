@@ -45,20 +45,21 @@ class RrtConnectBlock(PathThenTime):
         `free` checks collisions, and `left` returns the remaining search time [s].
         """
         base, geometric = _ompl()
-        space = base.RealVectorStateSpace(6)
-        bounds = base.RealVectorBounds(6)
-        for k in range(6):
+        space = base.RealVectorStateSpace(case.arm.num)
+        bounds = base.RealVectorBounds(case.arm.num)
+        for k in range(case.arm.num):
             bounds.setLow(k, float(free.lower[k]))
             bounds.setHigh(k, float(free.upper[k]))
         space.setBounds(bounds)
         information = base.SpaceInformation(space)
-        information.setStateValidityChecker(lambda state: bool(free.is_free(_numbers(state)[None])))
+        numbers = functools.partial(_numbers, case.arm.num)
+        information.setStateValidityChecker(lambda state: bool(free.is_free(numbers(state)[None])))
         information.setMotionValidator(_validator(base, information, free))
         information.setup()
         ends = []
         for angles in (case.angles, goal.angles):
             state = space.allocState()
-            for k in range(6):
+            for k in range(case.arm.num):
                 state[k] = float(angles[k])
             ends.append(state)
         problem = base.ProblemDefinition(information)
@@ -76,11 +77,11 @@ class RrtConnectBlock(PathThenTime):
         path = problem.getSolutionPath()
         if self.shortcuts:
             geometric.PathSimplifier(information).simplify(path, max(left(), 0.0))
-        return np.stack([_numbers(state) for state in path.getStates()])
+        return np.stack([numbers(state) for state in path.getStates()])
 
 
-def _numbers(state: Sequence[float]) -> np.ndarray:
-    return np.array([state[k] for k in range(6)])
+def _numbers(num: int, state: Sequence[float]) -> np.ndarray:
+    return np.array([state[k] for k in range(num)])
 
 
 def _validator(base: ModuleType, information: object, free: FreeSpace) -> object:
@@ -88,6 +89,7 @@ def _validator(base: ModuleType, information: object, free: FreeSpace) -> object
 
     class Edges(base.MotionValidator):
         def checkMotion(self, begin: Sequence[float], end: Sequence[float]) -> bool:  # noqa: N802
-            return bool(free.are_edges_free(_numbers(begin), _numbers(end)[None])[0])
+            first, last = (_numbers(len(free.lower), state) for state in (begin, end))
+            return bool(free.are_edges_free(first, last[None])[0])
 
     return Edges(information)

@@ -32,6 +32,11 @@ class BlockSweep(Sweep[BlockSettings]):
         if isinstance(planner, LibraryBlock | AdaptBlock):
             planner.check(cases)
 
+    def setting(self, cases: PyTree) -> Entries:
+        """Return the number of joints, which rows need to be read as plans, if it is not six."""
+        joints = cases.arm.num
+        return super().setting(cases) | ({} if joints == 6 else {"joints": joints})
+
     def findings(self, manifest: Entries) -> list[str]:
         """Return a sentence on the mean execution time of the successes."""
         if (mean := manifest["summary"]["mean_execution_time"]) is None:
