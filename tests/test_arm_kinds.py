@@ -10,6 +10,7 @@ import pytest
 from arms import KINDS, mjcf_of
 from jaxpr import assert_full_precision
 
+import planner_jax as pj
 from planner_jax.robot.arm import link_frames, shield_jacobian, shield_pose
 from planner_jax.robot.arm_file import irb1600
 from planner_jax.robot.arm_ik import choose_ik, inverse_kinematics
@@ -207,6 +208,23 @@ def test_out_of_reach_the_search_finds_nothing_and_stays_finite():
     solve = jax.jit(lambda: inverse_kinematics(arm, jnp.eye(3), middle))
     solutions, found = map(np.asarray, solve())
     assert np.all(within(arm, solutions)) and not np.any(found)
+
+
+def test_goals_of_a_pose_hold_the_shield_in_the_pose():
+    arm = irb1600()
+    angles = np.stack([arm.home, arm.home + np.float32(0.1)])
+    poses = jax.jit(jax.vmap(lambda q: shield_pose(arm, q)))
+    turn, middle = map(np.asarray, poses(angles))
+    goals = pj.reach.solve_pose(middle, turn)
+    assert goals.shape == (2, 8, 6) and np.all(within(arm, goals))
+    assert np.min(np.max(np.abs(goals[1] - angles[1]), axis=1)) < 1e-3
+    turns, middles = poses(goals.reshape(-1, 6))
+    np.testing.assert_allclose(middles, np.repeat(middle, 8, axis=0), atol=1e-5)
+    np.testing.assert_allclose(turns, np.repeat(turn, 8, axis=0), atol=1e-5)
+    with pytest.raises(pj.ArgumentError, match="position must be within the arm's reach"):
+        pj.reach.solve_pose([middle[0], (9.0, 0.0, 0.0)], turn)
+    with pytest.raises(pj.ArgumentError, match="rotation must be orthonormal"):
+        pj.reach.solve_pose(middle, 2.0 * turn)
 
 
 @of_each_kind

@@ -6,3 +6,4 @@ from .case import case as case
 from .case import make_scene as make_scene
 from .default_planner import ReachPlan as ReachPlan
 from .default_planner import ReachPlanner as ReachPlanner
+from .pose import solve_pose as solve_pose
