@@ -26,7 +26,7 @@ _MARGIN = 0.01  # [m], distance of bodies at which residuals aim, if start and g
 
 def join_knots(start: Array, times: Array, rates: Array) -> PiecewisePolynomial:
     """Return the motion with joint rates (M + 1, n) [rad/s] at times (M + 1,) [s], from `start`."""
-    durations = jnp.diff(times)
+    durations = jnp.maximum(jnp.diff(times), 0.0)  # rounding errors may exchange equal times
     turned = 0.5 * durations[:, None] * (rates[1:] + rates[:-1])
     angles = start[None] + jnp.cumsum(turned, axis=0) - turned
     rise = jnp.diff(rates, axis=0) / jnp.where(durations > 0.0, durations, jnp.inf)[:, None]
