@@ -146,8 +146,7 @@ def main() -> None:
         read = read_pairs if (options.folder / "starts.txt").exists() else read_problems
         problems = read(options.folder, options.every)
         some = next(iter(problems.values()))[0]
-        for search in planner.attempts:  # compile every program before times are taken
-            pj.plan(dataclasses.replace(planner, searches=(search,)), some)
+        pj.warm_up(planner, some)
         bench.say(
             "| family | problems | blocked | solved | refereed | p50 [ms] | p99 [ms] "
             "| duration p50 [s] |",

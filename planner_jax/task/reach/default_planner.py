@@ -37,7 +37,7 @@ from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate, tot
 _TURN = 0.018  # [rad], greatest joint-space distance between two states that are checked
 _CHUNK = 64  # number of states that are checked together
 _POWERS = (2.0, 4.0, 8.0)  # powers of relative accelerations in the cost, one after another
-_CUTS = 60  # number of attempts to shorten a path
+_CUTS = 200  # number of attempts to shorten a path
 
 
 @struct.dataclass
@@ -79,7 +79,7 @@ class ReachPlanner(Planner):
     pieces: int = 30  # greatest number of pieces of a motion
     samples: int = 60  # samples of a motion at which least squares compute distances
     worst: int = 12  # samples with the least distances, at which derivatives are computed
-    capacity: int = 4096  # greatest number of states of a tree
+    capacity: int = 8192  # greatest number of states of a tree
     margin: float = 0.002  # [m], distance from obstacles, if start and goal have twice as much
     slack: float = 1e-4  # fraction of every limit of rates and accelerations that is left unused
     solver: LevenbergConfig = LevenbergConfig(12, 1e-2, 0.25, 6.0, longest=2.0)
@@ -89,6 +89,8 @@ class ReachPlanner(Planner):
         TreeSearch(),
         TreeSearch(rays=8000, seed=1),
         TreeSearch(rays=8000, seed=2),
+        TreeSearch(rays=16000, seed=3),
+        TreeSearch(rays=16000, seed=4),
     )
 
     def __post_init__(self) -> None:
