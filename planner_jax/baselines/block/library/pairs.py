@@ -166,6 +166,7 @@ class PairPlanner(Planner):
             time=duration,
             effort=jnp.where(found, entry, jnp.inf),
             profile=jnp.argmin(durations, axis=1).astype(jnp.int32),
+            is_found=found,
         )
 
     def model(self, pair: PairCase, point: Array, case: BlockCase, flight: Flight) -> Model:
