@@ -9,6 +9,7 @@ are convex meshes in the model: for a capsule whose axis enters a box, `mj_geomD
 
 import dataclasses
 import functools
+import importlib
 import itertools
 from typing import Any
 
@@ -200,8 +201,7 @@ class _Bodies:
     """A MuJoCo model of one case's arm and obstacles, and the pairs that must not touch."""
 
     def __init__(self, case: _Lane) -> None:
-        import mujoco  # an optional dependency
-
+        mujoco: Any = importlib.import_module("mujoco")  # only this referee needs it
         self._mujoco = mujoco
         spec, arm = mujoco.MjSpec(), case.arm
         kinds = mujoco.mjtGeom

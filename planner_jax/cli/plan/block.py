@@ -7,6 +7,7 @@ from jaxtyping import PyTree
 
 from planner_jax.cli.plan.answer import Answer, Margin, Single, closest_to
 from planner_jax.cli.plan.settings import SingleBlockSettings
+from planner_jax.runs.manifest import Entries
 from planner_jax.runs.style import draw
 from planner_jax.sweep.block.settings import arm_options
 from planner_jax.task.block.case import case
@@ -25,7 +26,9 @@ class SingleBlock(Single[SingleBlockSettings]):
     def case(self) -> PyTree:
         """Make the case of the specified ball."""
         given = self.settings
-        own = {"regime": given.regime} if given.arm is None else arm_options(given.arm, given.tip)
+        own: Entries = {"regime": given.regime}
+        if given.arm is not None:
+            own = arm_options(given.arm, given.tip)
         scene = scene_for(own.get("arm"), has_pole=not given.no_pole)
         return case(given.pos, given.vel, delay=given.delay, wide=given.wide, scene=scene, **own)
 

@@ -51,7 +51,7 @@ def draw_plan(case: BlockCase, plan: BlockPlan, figure: Figure) -> None:
     corners = middles[:, None] + np.einsum("kij,cj->kci", edges, _SIGNS)
     contact = float(plan.contact_time)
     flown = np.linspace(0.0, contact, _SAMPLES)[:, None]
-    ball = case.ball.pos + case.ball.vel * flown - 0.5 * case.gravity * flown**2 * [0.0, 0.0, 1.0]
+    ball = case.ball.pos + case.ball.vel * flown - 0.5 * case.gravity * flown**2 * np.eye(3)[2]
     views = (above, (0, 1), "from above"), (side, (0, 2), "from the side")
     for axes, (across, up), title in views:
         _draw_scene(axes, case, across, up)
