@@ -1,3 +1,5 @@
+# Pyright cannot see the names of MuJoCo's compiled module.
+# pyright: reportAttributeAccessIssue=false
 """Execute planned blocks in MuJoCo with a heavy shield: `python -m benchmarks.block_torques`.
 
     python -m benchmarks.block_torques [--num 60] [--seed 977] [--regime R2] [--mass 1.5]
@@ -24,7 +26,7 @@ _STIFF, _DAMPED = 2500.0, 100.0  # [1/s^2] and [1/s], gains of the controller
 
 def main() -> None:
     """Plan the throws, execute the solved plans, and print one line of results."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description="Execute planned blocks in MuJoCo.")
     parser.add_argument("--num", type=int, default=60)
     parser.add_argument("--seed", type=int, default=977)
     parser.add_argument("--regime", default="R2")
