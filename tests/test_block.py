@@ -302,7 +302,7 @@ BARE = dataclasses.replace(
         (
             throw,
             {"angles": (0.0, 5.0, 0.0, 0.0, 0.0, 0.0)},
-            "angles must be between arm.lower and arm.upper, got 5",
+            "angles must be >= arm.lower and <= arm.upper, got 5",
         ),
         (throw, {"scene": boxes(0.3)}, "scene.inner.lower must be >= scene.outer.lower, got -0.4"),
         (throw, {"arm": BARE}, "arm must be one with a capsule around at least one link, got none"),

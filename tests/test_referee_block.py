@@ -454,6 +454,9 @@ FAILED = ["", "tilt", "time", "self", "velocity", "velocity", ""]
 # For dynamics, the home pose, and the arm's own limits, which a case can replace.
 UNREAD = {"arm.home", "arm.mass", "arm.centre", "arm.inertia"}
 UNREAD |= {"arm.limits.velocity", "arm.limits.acceleration"}
+# A case of a block has no boxes and no cylinders.
+UNREAD |= {f"scene.box_{name}" for name in ("half", "middle", "turn")}
+UNREAD |= {"scene.cylinder_ends", "scene.cylinder_radius"}
 UNKNOWN = ("miss", "pole_clearance")
 PLANNED = (COEFFS, DURATIONS, "plan.contact_time")
 ABSURD, HARMLESS = ("ball.pos", "angles", "arm.origin", "scene.pole", *PLANNED), "scene.pole"

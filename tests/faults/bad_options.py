@@ -58,7 +58,8 @@ plan hit --vel -3 0.2 4 --target 4 0 0 --pos 1 nan 2 | --pos must be finite, got
 plan hit --vel -3 0.2 4 --target 4 0 0 --pos 4 0 1 --speed inf | --speed must be finite
 plan hit --vel -3 0.2 4 --target 4 0 0 --pos 4 0 1 --out junk/below | --out must be in a folder
 plan catch --horizon 1 --ball 1 2 3          | --ball
-plan block                                   | block
+plan block                                   | --pos
+plan block --pos 9 0 0 --vel -8 0 5 --tip x  | --tip must be left out
 plan intercept                               | --map
 plan intercept --map gone                    | --map must be a file that can be read .. got 'gone'
 plan intercept --map folder                  | --map must be a file that can be read

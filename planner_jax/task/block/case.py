@@ -27,7 +27,7 @@ from planner_jax.task.block.scene import Scene, paper_scene
 
 _TOLERANCE = 1e-3  # [rad], by which a joint may start beyond its range; as in the referee
 _IN_RANGE = rules.Rule(
-    "between arm.lower and arm.upper",
+    ">= arm.lower and <= arm.upper",
     lambda value, case: (
         (value >= case.arm.lower - _TOLERANCE) & (value <= case.arm.upper + _TOLERANCE)
     ),
