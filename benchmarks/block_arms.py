@@ -5,7 +5,7 @@
 
 A file is an arm in MJCF or URDF that `pj.block.read_arm` reads; "irb1600" is the arm of the
 library. --tip is the body or site at which a shield of 0.30 m is mounted. --limits is a file with
-limits of the joints, by default the file beside that of the arm. The throws are those of the suite.
+limits of the joints, by default `NAME.limits.yaml` beside the arm's file. --suite draws the throws.
 The scene is scaled to the reach of each arm. The referee, an independent check in float64, decides
 which balls are blocked. With --long, throws that the planner fails to block are planned again from
 192 starting points. The last column is then the share of blocks among the throws that one of both

@@ -24,8 +24,8 @@ RATES = (50.0, 100.0, 237.0)
 def rejection(message, joints):
     """Return why joint_trajectory_controller rejects the fields of a message, or "".
 
-    The rules are those of `validate_trajectory_msg` in the package ros2_controllers, with the
-    controller's default parameters, and that names are unique, which the parameter `joints` needs.
+    The function `validate_trajectory_msg` of the package ros2_controllers has these rules, with the
+    controller's default parameters. Names must also be unique, as the parameter `joints` needs.
     """
     names, points = message["joint_names"], message["points"]
     if not names or not points:

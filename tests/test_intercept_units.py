@@ -187,7 +187,7 @@ def test_a_wrong_argument_is_named(settings, says):
 
 @pytest.mark.parametrize("size", [0.4, 4.5, 4500.0])
 def test_the_bound_between_samples_is_a_lower_bound_and_exact_for_a_dip(size):
-    # Distances |t - c| of points that pass each other, of which no sample shows the least one.
+    # Distances |t - c| of two points that pass each other. No sample is at the least distance.
     least = size * np.linspace(0.0, 0.9, 7)
     dips = least[:, None] + size * np.abs(np.arange(9.0) - np.linspace(3.0, 4.0, 7)[:, None])
     assert dips[3].min() > least[3] + 0.4 * size

@@ -157,8 +157,9 @@ def setpoints_of(plan: Plan, rate: float) -> Setpoints:
     }
     for name, values in found.items():
         require(bool(np.isfinite(values).all()), "plan", "finite", shown=f"{name} that is not")
-        if name in robot.rates and is_rested(plan):
-            values[-1] = 0.0
+    if is_rested(plan):
+        for name in robot.rates:
+            found[name][-1] = 0.0
     return dataclasses.replace(setpoints, **found)
 
 

@@ -329,7 +329,7 @@ def _clearances(case: dict, arm: Any, motion: _Motion, turning: np.ndarray) -> d
 def _put_start_first(
     case: dict, arm: Any, motion: _Motion, near: dict[str, tuple], contact: float
 ) -> dict[str, tuple]:
-    """Return the clearances `near`, with those of the start pose where the arm starts in contact.
+    """Return clearances in which the start pose counts alone if the arm starts in contact.
 
     A case that starts in a collision has no solution: the verdict names its start, although the
     motion may get deeper into the obstacle.

@@ -219,7 +219,7 @@ class ArmModel:
 
     def _locate(self, spec: Any, mesh: Any) -> None:
         """Find the file of a mesh, also if it is named by a package of ROS; raise without one."""
-        scheme, is_packaged, path = mesh.file.rpartition("://")
+        _, is_packaged, path = mesh.file.rpartition("://")
         if not mesh.file or self.path is None:
             return
         base = Path(spec.modelfiledir)

@@ -116,16 +116,19 @@ def read_arm(
     return _read(path, limits, shield, tip, home, dtype)[0]
 
 
+@functools.cache
 def read_shield_arm(path: str, tip: str | None = None) -> Arm:
-    """Read an arm for blocks: as `read_arm`, with a shield of 0.30 m at `tip` if it has none."""
-    arm = read_arm(path, tip=tip)
-    return arm if np.all(arm.shield_half) else read_arm(path, tip=tip, shield=Shield())
+    """Read an arm for blocks: as `read_arm`, with a shield of 0.30 m at `tip` if it has none.
+
+    A process reads each file once.
+    """
+    return _read(path, tip=tip, usual=Shield())[0]
 
 
 def describe_arm(path: str | os.PathLike, **settings: Any) -> str:
     """Describe an arm as `read_arm` reads it: joints, fit of the capsules, pairs not checked.
 
-    The arguments and errors are those of `read_arm`.
+    The function takes the arguments of `read_arm`, and raises the same errors.
     """
     return _read(path, **settings)[1]
 
@@ -137,13 +140,17 @@ def _read(
     tip: str | None = None,
     home: Iterable[float] | None = None,
     dtype: DTypeLike = np.float32,
+    usual: Shield | None = None,
 ) -> tuple[Arm, str]:
-    """Return the arm of a file, and the text of `describe_arm`."""
+    """Return the arm of a file, and the text of `describe_arm`.
+
+    `usual` is the shield of an arm whose file has none, if no other one is passed.
+    """
     model = ArmModel(path, tip)
     stated = limits_of(model, limits)
     lower, upper = stated["position"].T
     rest, source = model.home(home, lower, upper)
-    mount = _mount(model, shield)
+    mount = _mount(model, shield, usual)
     before = [(np.zeros(3), np.eye(3)), *model.zero[:-1]]
     steps = [
         (turn.T @ (p - q), turn.T @ r) for (q, turn), (p, r) in zip(before, model.zero, strict=True)
@@ -228,13 +235,14 @@ def _plate(mount: _Mount) -> list[tuple[float, np.ndarray, np.ndarray]]:
     return [(mount.mass, centre, mount.turn * moments @ mount.turn.T)]
 
 
-def _mount(model: ArmModel, shield: Shield | None) -> _Mount:
-    """Return the shield that is passed, or else the file's shield, or else one of size 0."""
+def _mount(model: ArmModel, shield: Shield | None, usual: Shield | None) -> _Mount:
+    """Return the shield passed, or else the file's, or else the usual one, or one of size 0."""
     origin, turn = model.tip
     mj, kinds, last = model.model, model.mujoco.mjtGeom, model.num - 1
     every = [(mj.ngeom, mj.geom), (mj.nsite, mj.site)]
     geoms, sites = ([k for k in range(num) if at(k).name == "shield"] for num, at in every)
     if shield is not None or not geoms:
+        shield = shield or usual
         own = shield or Shield(position=(0.0, 0.0, 0.0))
         rotation = Rotation.from_quat(own.turn, scalar_first=True).as_matrix()
         half = np.array(own.half, float) if shield else np.zeros(2)

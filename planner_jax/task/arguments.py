@@ -19,6 +19,8 @@ from planner_jax.core.protocol import Decision, Plan, take
 from planner_jax.core.registry import split_name
 from planner_jax.core.rules import NOT_NEGATIVE, Case
 
+TreeT = TypeVar("TreeT")
+
 _DRAWN_BYTES = 1_000  # [B], estimated memory of one case of a suite
 
 
@@ -35,6 +37,20 @@ def array_of(
         if isinstance(numbers, np.ndarray):
             numbers = numbers.astype(dtype)  # JAX would compile a program for each shape
         return jnp.asarray(numbers, dtype)
+
+
+def repeat_leaves(tree: TreeT, *, batch: tuple[int, ...], dtype: DTypeLike) -> TreeT:
+    """Return a tree without batch axes with its arrays repeated for every case of a batch.
+
+    Arrays of floating-point numbers become arrays of the type `dtype`.
+    """
+
+    def repeat(value: ArrayLike) -> Array:
+        value = np.asarray(value)
+        kind = np.dtype(dtype) if value.dtype.kind == "f" else value.dtype
+        return jnp.asarray(np.broadcast_to(value, batch + value.shape), kind)
+
+    return jax.tree.map(repeat, tree)
 
 
 def batch_of(name: str, vectors: object, *shape: int) -> tuple[int, ...]:

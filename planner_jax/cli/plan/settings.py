@@ -9,7 +9,12 @@ from planner_jax.core.choices import CHOICES, require, require_one_of
 from planner_jax.core.registry import Task, split_name
 from planner_jax.runs.manifest import Entries
 from planner_jax.runs.settings import option, recovery_option, recovery_options
-from planner_jax.sweep.block.settings import REGIMES, require_own_limits
+from planner_jax.sweep.block.settings import (
+    REGIMES,
+    arm_option,
+    require_own_limits,
+    tip_option,
+)
 from planner_jax.sweep.quadrotor_settings import resolve_robot, robot_option
 from planner_jax.task.catch.spec import DECISIONS, TRAINED
 from planner_jax.task.hit.spec import DRAG
@@ -61,12 +66,8 @@ class SingleBlockSettings(PlanSettings):
     regime: str = option("R2", "NAME", f"limits of the joints: {', '.join(REGIMES)}")
     wide: bool = option(False, "", "accept a ball 0.1 m from the shield's middle, at 30 degrees")
     no_pole: bool = option(False, "", "leave out the pole before the arm")
-    arm: str | None = option(
-        None, "FILE", "an arm in MJCF or URDF, with its own limits (default: the IRB 1600)"
-    )
-    tip: str | None = option(
-        None, "NAME", "body or site of this arm that carries a shield of 0.30 m, if it has none"
-    )
+    arm: str | None = arm_option()
+    tip: str | None = tip_option()
 
     RUN: ClassVar[str] = "planner_jax.cli.plan.block:SingleBlock"
 

@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from planner_jax.core.choices import require, require_one_of
 from planner_jax.runs.settings import Options, SweepSettings, option
@@ -17,6 +17,18 @@ def require_moderate(name: str, value: float | None, most: float = _LONGEST) -> 
     if value is not None:
         require(0.0 <= value < math.inf, name, "finite and >= 0", value)
         require(value <= most, name, f"<= {most:g}", value)
+
+
+def arm_option() -> Any:
+    """Return the option `--arm`, an arm from a file."""
+    words = "an arm in MJCF or URDF, with its own limits (default: the IRB 1600)"
+    return option(None, "FILE", words)
+
+
+def tip_option() -> Any:
+    """Return the option `--tip`, the end of the arm of `--arm`."""
+    words = "body or site of this arm that carries a shield of 0.30 m, if it has none"
+    return option(None, "NAME", words)
 
 
 def require_own_limits(arm: str | None, tip: str | None, regime: str) -> None:
@@ -48,12 +60,8 @@ class BlockSettings(SweepSettings):
     )
     anywhere: bool = option(False, "", "accept a ball anywhere on the shield, at any angle")
     delay: float = option(0.0, "S", "seconds until the arm may start")
-    arm: str | None = option(
-        None, "FILE", "an arm in MJCF or URDF, with its own limits (default: the IRB 1600)"
-    )
-    tip: str | None = option(
-        None, "NAME", "body or site of this arm that carries a shield of 0.30 m, if it has none"
-    )
+    arm: str | None = arm_option()
+    tip: str | None = tip_option()
 
     RUN: ClassVar[str] = "planner_jax.sweep.block.sweep:BlockSweep"
     DRAW: ClassVar[tuple[str, ...]] = ("regime", "wide", "anywhere", "delay")

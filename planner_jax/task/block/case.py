@@ -3,7 +3,6 @@
 import functools
 from typing import ClassVar
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
@@ -21,7 +20,8 @@ from planner_jax.robot.arm_file import Shield as Shield
 from planner_jax.robot.arm_file import describe_arm as describe_arm
 from planner_jax.robot.arm_file import irb1600
 from planner_jax.robot.arm_file import read_arm as read_arm
-from planner_jax.task.arguments import array_of, batch_of
+from planner_jax.task.arguments import array_of, batch_of, repeat_leaves
+from planner_jax.task.block import scene as scene_module
 from planner_jax.task.block.clearance import least_clearances
 from planner_jax.task.block.scene import Scene, paper_scene
 
@@ -56,12 +56,7 @@ RULES: Table = (
     Field("scene.outer.upper", (3,)),
     Field("scene.inner.lower", (3,), rules.at_least("scene.outer.lower")),
     Field("scene.inner.upper", (3,), rules.at_most("scene.outer.upper")),
-    Field("scene.pole", (2,)),
-    Field("scene.pole_radius", (), rules.NOT_NEGATIVE),
-    Field("scene.has_pole", (), kind=np.bool_),
-    Field("scene.floor", ()),
-    Field("scene.beam_ends", ("N", 2, 3)),
-    Field("scene.beam_radius", ("N",), rules.NOT_NEGATIVE),
+    *scene_module.RULES,
 )
 # Tolerances of a contact: greatest distance [m] of the ball from the shield's middle, and greatest
 # angle [rad] between the shield's normal and the reversed velocity of the ball.
@@ -131,8 +126,8 @@ def case(
             velocity at the end. "R2", the default: speeds of the robot's data sheet and
             30 rad/s^2, at rest at the end. "R3": limits of "R1", at rest at the end. A regime is
             not allowed for another arm, whose motions end at rest.
-        limits: greatest joint rates and accelerations, without batch axes; by default those of the
-            regime, or else of the arm.
+        limits: greatest joint rates and accelerations, without batch axes; by default the limits
+            of the regime, or else the limits of the arm.
         wide: whether the ball may meet the shield up to 0.1 m from its middle and tilted by up to
             30 degrees, instead of 2 mm and half a degree.
         anywhere: whether the ball may meet the shield anywhere and at any angle. This suits motions
@@ -178,11 +173,7 @@ def case(
 
     leaf = functools.partial(array_of, batch=batch, dtype=dtype)
 
-    def repeat(value: ArrayLike) -> Array:
-        value = np.asarray(value)
-        kind = np.dtype(dtype) if value.dtype.kind == "f" else value.dtype
-        return jnp.asarray(np.broadcast_to(value, batch + value.shape), kind)
-
+    repeat = functools.partial(repeat_leaves, batch=batch, dtype=dtype)
     offset, tilt = ANYWHERE if anywhere else WIDE if wide else STRICT
     cases = BlockCase(
         ball=BallState(pos=leaf("ball_pos", ball_pos, 3), vel=leaf("ball_vel", ball_vel, 3)),
@@ -190,12 +181,12 @@ def case(
         delay=leaf("delay", delay),
         angles=leaf("angles", angles, num),
         rates=leaf("rates", rates, num),
-        arm=jax.tree.map(repeat, arm),
-        limits=jax.tree.map(repeat, limits),
+        arm=repeat(arm),
+        limits=repeat(limits),
         ends_at_rest=jnp.broadcast_to(jnp.asarray(ends_at_rest), batch),
         offset=leaf("offset", offset),
         tilt=leaf("tilt", tilt),
-        scene=jax.tree.map(repeat, scene),
+        scene=repeat(scene),
     )
     require_sound(cases, {"ball.pos": "ball_pos", "ball.vel": "ball_vel"})
     return cases

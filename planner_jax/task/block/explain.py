@@ -20,10 +20,10 @@ _POINTS, _PIECES = (
 
 @dataclasses.dataclass(frozen=True)
 class Prospects:
-    """How far an arm can get to a ball, whatever lies between its start and the poses.
+    """Numbers of poses in which an arm meets a ball, and the time that the arm lacks.
 
-    In a pose the shield meets the ball where it may be blocked. The poses are those of the inverse
-    kinematics at 192 points of the ball's path.
+    In a pose the shield meets the ball where it may be blocked. Inverse kinematics find the poses
+    at 192 points of the ball's path. Obstacles between start and poses are ignored.
     """
 
     poses: int  # number of poses within the limits of the joint angles

@@ -10,8 +10,10 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from planner_jax.ball.flight import BallState, drag_free_fall_time
+from planner_jax.core import rules
 from planner_jax.core.arithmetic import host_leaf
 from planner_jax.core.choices import require
+from planner_jax.core.rules import Field, Table
 
 INNER_HALF, INNER_HEIGHT = 0.4, 1.35  # [m], half side and height of the protected box
 OUTER_HALF, OUTER_HEIGHT = 1.0, 1.85  # [m], half side and height of the box where balls are met
@@ -21,6 +23,17 @@ FLOOR = -0.4826  # [m], height of the floor
 # capsule that encloses its cross-section of 0.025 m x 0.076 m.
 RIG_HALF, RIG_LENGTH = 0.559, 1.09  # [m], half the side of the square, and length of a beam
 RIG_HEIGHT, RIG_RADIUS = -0.08, 0.0401  # [m], height of the beams' axes, and radius of a capsule
+
+
+# Shapes and ranges that `pj.require_sound` checks for the pole, floor and beams of a case's scene.
+RULES: Table = (
+    Field("scene.pole", (2,)),
+    Field("scene.pole_radius", (), rules.NOT_NEGATIVE),
+    Field("scene.has_pole", (), kind=np.bool_),
+    Field("scene.floor", ()),
+    Field("scene.beam_ends", ("N", 2, 3)),
+    Field("scene.beam_radius", ("N",), rules.NOT_NEGATIVE),
+)
 
 
 @struct.dataclass

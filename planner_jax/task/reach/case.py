@@ -3,7 +3,6 @@
 import functools
 from typing import ClassVar
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
@@ -16,7 +15,8 @@ from planner_jax.core.errors import ArgumentError
 from planner_jax.core.rules import Field, Table, require_sound
 from planner_jax.robot.arm import Arm, ArmLimits
 from planner_jax.robot.arm_file import irb1600
-from planner_jax.task.arguments import array_of, batch_of
+from planner_jax.task.arguments import array_of, batch_of, repeat_leaves
+from planner_jax.task.block import scene as scene_module
 from planner_jax.task.block.scene import Scene, paper_scene
 from planner_jax.task.block.scene import make_scene as make_scene  # for users of `pj.reach`
 
@@ -29,12 +29,7 @@ RULES: Table = (
     Field("arm.capsule_radius", ("C",), rules.NOT_NEGATIVE),
     Field("limits.velocity", ("J",), rules.POSITIVE),
     Field("limits.acceleration", ("J",), rules.POSITIVE),
-    Field("scene.pole", (2,)),
-    Field("scene.pole_radius", (), rules.NOT_NEGATIVE),
-    Field("scene.has_pole", (), kind=np.bool_),
-    Field("scene.floor", ()),
-    Field("scene.beam_ends", ("N", 2, 3)),
-    Field("scene.beam_radius", ("N",), rules.NOT_NEGATIVE),
+    *scene_module.RULES,
     Field("scene.box_middle", ("M", 3)),
     Field("scene.box_turn", ("M", 4)),
     Field("scene.box_half", ("M", 3), rules.NOT_NEGATIVE),
@@ -53,7 +48,7 @@ class ReachCase:
     rules: ClassVar[Table] = RULES
 
     angles: Array  # (n,) [rad], joint angles at the start
-    goals: Array  # (G, n) [rad], joint angles of which the motion may end at any one
+    goals: Array  # (G, n) [rad], joint angles; the motion may end at any of the G goals
     arm: Arm
     limits: ArmLimits
     scene: Scene
@@ -107,17 +102,13 @@ def case(
     dtype = floating(dtype)
     leaf = functools.partial(array_of, batch=batch, dtype=dtype)
 
-    def repeat(value: ArrayLike) -> Array:
-        value = np.asarray(value)
-        kind = np.dtype(dtype) if value.dtype.kind == "f" else value.dtype
-        return jnp.asarray(np.broadcast_to(value, batch + value.shape), kind)
-
+    repeat = functools.partial(repeat_leaves, batch=batch, dtype=dtype)
     cases = ReachCase(
         angles=leaf("angles", angles, arm.num),
         goals=leaf(name, ends, *own).reshape(*batch, -1, arm.num),
-        arm=jax.tree.map(repeat, arm),
-        limits=jax.tree.map(repeat, limits),
-        scene=jax.tree.map(repeat, scene),
+        arm=repeat(arm),
+        limits=repeat(limits),
+        scene=repeat(scene),
     )
     require_sound(cases)
     return cases
