@@ -1,6 +1,7 @@
 """The command `plan intercept`: the file of a case, text, files and rejections."""
 
 import csv
+import dataclasses
 import json
 
 import numpy as np
@@ -10,9 +11,11 @@ from PIL import Image
 
 import planner_jax as pj
 from planner_jax.cli.main import main
+from planner_jax.cli.plan.answer import Answer
 from planner_jax.cli.plan.intercept import SingleIntercept, read_case
 from planner_jax.cli.plan.settings import SingleInterceptSettings
 from planner_jax.plane.maps import MapError
+from planner_jax.task.intercept.spec import TASK
 
 CASE = {
     "target": {"position": [3.0, 4.6], "velocity": [0.0, -0.1]},
@@ -45,7 +48,7 @@ def test_a_file_with_utm_coordinates_keeps_millimetres(tmp_path):
     far |= {"lower": [500000, 4600000], "upper": [500008, 4600008], "mover_velocities": None}
     target = {"position": [500003.124, 4600004.623]}
     case = read_case(write_case(tmp_path, **far, target=target))
-    world = np.asarray(case.origin, float) + np.asarray(case.target.pos, float)
+    world = np.asarray(case.origin, float) + np.asarray(vars(case.target)["pos"], float)
     np.testing.assert_allclose(world, target["position"], atol=1e-6)
 
 
@@ -72,6 +75,18 @@ def test_a_target_out_of_reach_is_reported_with_the_limit_that_fails(tmp_path, c
     printed = capsys.readouterr().out
     assert printed.startswith("No plan that keeps every limit was found.")
     assert "Referee on the best plan found: " in printed
+
+
+def test_limits_that_need_to_be_relaxed_are_printed_for_an_unsolved_case(tmp_path):
+    single = SingleIntercept(
+        TASK, SingleInterceptSettings(planner="spacetime", map=str(write_case(tmp_path)))
+    )
+    solved = single.answer()
+    tight = dataclasses.replace(solved.case.limits, acceleration=np.float32(1e-3))
+    case = dataclasses.replace(solved.case, limits=tight)
+    plan = dataclasses.replace(solved.plan, status=np.int32(pj.Status.INFEASIBLE))
+    lines = single.describe(Answer(case, plan, pj.intercept.judge(case, plan)))
+    assert lines[1].startswith("Relaxation: a motion exists for the case with acceleration relaxed")
 
 
 def test_a_file_has_the_arguments_of_a_case_and_json_is_read_too(tmp_path):

@@ -13,6 +13,7 @@ from jaxtyping import PyTree
 
 from planner_jax.cli.plan.settings import PlanSettings
 from planner_jax.core.errors import CaseError
+from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import Status
 from planner_jax.core.registry import Task
 from planner_jax.planning.plan import plan
@@ -102,12 +103,15 @@ class Single(abc.ABC, Generic[SingleT]):
     def task_margins(self, answer: Answer) -> list[Margin]:
         """Return how close the plan comes to each limit that only this task has."""
 
+    def planner(self) -> Planner:
+        """Make the planner that the command's options specify."""
+        return self.task.planner(self.settings.planner, **self.settings.planner_options())
+
     def answer(self) -> Answer:
         """Plan the case and judge the plan; raise `ArgumentError` if an option is invalid."""
         try:
             case = jax.tree.map(np.asarray, self.case())
-            planner = self.task.planner(self.settings.planner, **self.settings.planner_options())
-            found = plan(planner, case)
+            found = plan(self.planner(), case)
         except CaseError as error:
             raise error.with_names(dict(map(self._setting_of, (error.name, error.other)))) from None
         return Answer(case, found, self.task.judge(case, found))

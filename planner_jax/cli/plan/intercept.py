@@ -12,12 +12,14 @@ from planner_jax.cli.plan.settings import SingleInterceptSettings
 from planner_jax.core.checks import numbers_of, require_switch
 from planner_jax.core.choices import require_one_of
 from planner_jax.core.errors import ArgumentError
+from planner_jax.core.protocol import is_unsolved
 from planner_jax.host.yaml_files import read_fields
 from planner_jax.plane.maps import MapError, read_map
 from planner_jax.plane.target import TurningPath
 from planner_jax.runs.style import draw
 from planner_jax.task.intercept import drawing
 from planner_jax.task.intercept.case import InterceptCase, case
+from planner_jax.task.intercept.explain import relaxation
 
 _SAMPLES = 4001  # number of times at which a plan is compared with the limits
 _TARGET = {"position": (2,), "velocity": (2,), "turn_rate": ()}  # fields of a target, and shapes
@@ -113,6 +115,15 @@ class SingleIntercept(Single[SingleInterceptSettings]):
             f"{float(answer.plan.speed[-1]):.2f} m/s, {1e3 * float(verdict.miss):.1f} mm from the "
             f"target{distances}."
         ]
+
+    def describe(self, answer: Answer) -> list[str]:
+        """Describe the answer, and limits with which an unsolved case has a plan, in lines."""
+        lines = super().describe(answer)
+        if not answer.success and is_unsolved(int(answer.plan.status)):
+            found = relaxation(answer.case, answer.plan, self.planner())
+            if found is not None:
+                lines.insert(1, f"Relaxation: {found.sentence()}.")
+        return lines
 
     def task_margins(self, answer: Answer) -> list[Margin]:
         """Return the margins of the body's distance from the target, and of the car's limits."""

@@ -12,5 +12,7 @@ from .case import InterceptCase as InterceptCase
 from .case import case as case
 from .default_planner import SpacetimeIntercept as SpacetimeIntercept
 from .drawing import draw_plan as draw_plan
+from .explain import Relaxation as Relaxation
+from .explain import relaxation as relaxation
 from .plan import InterceptPlan as InterceptPlan
 from .suites import draw_with_counts as draw_with_counts
