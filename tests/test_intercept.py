@@ -12,6 +12,7 @@ from planner_jax.cli.compilation import record_programs
 from planner_jax.optimise.levenberg import LevenbergConfig
 from planner_jax.robot.car import pose_at
 from planner_jax.robot.car_motion import Quadratic, by_unknowns, motion
+from planner_jax.task.intercept.problem import MotionProblem
 from planner_jax.task.intercept.searches import make_field, make_grid
 from planner_jax.task.intercept.terms import Weights
 from tests.planners import ONE_SEARCH
@@ -31,11 +32,12 @@ def knots():
 
 def test_the_motion_follows_the_car_s_kinematics(knots, float64):
     times = np.linspace(0.0, 4.0, 5 * (len(knots[0]) - 1) + 1)[1:]
+    start, end = jnp.asarray(START), jnp.asarray(4.0)
 
     @jax.jit
     def both(speed, curvature):
-        poses = jax.vmap(lambda t: pose_at(START, 4.0, speed, curvature, t))(times)
-        return motion(jnp.asarray(START), 4.0, speed, curvature, 5), poses
+        poses = jax.vmap(lambda t: pose_at(start, end, speed, curvature, t))(times)
+        return motion(start, end, speed, curvature, 5), poses
 
     found, poses = jax.device_get(both(*knots))
     np.testing.assert_allclose(found.pos.reshape(-1, 2), poses[:, :2], atol=2e-5)
@@ -106,11 +108,11 @@ def test_a_pose_is_the_integral_of_the_car_s_kinematics(knots, float64):
 def test_the_gradient_of_the_cost_matches_finite_differences(knots, float64, meet):
     case = double(pj.take(pj.intercept.draw(1, "hard", 5), 0))
     case = case.replace(end_heading=jnp.array(2.0), heading_tolerance=jnp.array(0.1))
-    planner = pj.intercept.planner(pieces=8, meet=meet)
-    problem = planner.problem
+    case = case.replace(limits=case.limits.replace(jerk=jnp.array(0.4)))
+    problem = MotionProblem(meet, pieces=8)
     grid = jax.jit(lambda case: make_grid(case, ONE_SEARCH[0].lattice, is_time_free=False))(case)
     field = jax.jit(make_field)(case, grid)
-    positions = np.random.default_rng(3).uniform(1.0, 7.0, (8, 2))
+    positions = jnp.asarray(np.random.default_rng(3).uniform(1.0, 7.0, (8, 2)))
     given = case, field, Weights(follow=1.0), positions
     model = jax.jit(lambda point: problem.build_model(point, *given))
     speed, curvature = (jnp.asarray(1.2 * each[1:]) for each in knots)
@@ -307,11 +309,9 @@ def test_a_wall_that_is_seen_on_the_way_is_avoided():
     plan = pj.plan(PLANNER, case)
     walls = pj.obstacles([np.array([[4, 3.7], [4.2, 3.7], [4.2, 4.4], [4, 4.4]], float)])
     again = pj.replan(PLANNER, case, plan, 2.0, walls=walls)
-    seen = case.replace(
-        walls=walls, start=again.start, speed=again.speed[0], curvature=again.curvature[0]
-    )
-    seen = seen.replace(time=again.time)
-    assert not pj.intercept.judge(case.replace(walls=walls), plan).success
+    driven = {"start": again.start, "speed": again.speed[0], "curvature": again.curvature[0]}
+    seen = dataclasses.replace(case, walls=walls, time=again.time, **driven)
+    assert not pj.intercept.judge(dataclasses.replace(case, walls=walls), plan).success
     assert pj.are_solved(again) and pj.intercept.judge(seen, again).success
     with pytest.raises(TypeError, match="walls must be"):
         pj.replan(PLANNER, case, plan, 2.0, walls=[np.zeros((3, 2))])
@@ -332,3 +332,14 @@ def test_bad_input_is_rejected_in_one_line():
         pj.intercept.planner(meet="soon")
     with pytest.raises(ValueError, match=r"^target must have leaves that begin with .* \(3,\)"):
         scene(NEAR, time=np.ones(3))
+
+
+@pytest.mark.slow
+def test_a_limited_jerk_is_kept():
+    slow = {"time": 7.5, "initial_speed": 0.2}
+    free, limited = (scene((7.0, 4.0), [HALF], jerk=jerk, **slow) for jerk in (np.inf, 0.8))
+    assert free.limits.jerk is None
+    plans = [pj.plan(PLANNER, case) for case in (free, limited)]
+    verdicts = [pj.intercept.judge(limited, plan) for plan in plans]
+    assert [str(each.failed_limit) for each in verdicts] == ["jerk", ""]
+    assert verdicts[0].max_jerk > 1.2 and verdicts[1].max_jerk <= 0.8 * 1.001

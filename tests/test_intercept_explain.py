@@ -11,7 +11,7 @@ from planners import ONE_SEARCH
 import planner_jax as pj
 
 KNOTS, TIME = 17, 4.0
-LIMITS = ("speed", "acceleration", "lateral_acceleration", "curvature", "steering_rate")
+LIMITS = ("speed", "acceleration", "jerk", "lateral_acceleration", "curvature", "steering_rate")
 WALL = [[2.0, 3.5], [3.0, 3.5], [3.0, 3.8], [2.0, 3.8]]
 
 

@@ -2,6 +2,7 @@
 
 import math
 from types import SimpleNamespace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -41,7 +42,15 @@ def group(polygons=(), velocities=(), room=(3, 6)):
     return {name: leaf[None] for name, leaf in leaves.items()}
 
 
-def good(speed=SPEED, curvature=0.0, time=TIME, start=START, end=None, walls=(), movers=((), ())):
+def good(
+    speed: Any = SPEED,
+    curvature: Any = 0.0,
+    time=TIME,
+    start: Any = START,
+    end=None,
+    walls: Any = (),
+    movers: Any = ((), ()),
+):
     """Return arrays (1, ...) of a case and a plan by name: a car drives to its target.
 
     The default end is the end of a straight drive at constant speed.
@@ -63,7 +72,7 @@ def good(speed=SPEED, curvature=0.0, time=TIME, start=START, end=None, walls=(),
         **{"body.wheelbase": WHEELBASE, "body.rear_overhang": REAR},
         **{"limits.speed": 1.5, "limits.acceleration": 1.0, "limits.curvature": 2.0},
         **{"limits.lateral_acceleration": 0.8, "limits.steering_rate": 2.0},
-        **{"limits.reverse_speed": 0.0},
+        **{"limits.reverse_speed": 0.0, "limits.jerk": math.inf},
     }
     leaves = {name: np.array(leaf, float)[None] for name, leaf in leaves.items()}
     for name, (polygons, velocities) in {"walls": (walls, ()), "movers": movers}.items():
@@ -131,6 +140,18 @@ def test_acceleration_is_that_of_the_steepest_piece_and_the_root_mean_square_of_
     assert_fails(leaves, "acceleration", excess=0.25, time=H)
 
 
+def test_jerk_is_the_change_of_the_acceleration_at_a_knot_over_the_time_between_knots():
+    speed = SPEED + 0.1 * np.array([0, 1, 3, 3, 3, 3, 3, 3, 3, 3, 3])
+    end = np.array(START[:2]) + [H * (speed.sum() - 0.5 * (speed[0] + speed[-1])) + MIDDLE, 0.0]
+    leaves = good(speed, end=end)
+    assert assert_good(leaves).max_jerk[0] == pytest.approx(0.2 / H**2)
+    leaves["limits.jerk"][:] = 0.16 / H**2
+    assert_fails(leaves, "jerk", excess=0.25, time=2.0 * H)
+    leaves["limits.jerk"][:] = 0.2 / H**2
+    assert_good(leaves)
+    assert assert_good(good()).max_jerk[0] == 0.0
+
+
 def test_lateral_acceleration_peaks_inside_of_a_piece():
     speed, curvature = np.zeros(KNOTS), np.zeros(KNOTS)
     speed[:4], curvature[4:] = 1.5, -2.0
@@ -175,7 +196,8 @@ def test_corners_graze_at_the_distance_of_their_diagonals():
     start = (2.0, 2.0, math.pi / 4.0)
     ahead, left = np.array([1.0, 1.0]) / math.sqrt(2.0), np.array([-1.0, 1.0]) / math.sqrt(2.0)
     beside = np.array(start[:2]) + 1.5 * ahead + (0.5 * WIDTH + 0.03) * left
-    passed = good(start=start, walls=[square(*(beside + [-0.4, 0.4]), 0.4)])
+    x, y = beside + [-0.4, 0.4]
+    passed = good(start=start, walls=[square(x, y, 0.4)])
     assert assert_good(passed).wall_clearance[0] == pytest.approx(0.03)
     corner = np.array(start[:2]) + (SPEED * TIME + FRONT) * ahead + 0.5 * WIDTH * left
     corners = np.array([[0.0, 0.0], ahead, ahead + left, left])
@@ -354,10 +376,11 @@ def test_referee_and_planner_agree_where_a_target_is():
         return random.standard_normal((num, *shape))
 
     rates = np.where(np.arange(num) < 10, 0.0, 0.1 * draw())
-    turning = TurningPath(pos=draw(2), vel=draw(2), turn_rate=rates)
-    polynomial = PolynomialPath(coeffs=0.1 * draw(4, 2), origin=draw())
+    make: list[Any] = [TurningPath, PolynomialPath, LaterPath]
+    turning = make[0](pos=draw(2), vel=draw(2), turn_rate=rates)
+    polynomial = make[1](coeffs=0.1 * draw(4, 2), origin=draw())
     paths = [turning, polynomial]
-    paths += [LaterPath(path=path, begin=random.uniform(0.0, 5.0, num)) for path in paths]
+    paths += [make[2](path=path, begin=random.uniform(0.0, 5.0, num)) for path in paths]
     for path in paths:
         assert position_setting(path) == {}
         with jax.enable_x64(True):
@@ -369,11 +392,11 @@ def test_referee_and_planner_agree_where_a_target_is():
 def test_a_target_of_an_own_class_is_where_its_method_says():
     @struct.dataclass
     class Standing:
-        pos: object
+        pos: Any
 
         def at(self, time):
             return PointState(pos=self.pos + 0.0 * time, vel=jnp.zeros_like(self.pos))
 
-    target = LaterPath(path=Standing(np.array([[1.0, 2.0]])), begin=np.array([0.5]))
-    where = position_setting(target)["target_positions"]
+    target = LaterPath(path=Standing(np.array([[1.0, 2.0]])), begin=jnp.array([0.5]))
+    where: Any = position_setting(target)["target_positions"]
     np.testing.assert_array_equal(where(target, np.array([3.0])), [[1.0, 2.0]])

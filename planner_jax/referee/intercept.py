@@ -27,7 +27,8 @@ _SENTENCES = {
     "[rad], speed [speed limits] or curvature [1 / length of the body]",
     "speed": "{excess:.2%} of its limit above it, or too fast in reverse, at {time:.3f} s",
     **dict.fromkeys(
-        ("acceleration", "curvature", "steering rate", "lateral acceleration"), judging.ABOVE_LIMIT
+        ("acceleration", "jerk", "curvature", "steering rate", "lateral acceleration"),
+        judging.ABOVE_LIMIT,
     ),
     "map": "the body's middle is {excess:.3g} m off the map at {time:.3f} s",
     "wall": "the body is {excess:.3g} m inside walls[{nearest_wall}] or its margin at {time:.3f} s",
@@ -71,6 +72,8 @@ class InterceptVerdict(judging.Verdict):
     max_speed: np.ndarray  # (B,) [m/s], magnitude
     max_acceleration: np.ndarray  # (B,) [m/s^2], |dv/dt|
     rms_acceleration: np.ndarray  # (B,) [m/s^2], sqrt(1/T int (dv/dt)^2 dt)
+    # Greatest change of the acceleration at a knot, divided by the duration of a piece.
+    max_jerk: np.ndarray  # (B,) [m/s^3], magnitude
     max_curvature: np.ndarray  # (B,) [1/m], magnitude
     max_steering_rate: np.ndarray  # (B,) [rad/s], magnitude, of the angle atan(wheelbase curvature)
     max_lateral_acceleration: np.ndarray  # (B,) [m/s^2], magnitude, of the rear axle
@@ -107,8 +110,8 @@ def referee_intercepts(
 
     Speed and curvature are linear between the plan's K + 1 knots in time, so the heading is a cubic
     polynomial of time. Gauss-Legendre quadrature integrates the position between samples, exact to
-    rounding. Speed, acceleration, curvature, steering rate and lateral acceleration are compared
-    with their limits at their extrema, not at samples.
+    rounding. Speed, acceleration, jerk, curvature, steering rate and lateral acceleration are
+    compared with their limits at their extrema, not at samples.
 
     The distances of the car's body from the map's border, from walls and from moving obstacles
     (movers) are tested at samples: at the knots, at the times when a mover appears or vanishes, and
@@ -177,9 +180,10 @@ def _leaves(cases, plans) -> dict[str, np.ndarray]:
     of_plan = {"start": (3,), "time": (), "curvature": speed.shape[1:], "speed": speed.shape[1:]}
     leaves = judging.read_leaves(plans, of_plan | {"origin": (2,)}, len(speed), "plan.")
     leaves |= judging.read_leaves(cases, _SHAPES, len(speed))
-    name, reverse = "limits.reverse_speed", cases.limits.reverse_speed
-    reverse = np.zeros(len(speed)) if reverse is None else reverse
-    leaves[name] = judging.check_leaf(name, reverse, (len(speed),))
+    for name, missing in (("reverse_speed", 0.0), ("jerk", np.inf)):
+        limit = vars(cases.limits)[name]
+        limit = np.full(len(speed), missing) if limit is None else limit
+        leaves[f"limits.{name}"] = judging.check_leaf(f"limits.{name}", limit, (len(speed),))
     region = np.asarray(cases.region)
     if region.ndim != 3 or region.shape[::2] != (len(speed), 2) or region.shape[1] < 1:
         raise ValueError(f"region must be ({len(speed)}, V >= 1, 2), got {region.shape}")
@@ -336,6 +340,7 @@ def _judge_limits(case: dict, span: np.ndarray, relative: float) -> tuple[dict, 
     peaks = {
         "speed": _greatest(np.abs(v), knots),
         "acceleration": _greatest(np.abs(rise), starts),
+        "jerk": _greatest(np.abs(np.diff(rise, prepend=rise[:, :1])) / h, starts),
         "curvature": _greatest(np.abs(k), knots),
         "steering rate": _greatest(steering, starts + zero),
         "lateral acceleration": _greatest(lateral, lateral_times),

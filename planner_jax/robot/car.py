@@ -27,6 +27,9 @@ class CarLimits:
     curvature: Array  # () [1/m], greatest magnitude of the rear axle's curvature
     steering_rate: Array  # () [rad/s], greatest magnitude of the steering angle's rate
     reverse_speed: Array | None = None  # () [m/s], greatest speed in reverse; None: no reverse gear
+    # () [m/s^3], greatest magnitude of the longitudinal jerk. The acceleration is constant between
+    # two knots of a plan. The jerk is its change at a knot, divided by the time between two knots.
+    jerk: Array | None = None
 
     @property
     def least_speed(self) -> Array:

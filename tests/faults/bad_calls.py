@@ -28,7 +28,7 @@ ARGUMENTS = (
     (CATCH, ("optional",), NOT_SWITCHES),
     (DRIVE, ("time", "tolerance", "length", "width", "wheelbase"), ("0", *NOT_POSITIVE[:3])),
     (DRIVE, ("initial_speed",), ("-1", "nan", "'x'", "None", "1j")),
-    (DRIVE, ("speed", "acceleration", "curvature", "steering_rate"), ("0", "-1", "nan", "'x'")),
+    (DRIVE, ("speed", "acceleration", "curvature", "jerk"), ("0", "-1", "nan", "'x'")),
     (BLOCK, ("ball_pos", "ball_vel"), (*NOT_VECTORS[:6], "(nan, 0, 1)")),
     (BLOCK, ("delay",), ("-1", "nan", "'x'", "None", "1j")),
     (BLOCK, ("wide", "anywhere"), NOT_SWITCHES),

@@ -131,15 +131,18 @@ class SingleIntercept(Single[SingleInterceptSettings]):
         motion = drawing.sample_motion(plan.start, plan.time, plan.speed, plan.curvature, _SAMPLES)
         time, speed, curvature = motion["time"], motion["speed"], motion["curvature"]
         angle = np.arctan(float(answer.case.body.wheelbase) * curvature)
+        knots = np.linspace(0.0, float(plan.time), np.size(plan.speed))
+        jerk = np.diff(np.asarray(plan.speed, float), 2) / knots[1] ** 2
         quantities = {
             "speed [m/s]": (speed, limits.speed),
             "acceleration [m/s^2]": (motion["acceleration"], limits.acceleration),
             "lateral acceleration [m/s^2]": (speed**2 * curvature, limits.lateral_acceleration),
             "curvature [1/m]": (curvature, limits.curvature),
             "steering rate [rad/s]": (np.gradient(angle, time), limits.steering_rate),
+            "jerk [m/s^3]": (jerk, np.inf if limits.jerk is None else limits.jerk),
         }
         margins = [
-            closest_to(time, words, np.abs(values), allowed)
+            closest_to(knots[1:] if values is jerk else time, words, np.abs(values), allowed)
             for words, (values, allowed) in quantities.items()
             if np.isfinite(allowed)
         ]

@@ -93,6 +93,7 @@ COLUMNS = [
         ("max_speed", "m/s", "of the car"),
         ("max_acceleration", "m/s^2", "along the path, absolute value"),
         ("rms_acceleration", "m/s^2", "along the path"),
+        ("max_jerk", "m/s^3", "along the path, absolute value"),
         ("max_lateral_acceleration", "m/s^2", "of the rear axle"),
         ("rms_lateral_acceleration", "m/s^2", "of the rear axle"),
         ("rms_lateral_jerk", "m/s^3", "of the rear axle"),

@@ -72,7 +72,11 @@ RULES: Table = (
     Field("upper", (2,), rules.NUMBER),
     *(Field(f"body.{name}", (), rules.POSITIVE) for name in _BODY if name != "rear_overhang"),
     Field("body.rear_overhang", ()),
-    *(Field(f"limits.{name}", (), rules.POSITIVE_OR_NONE) for name in _LIMITS[:-1]),
+    *(
+        Field(f"limits.{name}", (), rules.POSITIVE_OR_NONE)
+        for name in _LIMITS
+        if name != "reverse_speed"
+    ),
     Field("limits.reverse_speed", (), rules.NOT_NEGATIVE_OR_NONE),
     Field("speed", (), _DRIVABLE),
 )
@@ -158,6 +162,7 @@ def case(
     curvature: ArrayLike = 2.0,
     steering_rate: ArrayLike = 2.0,
     reverse_speed: ArrayLike = 0.0,
+    jerk: ArrayLike = np.inf,
     dtype: DTypeLike = jnp.float32,
 ) -> InterceptCase:
     """Make one case of an interception, or a batch, by default with the numbers of [Qu2022].
@@ -212,6 +217,9 @@ def case(
         steering_rate: [rad/s], greatest rate of the steering angle.
         reverse_speed: [m/s], greatest speed in reverse. With 0 for all cases the car has no reverse
             gear, and planning is faster.
+        jerk: [m/s^3], greatest magnitude of the longitudinal jerk: the change of the acceleration
+            from one piece of the plan to the next, divided by a piece's duration. The acceleration
+            at time 0 is not limited by it.
         dtype: type of every floating leaf.
 
     Raises:
@@ -236,6 +244,7 @@ def case(
         "curvature": curvature,
         "steering_rate": steering_rate,
         **({"reverse_speed": reverse_speed} if has_reverse else {}),
+        **({"jerk": jerk} if np.any(np.asarray(jerk) != np.inf) else {}),
     }
     moved = functools.partial(_make_obstacles, origin=shift, batch=batch, dtype=dtype)
     movement = {"velocities": mover_velocities, "paths": mover_paths, "growth": mover_growth}

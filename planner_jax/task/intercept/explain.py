@@ -19,10 +19,11 @@ from planner_jax.task.intercept.plan import InterceptPlan
 _BISECTIONS = 4  # number of plans by which a relaxation is reduced
 # Units of the numbers of a case that may be relaxed.
 _UNITS = {
-    **{"speed": "m/s", "reverse_speed": "m/s", "acceleration": "m/s^2", "curvature": "1/m"},
-    **{"steering_rate": "rad/s", "lateral_acceleration": "m/s^2", "time": "s", "earliest": "s"},
-    **{"tolerance": "m", "heading_tolerance": "rad", "end_speed": "m/s", "margin": "m"},
-    **{"map": "m", "body": "m"},
+    **dict.fromkeys(("speed", "reverse_speed", "end_speed"), "m/s"),
+    **dict.fromkeys(("acceleration", "lateral_acceleration"), "m/s^2"),
+    **{"jerk": "m/s^3", "curvature": "1/m", "steering_rate": "rad/s", "heading_tolerance": "rad"},
+    **dict.fromkeys(("tolerance", "margin", "map", "body"), "m"),
+    **dict.fromkeys(("time", "earliest"), "s"),
 }
 _SIDES = {"map": "every side of the map", "body": "every side of the body"}
 

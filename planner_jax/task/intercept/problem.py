@@ -257,6 +257,16 @@ class MotionProblem:
         )
         gradient, curvature = by_unknowns(drive, cost, self.is_time_free)
         total = jnp.sum(squares[..., 4, 4]) + jnp.sum(limits[:, 5, 5])
+        if (most := case.limits.jerk) is not None:
+
+            def exceed(point: Array) -> Array:
+                speed, _, time = self.unpack(case, point)
+                return jnp.maximum(terms.jerk_excess(most, time, speed) + weights.slack, 0.0)
+
+            over, slope = exceed(point), jax.jacfwd(exceed)(point)
+            gradient += weights.limit * jnp.matmul(over, slope, precision=_HIGHEST)
+            curvature += weights.limit * jnp.matmul(slope.T, slope, precision=_HIGHEST)
+            total += weights.limit * jnp.sum(over**2)
         if self.is_time_free:
             # Add two costs of the meeting time: a penalty if it exceeds the case's time, and, if
             # the meeting shall be early, the square of the time.

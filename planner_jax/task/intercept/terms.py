@@ -144,7 +144,20 @@ def limit_terms(
     )
     squares += _sum_squares(smooth, weights.effort / rate)
     discomfort = jnp.sum(rough**2) / rate
-    return jnp.moveaxis(squares, -1, 0), jnp.maximum(jnp.max(excess), wrong_end), discomfort
+    squares, worst = jnp.moveaxis(squares, -1, 0), jnp.maximum(jnp.max(excess), wrong_end)
+    if limits.jerk is not None:
+        worst = jnp.maximum(worst, jnp.max(jerk_excess(limits.jerk, time, speed)))
+    return squares, worst, discomfort
+
+
+def jerk_excess(limit: Array, time: Array, speed: Array) -> Array:
+    """Return relative excesses (K - 1,) of the jerk at the knots 1 to K - 1 over its limit.
+
+    The speeds (K + 1,) belong to equally spaced knots from time 0 to `time` (), at which the
+    acceleration changes. The jerk is this change divided by the time between two knots.
+    """
+    rate = (speed.shape[0] - 1) / time
+    return jnp.abs(speed[2:] - 2.0 * speed[1:-1] + speed[:-2]) * rate**2 / limit - 1.0
 
 
 def _sum_squares(rows: Array, weight: Array | float) -> Array:

@@ -68,7 +68,7 @@ def enter_units(case: InterceptCase, units: Units) -> InterceptCase:
     gained = jnp.minimum(acceleration, _ABRUPT) * case.time / units.time
     reachable = 1.1 * (jnp.abs(case.speed) / units.speed + gained)
     bound = lambda speed: jnp.minimum(_divide(speed, units.speed), reachable)  # noqa: E731
-    reverse = limits.reverse_speed
+    reverse, jerk = limits.reverse_speed, limits.jerk
     return dataclasses.replace(
         case,
         start=jnp.zeros_like(case.start),
@@ -95,6 +95,7 @@ def enter_units(case: InterceptCase, units: Units) -> InterceptCase:
             curvature=_divide(limits.curvature, 1.0 / units.length),
             steering_rate=_divide(limits.steering_rate, 1.0 / units.time),
             reverse_speed=None if reverse is None else bound(reverse),
+            jerk=None if jerk is None else _divide(jerk, units.acceleration / units.time),
         ),
         region=rotate(case.region, turn) / units.length,
         earliest=case.earliest / units.time,
