@@ -257,6 +257,23 @@ def test_drawn_starting_points_lead_to_plans():
     assert pj.are_solved(plan) and pj.block.judge(case, plan).success
 
 
+@pytest.mark.slow
+def test_a_batch_on_a_gpu_is_solved_where_its_cases_are_one_by_one():
+    straight = Search(straight=12, tries=0)
+    bent = Search(straight=0, tries=4, kept=2, in_turn=False, solver=LevenbergConfig(8, trial=3))
+    planner = dataclasses.replace(SMALL, searches=(straight, bent))
+    cases = pj.block.draw(12, "pole", seed=5)
+    run = jax.jit(lambda attempt, cases: planner.solve_at_once(cases, attempt))
+    for attempt in planner.searches:
+        plans = jax.tree.map(np.array, run(planner.load_attempt(attempt, cases), cases))
+        alone = dataclasses.replace(planner, searches=(attempt,))
+        solved = pj.are_solved(plans)
+        one_by_one = [pj.are_solved(pj.plan(alone, pj.take(cases, k))) for k in range(12)]
+        np.testing.assert_array_equal(solved, one_by_one)
+        verdict: Any = pj.block.judge(cases, plans)
+        assert 2 <= solved.sum() <= 11 and verdict.success[solved].all()
+
+
 def test_brisk_motions_end_before_the_ball_is_there():
     cases = jax.tree.map(np.array, pj.block.draw(8, seed=8))
     cases.ends_at_rest[4] = False

@@ -99,17 +99,22 @@ def continue_search(
 ) -> LevenbergState:
     """Continue to at most `most` steps in total (None: `config.max_steps`); return the state."""
     most = config.max_steps if most is None else most
+    return lax.while_loop(
+        lambda state: is_open(state, config, most),
+        lambda state: _step(evaluate, state, config),
+        state,
+    )
 
-    def is_unfinished(state: LevenbergState) -> Array:
-        is_open = (state.steps < most) & (state.stalled < config.settled)
-        if config.hope is None:
-            return is_open
-        behind = state.steps - config.trial
-        fade = jnp.asarray(config.fade, state.model.cost.dtype)
-        bound = config.hope * lax.pow(fade, jnp.maximum(behind, 0))
-        return is_open & ((behind < 0) | (state.model.cost <= bound))
 
-    return lax.while_loop(is_unfinished, lambda state: _step(evaluate, state, config), state)
+def is_open(state: LevenbergState, config: LevenbergConfig, most: Array | int) -> Array:
+    """Return whether a search goes on, with at most `most` steps in total."""
+    is_open = (state.steps < most) & (state.stalled < config.settled)
+    if config.hope is None:
+        return is_open
+    behind = state.steps - config.trial
+    fade = jnp.asarray(config.fade, state.model.cost.dtype)
+    bound = config.hope * lax.pow(fade, jnp.maximum(behind, 0))
+    return is_open & ((behind < 0) | (state.model.cost <= bound))
 
 
 def _step(

@@ -29,7 +29,6 @@ from planner_jax.core.protocol import (
     is_solved,
     require_settings,
     select,
-    select_first_solved,
     status_of,
 )
 from planner_jax.optimise import levenberg
@@ -52,9 +51,10 @@ if TYPE_CHECKING:
     from planner_jax.task.block.replan import ReplanBlock
 
 _HIGHEST = lax.Precision.HIGHEST
-# Number of starting points that take trial steps before the best of them are refined, and number of
-# starting points that are refined at the same time on a GPU.
-_GROUP, _WIDTH = 4, 2
+# Straight motions are first checked for collisions at `_COARSE` samples, several motions together.
+# Of the motions that pass, at most `_CHECKS` are checked at all samples.
+_COARSE, _CHECKS = 12, 3
+_TURN = 5  # steps of least squares on a GPU before searches that have ended make room for others
 
 
 @with_run_time_numbers("straight", "tries", "first", "kept", "in_turn")
@@ -173,11 +173,10 @@ class OnlineBlock(Planner):
     def load_attempt(self, attempt: Search, cases: BlockCase) -> Search:
         """Return a search whose numbers are arrays, so that all searches use one compiled program.
 
-        For a single case, searches without least squares use a smaller program. It is compiled
-        sooner, so that the first plan comes early.
+        Searches without least squares use a smaller program. It is compiled sooner, so that the
+        first plan comes early.
         """
-        is_small = cases.batch_shape == () and not attempt.tries
-        return place_numbers(StraightSearch(**vars(attempt)) if is_small else attempt)
+        return place_numbers(attempt if attempt.tries else StraightSearch(**vars(attempt)))
 
     def compiles_quickly(self, attempt: Search) -> bool:
         """Return whether a search's program is compiled in less time, though it then runs slower.
@@ -194,10 +193,10 @@ class OnlineBlock(Planner):
         the first solved plan, but with `brisk` it compares all straight motions.
         """
         flight, poses, order = self._rank(case)
-        straight = self._count_straight(flight, poses, attempt)
         if isinstance(attempt, StraightSearch):
-            plan = self._plan_straight(case, flight, poses, order, straight)
+            plan = self._plan_straight(case, flight, poses, order, attempt)
             return dataclasses.replace(plan, status=explain_status(poses, plan.status))
+        straight = self._count_straight(flight, poses, attempt)
         model = lambda point: self.model(point, case, flight)  # noqa: E731
         solver, tries = attempt.solver, jnp.where(flight.comes, attempt.tries, 0)
         kept = jnp.where(attempt.in_turn, 0, jnp.minimum(attempt.kept, tries))
@@ -236,58 +235,135 @@ class OnlineBlock(Planner):
         return dataclasses.replace(plan, status=explain_status(poses, plan.status))
 
     def solve_at_once(self, cases: BlockCase, attempt: Search) -> BlockPlan:
-        """Return the plans of a batch; every case runs the same computations, as for `jax.vmap`."""
-        return jax.vmap(lambda case: self._solve_in_step(case, attempt))(cases)
+        """Return the plans of a batch, on a GPU: the cases take the steps of searches together."""
+        flights, poses, orders = jax.vmap(self._rank)(cases)
+        given = cases, flights, poses, orders
+        best = jax.vmap(lambda case: make_empty_plan(case, self.pieces))(cases)
+        if isinstance(attempt, StraightSearch) or any(s.straight for s in self.searches if s.tries):
+            best = jax.vmap(functools.partial(self._plan_straight, attempt=attempt))(*given)
+        if not isinstance(attempt, StraightSearch):
+            best = self._refine_at_once(*given, best, attempt)
+        return dataclasses.replace(best, status=jax.vmap(explain_status)(poses, best.status))
 
-    def _solve_in_step(self, case: BlockCase, attempt: Search) -> BlockPlan:
-        flight, poses, order = self._rank(case)
-        straight = self._count_straight(flight, poses, attempt)
-        best = self._plan_straight(case, flight, poses, order, straight)
-        is_open = ~is_solved(best.status)
-        model = lambda point: self.model(point, case, flight)  # noqa: E731
-        solver = attempt.solver
+    def _refine_at_once(
+        self,
+        cases: BlockCase,
+        flights: Flight,
+        poses: EndPoses,
+        orders: Array,
+        best: BlockPlan,
+        attempt: Search,
+    ) -> BlockPlan:
+        """Return the plans of a batch by least squares.
 
-        def refine(searches: LevenbergState, most: Array) -> LevenbergState:
-            return jax.vmap(lambda each: continue_search(model, each, solver, most))(searches)
+        Each case has one more search than the `attempt.kept` best ones. In each of the first turns
+        it starts at the next starting point, and takes trial steps. In a later turn, open searches
+        of all cases, one for each case on average, take a few steps.
+        """
+        solver, kept = attempt.solver, max(search.kept for search in self.searches)
+        slots, num, dtype = kept + 1, orders.shape[0], cases.angles.dtype
 
-        def try_group(number: Array, best: BlockPlan) -> BlockPlan:
-            index = _GROUP * number + jnp.arange(_GROUP)
-            encode = functools.partial(self._encode_start, case, poses, order)
-            begin = lambda k: levenberg.start_search(encode(attempt.first + k), solver)  # noqa: E731
+        def advance(search: LevenbergState, most: Array, given: tuple) -> LevenbergState:
+            return continue_search(lambda x: self.model(x, *given), search, solver, most)
 
-            def take_turn(turn: Array, searches: LevenbergState) -> LevenbergState:
-                is_trial = turn < _GROUP // _WIDTH
-                costs = jnp.where(index < attempt.tries, _trial_cost(searches, solver), jnp.inf)
-                chosen = lax.top_k(-costs, _WIDTH)[1]
-                lanes = jnp.where(is_trial, _WIDTH * turn + jnp.arange(_WIDTH), chosen)
-                some = jax.tree.map(lambda leaf: leaf[lanes], searches)
-                later = refine(some, jnp.where(is_trial, solver.trial, solver.max_steps))
-                searches = jax.tree.map(lambda old, new: old.at[lanes].set(new), searches, later)
-                moved = jax.tree.map(lambda old, new: old.at[:_WIDTH].set(new), searches, later)
-                return jax.tree.map(lambda a, b: jnp.where(is_trial, a, b), searches, moved)
+        def find_open(costs: Array, searches: LevenbergState) -> Array:
+            each = jax.vmap(lambda search: levenberg.is_open(search, solver, solver.max_steps))
+            chosen = (jnp.arange(slots) < attempt.kept) & jnp.isfinite(costs)
+            is_open = each(searches).reshape(num, slots) & chosen
+            return (is_open & ~is_solved(best.status)[:, None]).reshape(-1)
 
-            turns = _GROUP // _WIDTH + 1
-            ends = lax.fori_loop(0, turns, take_turn, jax.vmap(begin)(index))
-            ends = jax.tree.map(lambda leaf: leaf[:_WIDTH], ends)
-            plans = jax.vmap(lambda end: self.finish(case, flight, end.point, end.steps))(ends)
-            least = jnp.argmin(jnp.where(jnp.isnan(plans.violation), jnp.inf, plans.violation))
-            return select(jax.tree.map(lambda leaf: leaf[least], plans), best, is_open)
+        def take_turn(state: tuple[Array, Array, LevenbergState]) -> tuple:
+            turn, costs, searches = state
+            is_trial = turn < attempt.tries
+            start = functools.partial(self._encode_start, k=attempt.first + turn)
+            begin = lambda *given: levenberg.start_search(start(*given), solver)  # noqa: E731
+            begun = jax.vmap(begin)(cases, poses, orders)
+            every = jnp.nonzero(find_open(costs, searches), size=num, fill_value=num * slots)[0]
+            lanes = jnp.where(is_trial, slots * jnp.arange(num) + kept, every)
+            some = jax.tree.map(lambda leaf: leaf.at[lanes].get(mode="clip"), searches)
+            some = jax.tree.map(lambda a, b: jnp.where(is_trial, a, b), begun, some)
+            own = jnp.minimum(lanes // slots, num - 1)
+            given = jax.tree.map(lambda leaf: leaf[own], (cases, flights))
+            later = jnp.minimum(some.steps + _TURN, solver.max_steps)
+            some = jax.vmap(advance)(some, jnp.where(is_trial, solver.trial, later), given)
+            searches = jax.tree.map(lambda a, b: a.at[lanes].set(b, mode="drop"), searches, some)
 
-        groups = (attempt.tries + _GROUP - 1) // _GROUP
-        plan = lax.fori_loop(0, groups, try_group, best)
-        return dataclasses.replace(plan, status=explain_status(poses, plan.status))
+            def rank() -> tuple[Array, LevenbergState]:
+                ranked = costs.at[:, kept].set(_trial_cost(some, solver))
+                order = jnp.argsort(ranked, axis=1)
+                flat = (slots * jnp.arange(num)[:, None] + order).reshape(-1)
+                sort = lambda leaf: leaf[flat]  # noqa: E731
+                return jnp.take_along_axis(ranked, order, 1), jax.tree.map(sort, searches)
+
+            return turn + 1, *lax.cond(is_trial, rank, lambda: (costs, searches))
+
+        def goes_on(state: tuple[Array, Array, LevenbergState]) -> Array:
+            turn, costs, searches = state
+            return (turn < attempt.tries) | jnp.any(find_open(costs, searches))
+
+        empty = levenberg.start_search(jnp.zeros(cases.arm.num * self.pieces + 1, dtype), solver)
+        empty = jax.tree.map(lambda x: jnp.broadcast_to(x, (num * slots, *x.shape)), empty)
+        state = jnp.zeros((), jnp.int32), jnp.full((num, slots), jnp.inf, dtype), empty
+        _, costs, ends = lax.while_loop(goes_on, take_turn, state)
+
+        def finish(k: Array, best: BlockPlan) -> BlockPlan:
+            lanes = slots * jnp.arange(num) + k
+            plans = jax.vmap(self.finish)(cases, flights, ends.point[lanes], ends.steps[lanes])
+            return select(plans, best, jnp.isfinite(costs[:, k]) & ~is_solved(best.status))
+
+        return lax.fori_loop(0, jnp.minimum(attempt.kept, kept), finish, best)
 
     def _plan_straight(
-        self, case: BlockCase, flight: Flight, poses: EndPoses, order: Array, num: Array
+        self, case: BlockCase, flight: Flight, poses: EndPoses, order: Array, attempt: Search
     ) -> BlockPlan:
-        def plan_to(k: Array) -> BlockPlan:
-            point = self.encode_straight(case, poses, order[k])
-            return self.finish(case, flight, point, jnp.zeros((), jnp.int32))
+        """Return the best of an attempt's straight motions, by default the first valid one.
 
-        best = make_empty_plan(case, self.pieces)
-        if self.brisk:
-            return lax.fori_loop(0, num, lambda k, best: select(plan_to(k), best), best)
-        return select_first_solved(plan_to, num, best)
+        A few samples of each motion are checked for collisions first. Nearly all motions that pass
+        are valid, so that few motions are checked at all samples.
+        """
+        num = self._count_straight(flight, poses, attempt)
+        shares, coarse = self._shares(), min(_COARSE, self.checked)
+        few = tuple(np.arange(1, coarse + 1) / coarse)
+        block = max(1, len(shares) // coarse)  # number of motions that are checked together first
+        blocks = (num + block - 1) // block
+
+        def sample(k: Array, at: tuple[float, ...]) -> Array:
+            index = order[jnp.minimum(k, len(order) - 1)]
+            moves, initial, _ = self.decode(case, self.encode_straight(case, poses, index))
+            return motion.angles_at(case.angles, initial, moves, at)
+
+        def take_turn(state: tuple[Array, Array, BlockPlan]) -> tuple[Array, Array, BlockPlan]:
+            turn, free, best = state
+            is_coarse, k = turn < blocks, jnp.argmax(free)
+            first = block * jnp.where(is_coarse, turn, 0)
+            several = jax.vmap(lambda k: sample(k, few))(first + jnp.arange(block))
+            several = jnp.resize(several, (len(shares), case.arm.num))
+            angles = jnp.where(is_coarse, several, sample(k, shares))
+            gaps = least_clearances(case.arm, case.scene, angles)
+            least = jnp.min(gaps[: block * coarse].reshape(block, coarse), axis=1)
+            found = (least >= self.margin) & (first + jnp.arange(block) < num)
+            found = lax.dynamic_update_slice(free, found, (first,))
+            point = self.encode_straight(case, poses, order[k])
+            plan = self._plan_of(case, flight, point, jnp.zeros((), jnp.int32), angles, gaps)
+            free = jnp.where(is_coarse, found, free.at[k].set(False))
+            return turn + 1, free, select(plan, best, ~is_coarse)
+
+        def goes_on(state: tuple[Array, Array, BlockPlan]) -> Array:
+            turn, free, best = state
+            stops = False if self.brisk else is_solved(best.status) | (turn >= blocks + _CHECKS)
+            return (turn < blocks) | (jnp.any(free) & jnp.logical_not(stops))
+
+        free = jnp.zeros(block * -(-len(order) // block), bool)
+        start = jnp.zeros((), jnp.int32), free, make_empty_plan(case, self.pieces)
+        return lax.while_loop(goes_on, take_turn, start)[-1]
+
+    def _shares(self) -> tuple[float, ...]:
+        """Return the samples of a motion that are checked, as fractions of the duration.
+
+        They are the start and all samples except the first after it: 96 by default. A GPU runs
+        threads in groups of 32, and takes a third longer for 97 samples.
+        """
+        return (0.0, *(np.arange(min(2, self.checked), self.checked + 1) / self.checked))
 
     def _rank(self, case: BlockCase) -> tuple[Flight, EndPoses, Array]:
         flight = flight_of(case)
@@ -393,13 +469,22 @@ class OnlineBlock(Planner):
 
         Limits are checked at `checked` samples. The plan reports `steps` as its iterations.
         """
+        moves, first, _ = self.decode(case, point)
+        angles = motion.angles_at(case.angles, first, moves, self._shares())
+        gaps = least_clearances(case.arm, case.scene, angles)
+        return self._plan_of(case, flight, point, steps, angles, gaps)
+
+    def _plan_of(
+        self,
+        case: BlockCase,
+        flight: Flight,
+        point: Array,
+        steps: Array,
+        angles: Array,
+        gaps: Array,
+    ) -> BlockPlan:
         moves, first, duration = self.decode(case, point)
         joints = motion.joint_terms(case, moves, first, duration, self.weights, 1.0 - self.slack)
-        # The start and all samples except the first after it are checked: 96 by default. A GPU runs
-        # threads in groups of 32, and takes a third longer for 97 samples.
-        shares = (0.0, *(np.arange(min(2, self.checked), self.checked + 1) / self.checked))
-        angles = motion.angles_at(case.angles, first, moves, shares)
-        gaps = least_clearances(case.arm, case.scene, angles)
         # A joint may exceed its position limit between two knots and turn back: check all samples.
         middle = 0.5 * (case.arm.upper + case.arm.lower)
         half = 0.5 * (case.arm.upper - case.arm.lower)
