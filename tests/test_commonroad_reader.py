@@ -1,6 +1,6 @@
 """Scenarios of CommonRoad become cases of interceptions: roads, traffic, goals, and states."""
 
-import importlib.util
+import importlib
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from matplotlib.path import Path as Area
 
+import planner_jax as pj
 from planner_jax.robot.car import CarPlan
 
 ROOT = Path(__file__).parents[1]
@@ -16,14 +17,15 @@ SCENARIO = ROOT / "tests" / "data" / "commonroad.xml"
 
 
 @pytest.fixture(scope="module")
-def reader():
-    path = ROOT / "benchmarks" / "commonroad_reader" / "commonroad_reader.py"
-    spec = importlib.util.spec_from_file_location("commonroad_reader", path)
-    module = importlib.util.module_from_spec(spec)
+def package():
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(__import__("sys").modules, spec.name, module)
-        spec.loader.exec_module(module)
-        yield module
+        patch.syspath_prepend(ROOT / "benchmarks" / "commonroad_reader")
+        yield [importlib.import_module(f"commonroad_{name}") for name in ("reader", "rows")]
+
+
+@pytest.fixture(scope="module")
+def reader(package):
+    return package[0]
 
 
 @pytest.fixture(scope="module")
@@ -85,7 +87,7 @@ def test_a_goal_has_its_region_and_its_intervals(problems):
     assert arguments["end_heading"] == pytest.approx(0.1)
     assert arguments["heading_tolerance"] == pytest.approx(0.2, rel=0.03)
     assert arguments["end_speed"] == (2.0, 9.0)
-    np.testing.assert_allclose(problem.middle, [36.0, 1.5])
+    np.testing.assert_allclose(arguments["target"].pos, [36.0, 1.5])
     corner = [3.0 * np.cos(0.1) - np.sin(0.1), 3.0 * np.sin(0.1) + np.cos(0.1)]
     assert np.abs(arguments["region"] - corner).sum(axis=1).min() < 0.1
 
@@ -93,7 +95,9 @@ def test_a_goal_has_its_region_and_its_intervals(problems):
 def test_a_goal_lanelet_is_divided_into_convex_goals_that_lie_inside_it(problems):
     parts = [each for each in problems if each.arguments["time"] == 6.0]
     assert len(parts) > 1 and all(each.arguments["heading_tolerance"] > 3.1 for each in parts)
-    corners = np.concatenate([each.middle + each.arguments["region"] for each in parts])
+    corners = np.concatenate(
+        [np.asarray(each.arguments["target"].pos) + each.arguments["region"] for each in parts]
+    )
     radii = np.linalg.norm(corners - [40.0, 10.0], axis=1)
     assert 9.8 < radii.min() < 10.5 and 13.0 < radii.max() < 13.6
 
@@ -107,7 +111,7 @@ def test_the_body_of_the_car_starts_in_the_middle_that_the_file_states(reader, p
     assert arguments["start"][0] + front == pytest.approx(5.0 + 0.5 * reader.CAR["length"])
 
 
-def test_the_states_of_a_plan_are_the_middles_of_the_body_at_the_time_steps(problems):
+def test_the_states_of_a_plan_are_the_middles_of_the_body_at_the_time_steps(package, problems):
     knots = 9
     plan = CarPlan(
         cost=jnp.zeros(()),
@@ -120,7 +124,7 @@ def test_the_states_of_a_plan_are_the_middles_of_the_body_at_the_time_steps(prob
         curvature=jnp.full(knots, 0.0),
         origin=jnp.zeros(2),
     )
-    row = problems[0].row(plan)
+    row = package[1].row_of(problems[0], plan)
     assert (row["file"], row["problem"]) == ("commonroad.xml", 7)
     expected = [[5.0 + 4.0 * k, -1.75, 0.0, 8.0, 0.0] for k in range(9)]  # every 0.5 s
     np.testing.assert_allclose(row["states"], expected, atol=1e-4)
@@ -130,3 +134,15 @@ def test_the_car_does_not_start_in_a_wall(problems):
     walls = problems[0].arguments["walls"]
     body = [5.0, -1.75] + np.array([[-2.25, -0.8], [2.25, -0.8], [2.25, 0.8], [-2.25, 0.8]])
     assert not any(Area(body).intersects_path(Area(wall), filled=True) for wall in walls)
+
+
+def test_cases_of_a_batch_have_equal_shapes(reader, tmp_path, monkeypatch):
+    text = SCENARIO.read_text()
+    (tmp_path / "a.xml").write_text(text)
+    kept = text[: text.index('<dynamicObstacle id="12"')] + text[text.index("<planningProblem") :]
+    (tmp_path / "b.xml").write_text(kept)
+    monkeypatch.setenv("COMMONROAD", str(tmp_path))
+    cases = reader.draw(2, 0, 0)
+    pj.require_sound(cases)
+    assert cases.batch_shape == (2,)
+    assert sorted(np.asarray(cases.movers.present).sum(axis=1)) == [2, 3]  # one is 1 km away

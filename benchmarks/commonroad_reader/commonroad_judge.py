@@ -6,8 +6,8 @@ This program imports nothing of planner-jax. Run it in a virtual environment of 
 
     pip install 'commonroad-io<2026' commonroad-drivability-checker triangle
 
-FOLDER holds the scenarios. PLANS.json is a list of results of `commonroad_reader.Problem.row`, one
-for each plan: the `file` of the scenario, the number `problem` of the planning problem, and
+FOLDER holds the scenarios. PLANS.json is a list of results of `commonroad_rows.row_of`, one for
+each plan: the `file` of the scenario, the number `problem` of the planning problem, and
 `states`, one for each time step from the initial state on. A state has the position x, y of the
 body's middle [m], the heading [rad], the speed [m/s], and the steering angle [rad]. The vehicle is
 the kinematic single-track model with the numbers of a BMW 320i.

@@ -10,9 +10,23 @@ import argparse
 import json
 from pathlib import Path
 
-from commonroad_reader import read
+import numpy as np
+from commonroad_reader import AHEAD, CAR, Problem, read
 
 import planner_jax as pj
+from planner_jax.robot.car import CarPlan
+
+
+def row_of(problem: Problem, plan: CarPlan) -> dict[str, object]:
+    """Return a plan's states at the scenario's time steps, for `commonroad_judge.py`.
+
+    A state is x, y of the body's middle [m], heading [rad], speed [m/s], steering angle [rad].
+    """
+    at = plan.sample(1.0 / problem.step)
+    pos = at.pos + AHEAD * np.stack([np.cos(at.heading), np.sin(at.heading)], axis=1)
+    steering = np.arctan(CAR["wheelbase"] * at.curvature)
+    states = np.column_stack([pos, at.heading, at.speed, steering]).tolist()
+    return {"file": problem.file, "problem": problem.number, "states": states}
 
 
 def main() -> None:
@@ -37,7 +51,7 @@ def main() -> None:
         else:
             parser.error(f"{file} must have a planning problem")
         verdict = pj.intercept.judge(case, plan)
-        rows.append(problem.row(plan))
+        rows.append(row_of(problem, plan))
         accepted += bool(verdict.success)
         status = pj.Status(int(plan.status)).name
         print(f"{file.stem:26} {status:12} goals {tried}: {verdict.sentence()}")
