@@ -83,12 +83,12 @@ def explain(
 
     The reason is NON_FINITE if a number of the case is NaN. Else it is BLOCKED if the car overlaps
     an obstacle or is off the map at the start, or if the meeting time is fixed and the target is
-    then too close to an obstacle or off the map. Else it is TOO_FAR if the meeting time is fixed
-    and the car cannot drive so far by then. Else it is the status `reason` () int32. `is_time_free`
+    then too close to an obstacle or off the map. Else it is TOO_FAR if the car cannot drive far
+    enough until any allowed meeting time. Else it is the status `reason` () int32. `is_time_free`
     is true if the planner may choose an earlier meeting time than the time of the case.
     """
-    if not is_time_free:
-        reason = jnp.where(terms.is_too_far(case), Status.TOO_FAR, reason)
+    is_too_far = terms.is_too_far(case, is_time_free=is_time_free)
+    reason = jnp.where(is_too_far, Status.TOO_FAR, reason)
     is_start_blocked, is_goal_blocked = terms.is_blocked(case)
     blocked = is_start_blocked if is_time_free else is_start_blocked | is_goal_blocked
     reason = jnp.where(blocked, Status.BLOCKED, reason)
