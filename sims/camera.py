@@ -29,7 +29,6 @@ from planner_jax.sims.segment import BallThresholds, Sighting, noisy_depth, sigh
 from planner_jax.task.block.scene import Scene
 
 _ARM = importlib.resources.files("planner_jax.robot") / "models" / "irb1600.xml"
-_POLE_TOP = 2.52  # [m], height of the pole's top in the base frame, 3 m above the floor
 _WALLS, _HIGH = 13.0, 6.0  # [m], distance of the walls from the arm, and height of the walls
 _NEAR, _FAR = 0.1, 40.0  # [m], clipping distances of the renderer
 _BALL, _POLE, _STEEL, _ARM_COLOUR, _WALL = "#FF7A0A", "#E59BC0", "#A7AFB5", "#D9D9D4", "#9AA7B4"
@@ -217,9 +216,11 @@ def _scene_model(arm_xml: str, camera: Camera, scene: Scene, ball_radius: float)
             middle, half = [0.0, 0.0, floor + 0.5 * _HIGH], [_WALLS, _WALLS, 0.5 * _HIGH]
             middle[axis], half[axis] = side, 0.05
             add("box", _WALL, pos=middle, size=half)
-    if bool(scene.has_pole):
-        middle, half = 0.5 * (_POLE_TOP + floor), 0.5 * (_POLE_TOP - floor)
-        add("cylinder", _POLE, pos=[*scene.pole, middle], size=[scene.pole_radius, half])
+    for ends, radius in zip(
+        np.asarray(scene.capsule_ends), np.asarray(scene.capsule_radius), strict=True
+    ):
+        if radius >= 0.0:
+            add("cylinder", _POLE, fromto=ends.reshape(-1), size=[radius])
     for ends, radius in zip(
         np.asarray(scene.beam_ends), np.asarray(scene.beam_radius), strict=True
     ):

@@ -39,7 +39,7 @@ def library(pieces=6, has_pole=True):
     num = (1, LAYOUT.num_pairs)
     vectors = (np.broadcast_to(each, (*num, 3)) for each in np.eye(3))
     row: Any = Row(steps[None], np.full(num, 0.9), *vectors)  # type: ignore[arg-type]
-    given = setting(has_pole=np.asarray(has_pole))
+    given = setting(capsule_radius=paper_scene(has_pole=has_pole).capsule_radius)
     return library_of(pack_rows(row), irb1600().home[None], LAYOUT, given)
 
 

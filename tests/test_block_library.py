@@ -55,7 +55,7 @@ def tunnels_of(layout):
 def ball_through(outer, inner, speed=8.0, before=0.6):
     outer, inner = np.asarray(outer), np.asarray(inner)
     span = np.linalg.norm(inner - outer) / speed
-    vel = (inner - outer) / span + (0.0, 0.0, 0.5 * GRAVITY * span)
+    vel = (inner - outer) / span + np.array([0.0, 0.0, 0.5 * GRAVITY * span])
     away = np.array([0.0, 0.0, -0.5 * GRAVITY * before**2])
     return outer - vel * before + away, vel + np.array([0.0, 0.0, GRAVITY * before])
 
@@ -64,7 +64,7 @@ def ball_through(outer, inner, speed=8.0, before=0.6):
 def test_a_point_of_a_cell_is_in_that_cell(name):
     layout, scene, tunnel = LAYOUTS[name], paper_scene(), tunnels_of(LAYOUTS[name])
     rng = np.random.default_rng(0)
-    behind: Any = Box(np.array([3.0, 0.0, 0.0]), np.array([4.0, 1.0, 1.0]))
+    behind: Any = Box(jnp.array([3.0, 0.0, 0.0]), jnp.array([4.0, 1.0, 1.0]))
     whole = tunnels(dataclasses.replace(layout, inner=(Face(0, -1, (1, 1)),)), behind, scene.outer)
     sides = (
         (layout.inner, scene.inner, tunnel.inner[: layout.num_inner]),
@@ -113,13 +113,13 @@ def test_tunnels_are_cut_off_where_no_ball_can_come_from():
 def test_a_shield_as_large_as_the_farthest_crossing_blocks_the_tunnel():
     rng, tunnel = np.random.default_rng(1), tunnels_of(LAYOUTS["D"])
     pair = rng.choice(np.flatnonzero(tunnel.is_centred))
-    outer, inner = tunnel.outer[pair], tunnel.inner[pair]
+    outer, inner = jnp.asarray(tunnel.outer[pair]), jnp.asarray(tunnel.inner[pair])
     ball, span = cells.nominal_ball(outer, inner)
     there = drag_free_flight(ball, 0.5 * span, jnp.asarray(GRAVITY))
     normal = -there.vel / np.linalg.norm(there.vel)
     side = np.cross(normal, (0.0, 0.0, 1.0))
     side /= np.linalg.norm(side)
-    rotation = np.stack([normal, side, np.cross(normal, side)], axis=1)
+    rotation = jnp.stack([normal, side, jnp.cross(normal, side)], axis=1)
     far = float(cells.farthest_crossing(outer, inner, there.pos, rotation))
     begin, end = (
         corners[0] + rng.uniform(size=(20000, 3)).round() * (corners[1] - corners[0])
@@ -167,7 +167,9 @@ def test_one_ball_gets_the_answer_of_a_batch():
         assert (found.pair, found.stored) == (many.pair[k], True)
         np.testing.assert_array_equal(found.row.steps, many.row.steps[k])
         np.testing.assert_allclose(found.time, many.time[k], rtol=1e-6)
-        np.testing.assert_allclose(found.beside, [each[k] for each in many.beside], atol=1e-5)
+        np.testing.assert_allclose(
+            np.array(found.beside), [each[k] for each in many.beside], atol=1e-5
+        )
     missed = int(np.flatnonzero(~np.asarray(many.stored))[0])
     assert not one.answer(cases.ball.pos[missed], cases.ball.vel[missed]).stored
 
@@ -255,8 +257,8 @@ def test_damaged_files_are_rejected_in_one_line(tmp_path, monkeypatch):
     rejects(f"^library must be a whole file of {len(whole)} bytes, got {len(whole) - 1} in")
     path.write_bytes(whole[:100])
     rejects("is cut off$")
-    path.write_bytes(whole.replace(b"library 1\n", b"library 9\n", 1))
-    rejects("^library must be of version 1, got version 9 in")
+    path.write_bytes(whole.replace(b"library 2\n", b"library 9\n", 1))
+    rejects("^library must be of version 2, got version 9 in")
     at = whole.index(np.float32(0.806).tobytes())  # byte position of the pole's x coordinate
     path.write_bytes(whole[:at] + np.float32(0.7).tobytes() + whole[at + 4 :])
     rejects("^library must have the setting [0-9a-f]{12}, got [0-9a-f]{12} in")
@@ -331,7 +333,7 @@ def test_a_repair_plans_only_motions_that_collide(counted, monkeypatch):
     library = library_of(rows, library.table.homes, LAYOUTS["A"], library.setting)
     stored = property(lambda self: np.isfinite(self.table.rows[..., 6 * PIECES]))
     monkeypatch.setattr(type(library), "found", stored)
-    scene = dataclasses.replace(paper_scene(), pole=np.array([0.806, -0.1], np.float32))
+    scene = paper_scene(pole=(0.806, -0.1))
     fixed, touched = building.repair(library, scene, progress=False)
     np.testing.assert_array_equal(touched[0], hit)
     np.testing.assert_array_equal(np.sort(np.concatenate(counted)), pairs[hit])
@@ -356,9 +358,8 @@ def test_a_home_in_collision_is_rejected(tmp_path):
     home[1] = 1.9
     with pytest.raises(ValueError, match="^homes must be free, got -.* m to .* at home 0$"):
         building.build(tmp_path / "a", setting(), home, TINY)
-    pole: Any = np.array([0.806, 0.1], np.float32)  # The forearm is there at home.
     with pytest.raises(ValueError, match="^homes must be free"):
-        building.repair(make_library(), dataclasses.replace(paper_scene(), pole=pole))
+        building.repair(make_library(), paper_scene(pole=(0.806, 0.1)))  # at the forearm
 
 
 @pytest.mark.parametrize(
@@ -418,7 +419,7 @@ def test_the_referee_confirms_a_built_library(regime, starts, tmp_path, monkeypa
     plans = pj.plan(planner, found.cases)
     np.testing.assert_array_equal(pj.are_solved(plans), found.claimed)
     shifted: Any = np.array([0.8926, 0.05], np.float32)
-    scene = dataclasses.replace(paper_scene(), pole=shifted)
+    scene = paper_scene(pole=shifted)
     fixed, touched = building.repair(library, scene, progress=False)
     same = ~touched & library.found
     assert touched.any() and same.any()

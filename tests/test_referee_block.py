@@ -1,6 +1,7 @@
 """The referee of blocks, an independent check of plans, on motions in closed form."""
 
 import functools
+from typing import Any
 from unittest.mock import Mock
 
 import jax
@@ -11,10 +12,12 @@ from scipy.optimize import least_squares, lsq_linear
 from scipy.spatial.transform import Rotation
 
 from planner_jax.referee import block, solids
+from planner_jax.referee.arm_clearance import KINDS
 from planner_jax.referee.block import LIMITS, BlockVerdict, referee_blocks, times_inside
 from planner_jax.robot.arm import REGIMES, shield_pose
 from planner_jax.robot.arm_file import irb1600
 from planner_jax.task.block.case import case
+from planner_jax.task.block.scene import ABSENT, make_scene
 
 GRAVITY, DELAY, SPAN = 9.81, 0.1, 0.9
 CONTACT_TIME = DELAY + SPAN
@@ -23,6 +26,7 @@ INCOMING = np.array([-7.0, -0.3, -3.0])  # velocity of the ball there
 PIECES = (0.3, 0.6)
 ARM = jax.tree.map(lambda leaf: np.asarray(leaf, float), irb1600())
 HOME, THICKNESS = ARM.home, 0.01
+BOX = (0.1, 0.1, 0.1), (1.0, 0.0, 0.0, 0.0)  # edges [m] and rotation of a box
 COEFFS, DURATIONS = "plan.motion.coeffs", "plan.motion.durations"
 # Coefficients of polynomials from 0 to 1 in time / duration: with standstill at both ends, and with
 # standstill at the start only.
@@ -193,7 +197,7 @@ FAILURES = {
 }
 NEARER = {
     "floor": ("scene.floor", ...),
-    "pole": ("scene.pole_radius", ...),
+    "obstacle": ("scene.capsule_radius", ...),
     "rig": ("scene.beam_radius", ...),
     "base": ("arm.base_box", (0, 1, 2)),  # its top: link 2 is above it
 }
@@ -216,30 +220,30 @@ def test_an_obstacle_moved_beyond_its_clearance_is_hit_by_the_difference(kind):
     verdict = assert_limit(leaves, kind)
     assert getattr(verdict, f"{kind}_clearance")[0] == pytest.approx(-0.02)
     part, excess = verdict.failed_part[0], verdict.failed_excess[0]
-    assert f"{part} is {excess:.3g} m " in verdict.sentence(0)
+    verb = "are" if " and " in part else "is"
+    assert f"{part} {verb} {excess:.3g} m " in verdict.sentence(0)
     assert excess == pytest.approx(0.02) or verdict.failed_time[0] == pytest.approx(DELAY)
 
 
 def test_an_arm_that_starts_in_the_pole_fails_at_its_start_although_it_gets_deeper_later():
     poles = [np.mean([links(HOME)[k][1][:2] for k in (3, 4)], axis=0), CONTACT[:2]]
     leaves = stack(good(), good())
-    leaves["scene.pole"][:] = poles
-    verdict, stays = judge(leaves), judge(still(HOME) | {"scene.pole": leaves["scene.pole"][:1]})
-    np.testing.assert_array_equal(verdict.failed_limit, "pole")
+    leaves["scene.capsule_ends"][:, 0, :, :2] = np.array(poles)[:, None]
+    start = {"scene.capsule_ends": leaves["scene.capsule_ends"][:1]}
+    verdict, stays = judge(leaves), judge(still(HOME) | start)
+    np.testing.assert_array_equal(verdict.failed_limit, "obstacle")
     assert verdict.failed_time[0] == pytest.approx(DELAY) and verdict.failed_time[1] > 2.0 * DELAY
-    assert verdict.failed_excess[0] == pytest.approx(-stays.pole_clearance[0])
-    assert verdict.failed_excess[0] < -verdict.pole_clearance[0]
-    assert verdict.failed_excess[1] == -verdict.pole_clearance[1]
+    assert verdict.failed_excess[0] == pytest.approx(-stays.obstacle_clearance[0])
+    assert verdict.failed_excess[0] < -verdict.obstacle_clearance[0]
+    assert verdict.failed_excess[1] == -verdict.obstacle_clearance[1]
 
 
 def test_an_absent_pole_and_absent_beams_are_ignored():
     leaves = good()
-    leaves["scene.pole"][:] = CONTACT[:2]
-    assert_fails(leaves, "pole", part="link 4")
-    leaves["scene.has_pole"][:] = False
-    assert np.isposinf(assert_good(leaves).pole_clearance[0])
-    leaves["scene.pole"][:], leaves["scene.pole_radius"][:] = np.nan, np.inf
-    assert_good(leaves)
+    leaves["scene.capsule_ends"][..., :2] = CONTACT[:2]
+    assert_fails(leaves, "obstacle", part="link 4 and capsule 1")
+    leaves["scene.capsule_radius"][:] = ABSENT
+    assert np.isposinf(assert_good(leaves).obstacle_clearance[0])
     leaves |= {name: leaves[name][:, :0] for name in ("scene.beam_ends", "scene.beam_radius")}
     assert np.isposinf(assert_good(leaves).rig_clearance[0])
 
@@ -322,7 +326,7 @@ def test_the_least_clearance_is_that_of_a_pose_among_close_samples(monkeypatch, 
     steps = np.linalg.norm(np.diff(sampled_angles), axis=0)
     assert steps.max() <= block.LARGEST_TURN and len(steps) >= sum(durations) / block.LONGEST_STEP
     np.testing.assert_allclose(sampled_angles[:, [0, -1]].T, [HOME, GOAL], atol=1e-12)
-    for kind in ("floor", "pole", "rig", "base", "self"):
+    for kind in KINDS:
         least, found = (getattr(x, f"{kind}_clearance").min() for x in (judge_poses(), verdict))
         assert 0.0 <= least - found + 1e-12 < 1e-4
 
@@ -344,7 +348,7 @@ def solids_of(angles):
     for k, link in enumerate(ARM.capsule_link):
         rotation, place = frames[link]
         ends = place + ARM.capsule_ends[k] @ rotation.T
-        found.append((link, *segment(*ends, ARM.capsule_radius[k])))
+        found.append((link, *segment(ends[0], ends[1], ARM.capsule_radius[k])))
     rotation, middle = shield(angles)
     half = np.array([0.5 * THICKNESS, *ARM.shield_half])
     plate = (6, middle - 0.5 * THICKNESS * rotation[:, 0], list(half[:, None] * rotation.T), 0.0)
@@ -352,11 +356,12 @@ def solids_of(angles):
 
 
 def brute_clearances(angles, scene):
-    """Return the arm's least distances [m] from floor, pole, rig, base and itself, by name."""
+    """Return the arm's least distances [m] from floor, obstacle, rig, base and itself, by name."""
     arm = solids_of(angles)
-    pole = (np.array([*scene.pole[0], 0.0]), [np.array([0.0, 0.0, 5.0])], scene.pole_radius[0])
+    first, second = scene.capsule_ends[0, 0]
+    pole = segment(first, second, scene.capsule_radius[0, 0])
     rods = zip(scene.beam_ends[0], scene.beam_radius[0], strict=True)
-    beams = [segment(*ends, radius) for ends, radius in rods]
+    beams = [segment(ends[0], ends[1], radius) for ends, radius in rods]
     low, high = ARM.base_box
     base = (0.5 * (low + high), list(0.5 * np.diag(high - low)), 0.0)
     wrist, plate = solids_of(np.zeros(6))[5], solids_of(np.zeros(6))[8]
@@ -365,7 +370,7 @@ def brute_clearances(angles, scene):
         "floor": [
             m[2] - np.abs(np.array(s)[:, 2]).sum() - r - scene.floor[0] for _, m, s, r in arm
         ],
-        "pole": [gap(solid, pole) for _, *solid in arm],
+        "obstacle": [gap(solid, pole) for _, *solid in arm],
         "rig": [gap(solid, beam) for _, *solid in arm for beam in beams],
         "base": [gap(solid, base) for link, *solid in arm if link > 0],
         "self": [gap(a, b) for i, *a in arm if i == 0 for j, *b in arm if j > 1],
@@ -389,7 +394,7 @@ def test_clearances_are_those_of_a_solver():
         for kind, least in brute_clearances(pose, scene).items():
             assert getattr(verdict, f"{kind}_clearance")[k] == pytest.approx(least, abs=1e-8)
             touched |= {kind} if least < 0.0 else set()
-    assert touched == {"floor", "pole", "rig", "base", "self"}
+    assert touched == {*KINDS}
 
 
 def test_a_straight_wrist_does_not_touch_its_shield_and_a_folded_one_does():
@@ -445,6 +450,57 @@ def test_overlapping_boxes_are_as_deep_as_the_shortest_way_out():
     assert found == pytest.approx(-(0.1 + np.sqrt(0.5) * 0.3))
 
 
+def nearest_pair(one, other, num=2000):
+    """Return the least distance of two convex sets, given the projections onto them."""
+    point = before = np.zeros(3)
+    for _ in range(num):  # alternating projections
+        point, before = one(other(point)), point
+    return np.linalg.norm(point - other(point)), np.linalg.norm(point - before)
+
+
+def test_distances_from_a_cylinder_are_the_least_over_all_points():
+    rng, tried = np.random.default_rng(2), 0
+    for _ in range(16):
+        first, second, middle = rng.normal(size=(3, 3))
+        turn, half = Rotation.from_rotvec(rng.normal(size=3)).as_matrix(), rng.uniform(0.1, 0.4, 2)
+        length, radius = np.linalg.norm(second - first), rng.uniform(0.05, 0.3)
+        axis = (second - first) / length
+
+        def onto_cylinder(point, first=first, axis=axis, length=length, radius=radius):
+            along = np.clip((point - first) @ axis, 0.0, length)
+            across = point - first - ((point - first) @ axis) * axis
+            return first + along * axis + across * min(1.0, radius / np.linalg.norm(across))
+
+        def onto_plate(point, middle=middle, turn=turn, half=half):
+            inside = (point - middle) @ turn[:, 1:]
+            return middle + turn[:, 1:] @ np.clip(inside, -half, half)
+
+        least, moved = nearest_pair(onto_cylinder, onto_plate)
+        cylinder = first[:, None], second[:, None], np.array([radius])
+        edges = (turn[:, 1:] * half)[..., None]
+        found = solids.rectangle_to_cylinder(middle[:, None], edges, *cylinder)[0]
+        if moved < 1e-10:
+            assert found == pytest.approx(least, abs=1e-6)
+            tried += 1
+        edge = middle + edges[:, 0, 0] - edges[:, 1, 0], middle + edges[:, 0, 0] + edges[:, 1, 0]
+        side = solids.segment_to_cylinder(edge[0][:, None], edge[1][:, None], *cylinder)[0]
+        shares = np.linspace(edge[0], edge[1], 2000)
+        away = [np.linalg.norm(point - onto_cylinder(point)) for point in shares]
+        assert min(away) - 1e-3 < side <= min(away) + 1e-12 and found <= side + 1e-12
+    assert tried > 8
+
+
+def test_every_kind_of_obstacle_is_hit_and_named():
+    boxes = [((0.0, 2.0, 1.0), (0.2, 0.2, 0.2), (1.0, 0.0, 0.0, 0.0)), (CONTACT, *BOX)]
+    rods = [([(2.0, 0.0, 0.0), (2.0, 0.0, 1.0)], 0.1), ([CONTACT - 0.1, CONTACT + 0.1], 0.05)]
+    given: dict[str, Any] = {"boxes": boxes, "capsules": rods, "cylinders": rods}
+    for kind, some in given.items():
+        scene, name = make_scene(**{kind: some}), kind.removesuffix("s").replace("boxe", "box")
+        verdict = assert_limit(good(scene=scene), "obstacle")
+        assert verdict.failed_part[0].endswith(f" and {name} 2")
+    assert_good(good(scene=make_scene(boxes=boxes[:1], capsules=rods[:1], cylinders=rods[:1])))
+
+
 def unequal_lanes():
     failed = [FAILURES[key][0] for key in ("tilt: by TURN", "time: an hour", "self: wrist")]
     return [good(), *failed, good(durations=(0.05, 0.06)), good(durations=(0.1, 0.3)), good()]
@@ -454,14 +510,17 @@ FAILED = ["", "tilt", "time", "self", "velocity", "velocity", ""]
 # For dynamics, the home pose, and the arm's own limits, which a case can replace.
 UNREAD = {"arm.home", "arm.mass", "arm.centre", "arm.inertia"}
 UNREAD |= {"arm.limits.velocity", "arm.limits.acceleration"}
-# A case of a block has no boxes and no cylinders.
+# The usual scene has no boxes and no cylinders.
 UNREAD |= {f"scene.box_{name}" for name in ("half", "middle", "turn")}
 UNREAD |= {"scene.cylinder_ends", "scene.cylinder_radius"}
-UNKNOWN = ("miss", "pole_clearance")
+UNKNOWN = ("miss", "obstacle_clearance")
 PLANNED = (COEFFS, DURATIONS, "plan.contact_time")
-ABSURD, HARMLESS = ("ball.pos", "angles", "arm.origin", "scene.pole", *PLANNED), "scene.pole"
+ABSURD, HARMLESS = (
+    ("ball.pos", "angles", "arm.origin", "scene.capsule_ends", *PLANNED),
+    "scene.capsule_ends",
+)
 READ = {name for name, leaf in good().items() if leaf.dtype == float} - UNREAD
-READ |= {"scene.has_pole", "ends_at_rest"}
+READ |= {"ends_at_rest"}
 WRONG = [
     ({}, {"capsule_link": (6,) * 8}, "arm.capsule_link must be in -1, ..., 5"),
     ({COEFFS: np.zeros((1, 2, 6, 5))}, {}, r"coeffs must be \(B, M, D \+ 1, 6\), got"),

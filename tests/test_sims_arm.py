@@ -191,7 +191,7 @@ def test_an_arm_that_runs_into_the_pole_does_not_succeed():
     vel = -8.0 * turn[:, 0]
     found = score_standstill(pj.block.case([middle - 0.5 * vel], [vel], gravity=1e-6), ahead)
     assert found.blocked.all() and found.touched.all() and not found.success.any()
-    assert found.nearest[0].endswith(", pole") and found.clearance[0] < -0.01
+    assert found.nearest[0].endswith(" and capsule 1, obstacle") and found.clearance[0] < -0.01
 
 
 def test_clearances_of_an_exact_execution_equal_the_clearances_of_the_referee():
@@ -238,8 +238,10 @@ def test_arms_that_observe_their_balls_execute_the_motions_they_decided():
     sights = [see(cases.cases, eye(std=std), 0.1) for std in (0.02, 1e-5)]
     decided = Decided(
         cases=jax.tree.map(jnp.asarray, cases.cases),
-        **{"plans": plan, "fits": batch(*[sight.fits for sight in sights])},
-        **{"start": jnp.zeros(LANES), "motions": 2 + jnp.arange(LANES)},
+        plans=plan,
+        fits=batch(*[sight.fits for sight in sights]),
+        start=jnp.zeros(LANES),
+        motions=2 + jnp.arange(LANES),
     )
     found = fly_blocks(BLOCK_WORLD, cases, decided=decided, planning_budget=0.05)
     known = fly_blocks(BLOCK_WORLD, cases, plan=plan, planning_budget=0.05)
@@ -334,7 +336,8 @@ def test_flights_take_a_library_of_their_limits_and_scene_alone(tmp_path):
     path = tmp_path / "a.lib"
     save_library(path, make_library(regime="R1"))
     assert BlockFly(planner=f"library:{path}", regime="R1").flight().settings.regime == "R1"
-    for options in ({"regime": "R2"}, {"regime": "R1", "suite": "open"}):
+    others: list[Any] = [{"regime": "R2"}, {"regime": "R1", "suite": "open"}]
+    for options in others:
         with pytest.raises(ArgumentError, match="^library must be of the cases' arm, limits and"):
             BlockFly(planner=f"library:{path}", **options).flight()
     path.write_bytes(path.read_bytes()[:2000])

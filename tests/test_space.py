@@ -1,4 +1,4 @@
-"""Distances of segments, rectangles, boxes and vertical lines in space."""
+"""Distances of segments, rectangles and boxes in space."""
 
 import functools
 
@@ -16,8 +16,6 @@ DISTANCES = {
     "segments": space.segment_to_segment,
     "rectangle": space.segment_to_rectangle,
     "box": space.segment_to_box,
-    "line": space.segment_to_vertical_line,
-    "rectangle to line": space.rectangle_to_vertical_line,
 }
 every_distance = pytest.mark.parametrize("name", DISTANCES)
 
@@ -29,14 +27,8 @@ def gap_of(name, bodies):
     if name == "rectangle":
         (a, a_end), middle, (e, f) = bodies
         return a - middle - e - f, [a_end - a, 2.0 * e, 2.0 * f]
-    if name == "box":
-        (a, a_end), lower, upper = bodies
-        return a - lower, [a_end - a, *np.diag(lower - upper)]
-    if name == "line":
-        (a, a_end), place = bodies
-        return (a[:2] - place), [(a_end - a)[:2]]
-    middle, (e, f), place = bodies
-    return (middle - e - f)[:2] - place, [2.0 * e[:2], 2.0 * f[:2]]
+    (a, a_end), lower, upper = bodies
+    return a - lower, [a_end - a, *np.diag(lower - upper)]
 
 
 def least_distances(name, bodies):
@@ -76,8 +68,6 @@ def pairs(name, kind, seed=0):
         "segments": (ends, other),
         "rectangle": (ends, middle, edges),
         "box": (ends, -upper, upper),
-        "line": (ends, place),
-        "rectangle to line": (middle, edges, place),
     }[name]
     return tuple(np.asarray(body, np.float32) for body in bodies)
 
@@ -121,7 +111,7 @@ def test_a_gradient_matches_finite_differences(name, float64):
     assert_gradient_matches_differences(total, smooth_pairs(name), step=1e-7, rtol=1e-6)
 
 
-@pytest.mark.parametrize("name", ["segments", "rectangle", "box", "line"])
+@pytest.mark.parametrize("name", ["segments", "rectangle", "box"])
 def test_a_second_derivative_includes_the_motion_of_the_nearest_points(name, float64):
     ends, *others = smooth_pairs(name)
     direction = np.random.default_rng(1).normal(size=ends.shape)
@@ -141,8 +131,7 @@ def test_an_approach_gives_the_derivative_by_a_rotation_and_a_translation(name, 
         distance, first, others = space.lowest_of_rectangle, smooth_pairs("rectangle")[1:], ()
     else:
         distance, bodies = DISTANCES[name], smooth_pairs(name)
-        num = 1 + (name == "rectangle to line")
-        first, others = bodies[:num], bodies[num:]
+        first, others = bodies[:1], bodies[1:]
 
     def slopes(first, others):
         def at(twist):
@@ -164,7 +153,7 @@ def test_an_approach_gives_the_derivative_by_a_rotation_and_a_translation(name, 
     assert np.abs(found[:, :3]).max() > 0.1
 
 
-@pytest.mark.parametrize("name", ["rectangle", "box", "rectangle to line"])
+@pytest.mark.parametrize("name", ["rectangle", "box"])
 def test_crossing_bodies_have_exactly_zero_distance_and_gradient(name):
     bodies = pairs(name, "any")
     crosses = least_distances(name, bodies) < 1e-7
@@ -181,20 +170,6 @@ def test_a_segment_nearly_along_an_edge_of_a_box_is_exact_in_float32_too():
     upper = np.broadcast_to(np.asarray([0.6, 0.3, 0.1], np.float32), (1000, 3))
     bodies = (ends.astype(np.float32), -upper, upper)
     np.testing.assert_allclose(distances("box", bodies), least_distances("box", bodies), atol=5e-7)
-
-
-def test_an_upright_rectangle_does_not_reach_a_line_beyond_its_end():
-    rng = np.random.default_rng(0)
-    angle, roll = rng.uniform(0.0, 6.0, 1000), rng.uniform(0.0, 1.5, (1000, 1))
-    along = np.stack([np.cos(angle), np.sin(angle), np.zeros(1000)], axis=1)
-    e = np.cos(roll) * along + np.sin(roll) * [0.0, 0.0, 1.0]
-    f = np.cos(roll) * [0.0, 0.0, 1.0] - np.sin(roll) * along
-    half = 0.15 * np.ravel(np.cos(roll) + np.sin(roll))
-    beyond = rng.uniform(-0.1, 0.5, 1000)
-    place = (half + beyond)[:, None] * along[:, :2]
-    bodies = (np.zeros((1000, 3)), 0.15 * np.stack([e, f], axis=1), place)
-    found = distances("rectangle to line", [body.astype(np.float32) for body in bodies])
-    np.testing.assert_allclose(found, np.maximum(beyond, 0.0), atol=1e-6)
 
 
 def test_the_lowest_points_are_corners():

@@ -108,7 +108,7 @@ def edit(plan, factor=1.0, **offsets):
     ],
 )
 def test_the_judge_names_the_limit_that_a_motion_breaks(name, change):
-    case = reach([2.5, 0.3, -0.3, 0.0, 0.6, 0.0], angles=[-2.5, 0.3, -0.3, 0.0, 0.6, 0.0])
+    case = reach(np.array([2.5, 0.3, -0.3, 0.0, 0.6, 0.0]), angles=[-2.5, 0.3, -0.3, 0.0, 0.6, 0.0])
     plan = pj.plan(DIRECT, case)
     assert pj.reach.judge(case, plan).success
     assert pj.reach.judge(case, edit(plan, **change)).failed_limit == name
@@ -150,8 +150,8 @@ def test_shapes_are_checked():
         pj.reach.case(GOAL, goals=[GOAL])
     with pytest.raises(ValueError, match="goal must have a shape that ends with"):
         pj.reach.case(np.zeros(5))
-    with pytest.raises(ValueError, match="scene must be one without boxes"):
-        pj.block.case((9.0, 0.5, 0.3), (-8.0, -0.4, 5.4), scene=WALL)
+    with pytest.raises(ValueError, match=r"the radius of capsules\[0\] must be >= 0, got -0.1"):
+        pj.reach.make_scene(capsules=[([(0.0, 0.0, 0.0), (0.0, 0.0, 1.0)], -0.1)])
 
 
 def test_planner_and_judge_measure_the_same_distances():
@@ -160,7 +160,7 @@ def test_planner_and_judge_measure_the_same_distances():
     path = jax.tree.map(np.asarray, plan.motion)
     shares = np.linspace(0.0, 1.0, 400)
     local = (ends[:, None] * shares)[..., None]
-    angles = sum(path.coeffs[:, None, k] * local**k for k in range(3)).reshape(-1, 6)
+    angles = np.sum([path.coeffs[:, None, k] * local**k for k in range(3)], axis=0).reshape(-1, 6)
     least = float(jnp.min(jax.jit(clearances)(ARM, WALL, angles.astype(np.float32))))
     verdict = pj.reach.judge(case, plan)
     assert min(verdict.obstacle_clearance, verdict.self_clearance) == pytest.approx(least, abs=5e-4)
@@ -195,8 +195,8 @@ def test_a_path_is_shortened_to_few_straight_lines():
 
 
 def test_steps_lead_to_the_goal_whatever_they_are():
-    steps = np.random.default_rng(0).normal(size=(11, 6)).astype(np.float32)
-    knots = motion.steps_knots(motion.end_at(steps, GOAL - START), ARM.limits)
-    path = motion.join_knots(START, *knots)
+    steps = jnp.asarray(np.random.default_rng(0).normal(size=(11, 6)), jnp.float32)
+    knots = motion.steps_knots(motion.end_at(steps, jnp.asarray(GOAL - START)), ARM.limits)
+    path = motion.join_knots(jnp.asarray(START), *knots)
     end = pj.evaluate(path, jnp.sum(path.durations))
     np.testing.assert_allclose(end, GOAL, atol=1e-5)

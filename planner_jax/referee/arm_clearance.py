@@ -4,7 +4,7 @@ Base frame of the arm, z up, SI units. Vectors at S sampled times of B motions a
 S = 1 for solids that do not move. The solids are capsules around the links, and a rectangular
 plate, the shield, 0.01 m thick. These distances are tested:
 
-- of every link and the shield from the floor, the pole and the beams of the rig around the arm;
+- of every link and the shield from the floor, obstacles and the beams of the rig around the arm;
 - of the shield and the links of `Arm.base_pairs` from the base, on which link 1 is mounted;
 - of the links of `Arm.pairs`, since neighbouring links always touch;
 - of the links of `Arm.shield_pairs` from the shield, which the last link carries.
@@ -19,16 +19,15 @@ import numpy as np
 
 from planner_jax.referee import solids
 
-KINDS = ("floor", "pole", "rig", "base", "self")
+KINDS = ("floor", "obstacle", "rig", "base", "self")
 THICKNESS = 0.01  # [m], thickness of the shield's plate
-_POLE_HALF = 1e3  # [m], half the length of the pole, practically infinite
 _SLACK = 1e-9  # [m], greatest rounding error of the lower bound of a distance
 _BASE = -1  # index of the base, where links 1 to n have indices 0 to n - 1
 
 
 @dataclasses.dataclass(frozen=True)
 class _Capsule:
-    """The pose of a capsule (a link, a beam or the pole) at every sample of B motions."""
+    """The pose of a capsule (a link, a beam or an obstacle) at every sample of B motions."""
 
     name: str
     link: int
@@ -62,7 +61,7 @@ class _Capsule:
 
 @dataclasses.dataclass(frozen=True)
 class _Box:
-    """The pose of a box (the shield or the base) at every sample of B motions."""
+    """The pose of a box (shield, base or obstacle) at every sample of B motions."""
 
     name: str
     middle: np.ndarray  # (3, B, S) [m]
@@ -94,6 +93,37 @@ class _Box:
     def at(self, lane: np.ndarray, sample: np.ndarray) -> "_Box":
         middle, turn = (_pick_samples(each, lane, sample) for each in (self.middle, self.turn))
         return _Box(self.name, middle, turn, self.half[:, lane, 0])
+
+
+@dataclasses.dataclass(frozen=True)
+class _Cylinder:
+    """A cylinder (an obstacle) in each of B cases."""
+
+    name: str
+    first: np.ndarray  # (3, B, 1) [m], first end of the axis
+    second: np.ndarray  # (3, B, 1) [m], second end of the axis
+    radius: np.ndarray  # (B, 1) [m]
+
+    def distance_to_point(self, point: np.ndarray) -> np.ndarray:
+        return solids.length(solids.from_cylinder(point, self.first, self.second, self.radius))
+
+    def distance_to_capsule(self, other: _Capsule) -> np.ndarray:
+        gap = solids.segment_to_cylinder(
+            other.first, other.second, self.first, self.second, self.radius
+        )
+        return gap - other.radius
+
+    def distance_to_box(self, other: _Box) -> np.ndarray:
+        """Return the distance from the middle plane of a plate, rounded by half its thickness."""
+        edges = other.turn[:, 1:] * other.half[1:]
+        gap = solids.rectangle_to_cylinder(
+            other.middle, edges, self.first, self.second, self.radius
+        )
+        return gap - other.half[0]
+
+    def at(self, lane: np.ndarray, sample: np.ndarray) -> "_Cylinder":
+        first, second = (end[..., lane, 0] for end in (self.first, self.second))
+        return _Cylinder(self.name, first, second, self.radius[lane, 0])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -141,11 +171,12 @@ def shield_pose(case: dict, turns: list, positions: list) -> tuple[np.ndarray, n
 
 
 def clearances(case: dict, arm: Any, angles: np.ndarray, sampled: np.ndarray) -> dict:
-    """Return an arm's least distances to the floor, the pole, the rig, its base and itself.
+    """Return an arm's least distances to the floor, obstacles, the rig, its base and itself.
 
     The distance of overlapping solids is minus the penetration depth. If one solid is a capsule,
     the depth is at most its radius, and for two capsules at most the sum of both radii. Distances
-    at samples are exact.
+    at samples are exact. For cylinders, the edges of the shield are rounded: the shield is larger
+    by up to half its thickness.
 
     Args:
         case: arrays of B cases.
@@ -162,14 +193,15 @@ def clearances(case: dict, arm: Any, angles: np.ndarray, sampled: np.ndarray) ->
     on_base = [each for each in capsules if each.link == _BASE]
     bodies = [*moving, shield]
     off_base = [*(capsules[k] for k in arm.base_pairs), shield]
-    beams, pole, base = _beams(case), _pole(case), [_base_box(case), *on_base]
+    beams, base = _rods(case, "beam"), [_base_box(case), *on_base]
+    obstacles = _obstacles(case)
     floor = case["scene.floor"][:, None]
     heights = [(body.name, body.lowest() - floor) for body in bodies]
     folded = [(capsules[k], capsules[other]) for k, other in arm.pairs]
     guarded = [(part, shield) for part in _beside_shield(case, arm, capsules)]
     pairs = {
         "floor": [_Pair(name, above, partial(_pick_samples, above)) for name, above in heights],
-        "pole": [_pair(body, pole, body.name) for body in bodies],
+        "obstacle": [_pair(a, b, f"{a.name} and {b.name}") for a in bodies for b in obstacles],
         "rig": [_pair(body, beam, body.name) for body in bodies for beam in beams],
         "base": [_pair(body, part, body.name) for body in off_base for part in base],
         "self": [_pair(a, b, f"{a.name} and {b.name}") for a, b in (*folded, *guarded)],
@@ -215,20 +247,27 @@ def _beside_shield(case: dict, arm: Any, capsules: list[_Capsule]) -> list[_Caps
     return beside
 
 
-def _pole(case: dict) -> _Capsule:
-    """Return the pole as a long vertical capsule; without a pole, all distances are infinite."""
-    x, y = case["scene.pole"].T[..., None]
-    first, second = (np.stack([x, y, np.full_like(x, end)]) for end in (-_POLE_HALF, _POLE_HALF))
-    radius = np.where(case["scene.has_pole"] != 0.0, case["scene.pole_radius"], -np.inf)
-    return _Capsule("the pole", _BASE, first, second, radius[:, None])
+def _rods(case: dict, kind: str) -> list[_Capsule]:
+    """Return the capsules or beams of the scene; one with a negative radius is infinitely far."""
+    rods = []
+    for k, radius in enumerate(case[f"scene.{kind}_radius"].T):
+        first, second = case[f"scene.{kind}_ends"][:, k].transpose(1, 2, 0)[..., None]
+        radius = np.where(radius < 0.0, -np.inf, radius)
+        rods.append(_Capsule(f"{kind} {k + 1}", _BASE, first, second, radius[:, None]))
+    return rods
 
 
-def _beams(case: dict) -> list[_Capsule]:
-    beams = []
-    for k, radius in enumerate(case["scene.beam_radius"].T):
-        first, second = case["scene.beam_ends"][:, k].transpose(1, 2, 0)[..., None]
-        beams.append(_Capsule("a beam", _BASE, first, second, radius[:, None]))
-    return beams
+def _obstacles(case: dict) -> list["_Capsule | _Box | _Cylinder"]:
+    solids: list[_Capsule | _Box | _Cylinder] = [*_rods(case, "capsule")]
+    for k in range(case["scene.box_half"].shape[1]):
+        middle, turn, half = (
+            case[f"scene.box_{name}"][:, k].T[..., None] for name in ("middle", "turn", "half")
+        )
+        solids.append(_Box(f"box {k + 1}", middle, _rotation(turn), half))
+    for k, radius in enumerate(case["scene.cylinder_radius"].T):
+        first, second = case["scene.cylinder_ends"][:, k].transpose(1, 2, 0)[..., None]
+        solids.append(_Cylinder(f"cylinder {k + 1}", first, second, radius[:, None]))
+    return solids
 
 
 def _base_box(case: dict) -> _Box:
@@ -237,7 +276,7 @@ def _base_box(case: dict) -> _Box:
     return _Box("the base", 0.5 * (lower + upper), turn, 0.5 * (upper - lower))
 
 
-def _pair(one: _Capsule | _Box, other: _Capsule | _Box, name: str) -> _Pair:
+def _pair(one: _Capsule | _Box, other: _Capsule | _Box | _Cylinder, name: str) -> _Pair:
 
     def exact(lane: np.ndarray, sample: np.ndarray) -> np.ndarray:
         return _distance(one.at(lane, sample), other.at(lane, sample))
@@ -245,7 +284,7 @@ def _pair(one: _Capsule | _Box, other: _Capsule | _Box, name: str) -> _Pair:
     return _Pair(name, other.distance_to_point(one.middle) - one.reach, exact)
 
 
-def _distance(one: _Capsule | _Box, other: _Capsule | _Box) -> np.ndarray:
+def _distance(one: _Capsule | _Box, other: _Capsule | _Box | _Cylinder) -> np.ndarray:
     if isinstance(one, _Capsule):
         return other.distance_to_capsule(one)
     return (

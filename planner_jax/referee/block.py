@@ -28,7 +28,7 @@ _SENTENCES = {
     "rest": "{failed_part} turns at {excess:.3g} rad/s when the motion ends, at {time:.3f} s; the "
     "arm must be at standstill there if the case requires it or the contact is later",
     "floor": "{failed_part} is {excess:.3g} m below the floor at {time:.3f} s",
-    "pole": "{failed_part} is {excess:.3g} m inside the pole at {time:.3f} s",
+    "obstacle": "{failed_part} are {excess:.3g} m inside each other at {time:.3f} s",
     "rig": "{failed_part} is {excess:.3g} m inside a beam of the rig at {time:.3f} s",
     "base": "{failed_part} is {excess:.3g} m inside the base at {time:.3f} s",
     "self": "{failed_part} are {excess:.3g} m inside each other at {time:.3f} s",
@@ -42,12 +42,18 @@ LIMITS = tuple(_SENTENCES)
 # Fields of a case that may be infinite, besides limits of joint velocities and accelerations.
 _UNBOUNDED_LEAVES = ("arm.lower", "arm.upper", "offset", "tilt")
 _SIDES = ("lower", "upper")
+# Shapes of leaves for each obstacle of a kind.
+_OBSTACLES: dict[str, dict[str, tuple[int, ...]]] = {
+    "capsule": {"ends": (2, 3), "radius": ()},
+    "beam": {"ends": (2, 3), "radius": ()},
+    "box": {"middle": (3,), "turn": (4,), "half": (3,)},
+    "cylinder": {"ends": (2, 3), "radius": ()},
+}
 _CASE_SHAPES: dict[str, tuple[int, ...]] = {
     **{"ball.pos": (3,), "ball.vel": (3,), "gravity": ()},
     **{"delay": (), "ends_at_rest": (), "offset": (), "tilt": ()},
-    **{"arm.base_box": (2, 3), "scene.pole": (2,)},
+    **{"arm.base_box": (2, 3), "scene.floor": ()},
     **{"arm.shield_centre": (3,), "arm.shield_turn": (4,), "arm.shield_half": (2,)},
-    **{"scene.pole_radius": (), "scene.has_pole": (), "scene.floor": ()},
     **{f"scene.{box}.{side}": (3,) for box in ("inner", "outer") for side in _SIDES},
 }
 # Shapes of leaves for each of the n joints.
@@ -88,7 +94,7 @@ class BlockVerdict(judging.Verdict):
     velocity_share: np.ndarray  # (B,) greatest ratio of a joint's |velocity| to its limit
     acceleration_share: np.ndarray  # (B,) greatest ratio of a joint's |acceleration| to its limit
     floor_clearance: np.ndarray  # (B,) [m], least distance of arm and shield from the floor
-    pole_clearance: np.ndarray  # (B,) [m], least distance of arm and shield from the pole
+    obstacle_clearance: np.ndarray  # (B,) [m], least distance of arm and shield from obstacles
     rig_clearance: np.ndarray  # (B,) [m], least distance of arm and shield from the rig's beams
     base_clearance: np.ndarray  # (B,) [m], least distance of shield and links from the base
     self_clearance: np.ndarray  # (B,) [m], least distance between two parts of the arm
@@ -148,9 +154,6 @@ def _read(cases, plans) -> dict[str, np.ndarray]:
     links = tuple(int(link) for link in cases.arm.capsule_link)
     if not all(-1 <= link < num for link in links):
         raise ValueError(f"arm.capsule_link must be in -1, ..., {num - 1}, got {links}")
-    beams = np.shape(cases.scene.beam_radius)
-    if len(beams) != 2:
-        raise ValueError(f"scene.beam_radius must be ({len(coeffs)}, N), got {beams}")
     num_lanes, capsules = len(coeffs), len(links)
     of_joints = {name: (num, *shape) for name, shape in _JOINT_SHAPES.items()}
     shapes = (
@@ -160,16 +163,14 @@ def _read(cases, plans) -> dict[str, np.ndarray]:
             "arm.capsule_ends": (capsules, 2, 3),
             "arm.capsule_radius": (capsules,),
             "arm.shield_gap_radius": (capsules,),
-            "scene.beam_ends": (*beams[1:], 2, 3),
-            "scene.beam_radius": beams[1:],
         }
     )
+    for kind, parts in _OBSTACLES.items():
+        num_solids = (*np.shape(getattr(cases.scene, f"{kind}_{[*parts][-1]}")), 0, 0)[1]
+        shapes |= {f"scene.{kind}_{name}": (num_solids, *of) for name, of in parts.items()}
     leaves = {"plan.motion.coeffs": coeffs} | judging.read_leaves(cases, shapes, num_lanes)
     of_plan = {"motion.durations": coeffs.shape[1:2], "contact_time": ()}
     leaves |= judging.read_leaves(plans, of_plan, num_lanes, "plan.")
-    absent = leaves["scene.has_pole"] == 0
-    leaves["scene.pole"] = np.where(absent[:, None], 0.0, leaves["scene.pole"])
-    leaves["scene.pole_radius"] = np.where(absent, 0.0, leaves["scene.pole_radius"])
     return leaves
 
 

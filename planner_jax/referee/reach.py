@@ -256,10 +256,9 @@ class _Bodies:
             base = add_box("the base", links[-1], *box)
             own += [(k, base) for k in based]
         scene = case.scene
-        fixed = [
-            add_capsule("a capsule", links[-1], ends, radius)
-            for ends, radius in zip(scene.beam_ends, scene.beam_radius, strict=True)
-        ]
+        rods = [*zip(scene.capsule_ends, scene.capsule_radius, strict=True)]
+        rods += zip(scene.beam_ends, scene.beam_radius, strict=True)
+        fixed = [add_capsule("a capsule", links[-1], *rod) for rod in rods if rod[1] >= 0.0]
         solids = zip(scene.box_middle, scene.box_turn, scene.box_half, strict=True)
         fixed += [add_box("a box", links[-1], *solid) for solid in solids]
         for ends, radius in zip(scene.cylinder_ends, scene.cylinder_radius, strict=True):
@@ -267,10 +266,6 @@ class _Bodies:
             fixed.append(
                 add("a cylinder", links[-1], kinds.mjGEOM_CYLINDER, fromto=ends.ravel(), size=size)
             )
-        if scene.has_pole:
-            ends = np.array([[*scene.pole, -10.0], [*scene.pole, 10.0]])
-            radius = float(scene.pole_radius)
-            fixed.append(add_capsule("the pole", links[-1], ends, radius))
         floor = [0.0, 0.0, float(scene.floor)]
         floor = add("the floor", links[-1], kinds.mjGEOM_PLANE, pos=floor, size=[1.0, 1.0, 1.0])
         low = [k for k in moving if k not in capsules or arm.capsule_link[k] > 0]

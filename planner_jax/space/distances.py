@@ -1,4 +1,4 @@
-"""Differentiable distances between segments, rectangles, boxes, vertical lines and the ground.
+"""Differentiable distances between segments, rectangles, boxes, cylinders and the ground.
 
 With them an arm that blocks a ball keeps its links and shield clear of obstacles. Every function
 takes ONE pair of bodies; use `jax.vmap` for many pairs. The distance of a capsule is the distance
@@ -10,8 +10,7 @@ of its axis minus its radius. Any frame, SI units; the ground is the x-y plane. 
 * a box along the axes: its corners `lower` and `upper` (3,) [m], `lower` <= `upper`;
 * a turned box: its `middle` (3,) [m], its `axes` (3, 3), unit vectors along the edges, and `half`
   (3,) [m], halves of the edges' lengths;
-* a cylinder: the `ends` (2, 3) [m] of its axis, which do not coincide, and its `radius` () [m];
-* a vertical line of infinite length, such as a pole's axis: its `position` (2,) [m].
+* a cylinder: the `ends` (2, 3) [m] of its axis, which do not coincide, and its `radius` () [m].
 
 A distance is the least length |gap| of a vector between points of two bodies. The derivative of the
 distance is the derivative of |gap| with the nearest points fixed on their bodies (the envelope
@@ -63,19 +62,6 @@ def segment_to_cylinder(ends: Array, axis_ends: Array, radius: Array) -> Array:
     return _shortest(_nearest_of_cylinder, _gap_to_cylinder, (ends, axis_ends, radius))
 
 
-def segment_to_vertical_line(ends: Array, position: Array) -> Array:
-    """Return the horizontal distance () [m] between a segment and a vertical line."""
-    return _shortest(_nearest_to_line, _gap_to_line, (ends, position))
-
-
-def rectangle_to_vertical_line(middle: Array, edges: Array, position: Array) -> Array:
-    """Return the horizontal distance () [m] of a rectangle from a vertical line, 0 if they cross.
-
-    Any parallelogram is valid, including a vertical one: its edges need not be at right angles.
-    """
-    return _shortest(_nearest_of_projection, _gap_of_projection, (middle, edges, position))
-
-
 def lowest_of_segment(ends: Array) -> Array:
     """Return the height () [m] of the lowest point of a segment above the ground."""
     return jnp.minimum(ends[0, 2], ends[1, 2])
@@ -125,8 +111,6 @@ def approach(distance: Callable, nearest: Any, *bodies: Array) -> Approach:
     """
     _, gap_of, point_of = _PARTS[distance]
     point, gap = point_of(nearest, *bodies), gap_of(nearest, *bodies)
-    # A horizontal gap has two components; add a third that is zero.
-    gap = (*gap, *[jnp.zeros_like(gap[0])] * (3 - len(gap)))
     # Divide last: XLA computes a quotient only once, but repeats cheaper arithmetic for each use.
     length = _length(gap)
     length = jnp.where(length > 0.0, length, jnp.inf)
@@ -363,50 +347,6 @@ def _share_nearest_to_slabs(slabs: list[_Slab]) -> Array:
     return between / jnp.where(rises, rise - fall, 1.0)
 
 
-def _nearest_to_line(ends: Array, position: Array) -> tuple[Array]:
-    start, end = _ground(ends)
-    step = _minus(end, start)
-    return (_unit(_ratio(dot(_minus(tuple(position), start), step), dot(step, step))),)
-
-
-def _gap_to_line(shares: tuple[Array], ends: Array, position: Array) -> Vector:
-    return _minus(_point(ends, shares[0])[:2], tuple(position))
-
-
-def _nearest_of_projection(middle: Array, edges: Array, position: Array) -> Any:
-    e, f = _ground(edges)
-    to_x, to_y = to = tuple(x - m for x, m in zip(position, middle[:2], strict=True))
-    squares, product = (dot(e, e), dot(f, f)), dot(e, f)
-    ahead = (dot(to, e), dot(to, f))
-    nearest = jnp.full_like(product, jnp.inf)
-    p = q = jnp.zeros_like(product)
-    for side in (-1.0, 1.0):
-        on_f = jnp.clip(_ratio(ahead[1] - side * product, squares[1]), -1.0, 1.0)
-        on_e = jnp.clip(_ratio(ahead[0] - side * product, squares[0]), -1.0, 1.0)
-        for along_e, along_f in ((side, on_f), (on_e, side)):
-            gap_x = to_x - along_e * e[0] - along_f * f[0]
-            gap_y = to_y - along_e * e[1] - along_f * f[1]
-            square = gap_x * gap_x + gap_y * gap_y
-            closer = square < nearest
-            nearest = jnp.where(closer, square, nearest)
-            p, q = jnp.where(closer, along_e, p), jnp.where(closer, along_f, q)
-    area = jnp.abs(_area(e, f))
-    inside = (jnp.abs(_area(to, f)) < area) & (jnp.abs(_area(e, to)) < area)
-    # A vertical rectangle projects to a line segment without area, for which rounding errors spoil
-    # the test of areas. A position farther from the middle than every corner is never inside.
-    inside = inside & (dot(to, to) <= squares[0] + squares[1] + 2.0 * jnp.abs(product))
-    return p, q, ~inside
-
-
-def _gap_of_projection(nearest: Any, middle: Array, edges: Array, position: Array) -> Vector:
-    p, q, apart = nearest
-    e, f = _ground(edges)
-    return tuple(
-        jnp.where(apart, m + p * a + q * b - x, 0.0)
-        for m, a, b, x in zip(middle[:2], e, f, position, strict=True)
-    )
-
-
 def _length(vector: Vector) -> Array:
     """Return the length () of a vector; 0, with derivative 0, if it is below 1e-12."""
     square = dot(vector, vector)
@@ -432,10 +372,6 @@ def _rows(pair: Array) -> tuple[Vector, Vector]:
     return tuple(pair[0]), tuple(pair[1])
 
 
-def _ground(pair: Array) -> tuple[Vector, Vector]:
-    return tuple(pair[0, :2]), tuple(pair[1, :2])
-
-
 def _minus(a: Vector, b: Vector) -> Vector:
     return tuple(x - y for x, y in zip(a, b, strict=True))
 
@@ -449,10 +385,6 @@ def dot(a: Vector, b: Vector) -> Array:
 def cross(a: Vector, b: Vector) -> Vector:
     """Return the cross product of two vectors."""
     return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
-
-
-def _area(a: Vector, b: Vector) -> Array:
-    return a[0] * b[1] - a[1] * b[0]
 
 
 def _lowest_end(ends: Array) -> Vector:
@@ -490,8 +422,6 @@ _PARTS: dict[Callable, tuple[Callable, Callable, Callable]] = {
     segment_to_box: (_nearest_of_box, _gap_to_box, _point_of_segment),
     segment_to_turned_box: (_nearest_of_turned_box, _gap_to_turned_box, _point_of_segment),
     segment_to_cylinder: (_nearest_of_cylinder, _gap_to_cylinder, _point_of_segment),
-    segment_to_vertical_line: (_nearest_to_line, _gap_to_line, _point_of_segment),
-    rectangle_to_vertical_line: (_nearest_of_projection, _gap_of_projection, _point_of_rectangle),
     lowest_of_segment: (_lowest_end, _gap_to_ground, _point_itself),
     lowest_of_rectangle: (_lowest_corner, _gap_to_ground, _point_itself),
 }

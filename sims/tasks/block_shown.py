@@ -10,7 +10,6 @@ from planner_jax.runs.table import RateTable
 from planner_jax.sims.scenery import Part
 from planner_jax.task.block.scene import FLOOR, Box, paper_scene
 
-_POLE = 3.0  # [m], height of the drawn pole
 _BARS = 32  # greatest number of balls in the picture of the time budget
 # Parts of a ball's time of flight, each a name of a field of `Budget` with its description.
 BUDGET = {
@@ -36,7 +35,7 @@ def _around(ends: np.ndarray, radius: float) -> np.ndarray:
 
 def scenery(arm: Arm, has_pole: bool) -> tuple[Part, ...]:
     """Return the drawn parts: outer box, protected inner box, beams, pedestal and pole."""
-    scene, (lower, upper) = paper_scene(), arm.base_box
+    scene, (lower, upper) = paper_scene(has_pole=has_pole), arm.base_box
     parts = [_make_box_part(scene.inner, GREEN, 0.1), _make_box_part(scene.outer, SKY, 0.07)]
     for ends, radius in zip(scene.beam_ends, scene.beam_radius, strict=True):
         parts.append(
@@ -45,10 +44,11 @@ def scenery(arm: Arm, has_pole: bool) -> tuple[Part, ...]:
     x, y, _ = 0.5 * (lower + upper)
     length, width, _ = upper - lower
     parts.append(Part("box", (length, width, -FLOOR), (x, y, -0.5 * FLOOR), GREY))
-    if has_pole:
-        x, y = map(float, scene.pole)
-        wide = 2.0 * float(scene.pole_radius)
-        parts.append(Part("cylinder", (wide, wide, _POLE), (x, y, 0.5 * _POLE), "#5B6B73"))
+    for ends, radius in zip(scene.capsule_ends, scene.capsule_radius, strict=True):
+        x, y, middle = np.asarray(ends, float).mean(axis=0)
+        size = 2.0 * float(radius), 2.0 * float(radius), float(np.ptp(ends[:, 2]))
+        if radius >= 0.0:  # an upright pole
+            parts.append(Part("cylinder", size, (x, y, middle - FLOOR), "#5B6B73"))
     return tuple(parts)
 
 

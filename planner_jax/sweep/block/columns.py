@@ -35,7 +35,7 @@ COLUMNS = [
         ("tilt", "rad", "of the shield's normal from the ball's path at contact"),
         ("velocity_share", "1", "greatest rate over its limit"),
         ("acceleration_share", "1", "greatest acceleration over its limit"),
-        ("pole_clearance", "m", "least"),
+        ("obstacle_clearance", "m", "least"),
         ("floor_clearance", "m", "least"),
         ("rig_clearance", "m", "least"),
         ("base_clearance", "m", "least"),

@@ -12,5 +12,6 @@ from .explain import prospects as prospects
 from .plan import BlockPlan as BlockPlan
 from .replan import ReplanBlock as ReplanBlock
 from .scene import Scene as Scene
+from .scene import make_scene as make_scene
 from .scene import paper_scene as paper_scene
 from .suites import draw as draw

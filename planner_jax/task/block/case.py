@@ -132,7 +132,8 @@ def case(
             30 degrees, instead of 2 mm and half a degree.
         anywhere: whether the ball may meet the shield anywhere and at any angle. This suits motions
             that were planned for another ball.
-        scene: obstacles, without batch axes; by default the scene of [Natarajan2024].
+        scene: protected body and obstacles, without batch axes, for example of `make_scene`; by
+            default the scene of [Natarajan2024].
         arm: without batch axes; by default an IRB 1600 with a shield.
         angles: (n,) [rad], joint angles at the start; by default those at which the arm waits.
         rates: (n,) [rad/s], joint rates at the start.
@@ -147,8 +148,6 @@ def case(
     require_switch("anywhere", anywhere)
     scene = paper_scene() if scene is None else scene
     require_kind("scene", scene, Scene)
-    has_solids = len(scene.box_half) or len(scene.cylinder_radius)
-    require(not has_solids, "scene", "one without boxes and cylinders", shown="some")
     arm = irb1600() if arm is None else arm
     require_kind("arm", arm, Arm)
     rule = "one with a capsule around at least one link"

@@ -1,8 +1,8 @@
 """Distances of an arm and its shield from obstacles, and between the arm's own links.
 
 The links are represented by capsules, and the shield by a plate of 0.01 m with rounded edges. The
-obstacles are a pole, the floor, beams, boxes, cylinders, the base and other links. The arm states
-which of its bodies must not touch each other.
+obstacles are capsules, boxes and cylinders of the scene, the rig's beams, the floor, the base and
+other links. The arm states which of its bodies must not touch each other.
 
 The functions process N poses of the arm at once. N is the last axis of arrays, so that a processor
 works on several poses with one instruction.
@@ -20,7 +20,6 @@ from planner_jax.robot.arm import Arm, link_frames, quaternion_rotation
 from planner_jax.space import distances as space
 from planner_jax.task.block.scene import Scene
 
-FAR = 10.0  # [m], added to the distances from the pole if the scene has no pole
 _HALF_THICKNESS = 0.005  # [m], of the shield
 
 
@@ -45,7 +44,8 @@ def clearances(arm: Arm, scene: Scene, angles: Array) -> Array:
     """Return the distances (R, N) [m] of R pairs of bodies, in N poses at angles (N, n) [rad].
 
     A pair is a link or the shield, and a body that it must not touch. A distance is negative
-    if the bodies overlap. The first `num_of_pole(arm)` of the R rows are distances from the pole.
+    if the bodies overlap. The first `num_of_obstacles(arm, scene)` of the R rows are distances from
+    capsules, boxes and cylinders of the scene.
     """
     every = _pairs(arm, scene, _poses(arm, angles))
     return jnp.concatenate([pairs.measure(*pairs.bodies) - pairs.thick for pairs in every])
@@ -92,9 +92,14 @@ def clearances_and_slopes(
     return jnp.concatenate(distances), slopes_at
 
 
-def num_of_pole(arm: Arm) -> int:
-    """Return the number of bodies whose distance from the pole is computed: capsules and shield."""
-    return len(_moving(arm)) + 1
+def num_of_obstacles(arm: Arm, scene: Scene) -> int:
+    """Return the number of pairs of a link or the shield, and a part of a scene's obstacle."""
+    solids = (scene.capsule_radius, scene.box_half, scene.cylinder_radius)
+    rods, boxes, cylinders = (len(each) for each in solids)
+    # The shield has pairs with capsules, axes of cylinders, and the 12 edges of each box. Each box
+    # has pairs with the shield's 4 edges.
+    of_shield = rods + cylinders + (12 + 4) * boxes
+    return len(_moving(arm)) * (rods + boxes + cylinders) + of_shield
 
 
 def _moving(arm: Arm) -> np.ndarray:
@@ -158,9 +163,7 @@ def _pairs(arm: Arm, scene: Scene, poses: _Poses) -> list[_Pairs]:
     of_fixed = np.append(link[others], np.full(num_beams, -1))[fixture]
     near, (lower, upper) = with_beams(before), jnp.asarray(arm.base_box)
     of_near = np.append(link[before], np.full(num_beams, -1))
-    pole = jnp.where(scene.has_pole, scene.pole_radius, -FAR)
     thick, plate, shield, half = radius[:, None], (middle, edges), arm.num - 1, _HALF_THICKNESS
-    to_pole = thick[turning] + pole
 
     boxed = jnp.concatenate([poses.ends[:, :, swung], outline], axis=2)
     boxed_radius = jnp.concatenate([thick[swung], jnp.full((4, 1), half, thick.dtype)])
@@ -170,14 +173,12 @@ def _pairs(arm: Arm, scene: Scene, poses: _Poses) -> list[_Pairs]:
         return poses.ends[:, :, index]
 
     return [
-        _Pairs(space.segment_to_vertical_line, (ends(turning), scene.pole), to_pole, link[turning]),
-        _Pairs(space.rectangle_to_vertical_line, (*plate, scene.pole), half + pole, shield),
+        *_obstacles(arm, scene, poses),
         _Pairs(space.segment_to_segment, (ends(moving), against), between, link[moving], of_fixed),
         _Pairs(space.segment_to_rectangle, (near, *plate), near_to, shield, of_near, first=False),
         _Pairs(space.lowest_of_segment, (ends(high),), thick[high] + scene.floor, link[high]),
         _Pairs(space.lowest_of_rectangle, plate, half + scene.floor, shield),
         _Pairs(space.segment_to_box, (boxed, lower, upper), boxed_radius, boxed_link),
-        *_obstacles(arm, scene, poses),
     ]
 
 
@@ -190,13 +191,18 @@ def _outline(middle: Array, edges: Array) -> Array:
 
 
 def _obstacles(arm: Arm, scene: Scene, poses: _Poses) -> list[_Pairs]:
-    """Return the pairs of each link and the shield with each box and cylinder of the scene."""
+    """Return the pairs of each link and the shield with each obstacle of the scene."""
     link, shield = np.asarray(arm.capsule_link), arm.num - 1
-    moving, plate = np.flatnonzero(link >= 0), (poses.middle[:, None], poses.edges[:, :, None])
+    moving, plate = _moving(arm), (poses.middle[:, None], poses.edges[:, :, None])
     radius, num_poses = jnp.asarray(arm.capsule_radius)[moving], poses.middle.shape[-1]
-    sticks = jnp.zeros((2, 3, 0, 1), radius.dtype)  # segments whose distance from the shield counts
-    around = jnp.zeros(0, radius.dtype)  # [m], radii around them
+    # Segments (2, 3, S, 1) whose distance from the shield counts, and the radii around them [m].
+    sticks = jnp.moveaxis(jnp.asarray(scene.capsule_ends), 0, 2)[..., None]
+    around = jnp.asarray(scene.capsule_radius)
     pairs = []
+    if num := around.shape[0]:
+        k, j = np.repeat(np.arange(len(moving)), num), np.tile(np.arange(num), len(moving))
+        bodies, between = (poses.ends[:, :, moving[k]], sticks[:, :, j]), radius[k] + around[j]
+        pairs.append(_Pairs(space.segment_to_segment, bodies, between[:, None], link[moving[k]]))
     if num := scene.box_half.shape[0]:
         middle = jnp.asarray(scene.box_middle).T[..., None]  # (3, M, 1)
         turns = quaternion_rotation(jnp.asarray(scene.box_turn))
@@ -213,8 +219,9 @@ def _obstacles(arm: Arm, scene: Scene, poses: _Poses) -> list[_Pairs]:
         corners = [np.insert(sign, k, end) for k in range(3) for sign in signs for end in (-1, 1)]
         corners = jnp.einsum("ec,cmx,cdmx->demx", jnp.asarray(corners, half.dtype), half, axes)
         edges = (corners + middle[:, None]).reshape(3, 12, 2, num)
-        sticks = jnp.moveaxis(edges, 2, 0).reshape(2, 3, 12 * num, 1)
-        around = jnp.zeros(12 * num, radius.dtype)
+        edges = jnp.moveaxis(edges, 2, 0).reshape(2, 3, 12 * num, 1)
+        sticks = jnp.concatenate([sticks, edges], axis=2)
+        around = jnp.append(around, jnp.zeros(12 * num, radius.dtype))
     if num := scene.cylinder_radius.shape[0]:
         axis_ends = jnp.moveaxis(jnp.asarray(scene.cylinder_ends), 0, 2)[..., None]
         wide = jnp.asarray(scene.cylinder_radius)

@@ -35,7 +35,11 @@ from planner_jax.optimise import levenberg
 from planner_jax.optimise.levenberg import LevenbergConfig, LevenbergState, Model, continue_search
 from planner_jax.task.block import motion
 from planner_jax.task.block.case import BlockCase
-from planner_jax.task.block.clearance import clearances_and_slopes, least_clearances, num_of_pole
+from planner_jax.task.block.clearance import (
+    clearances_and_slopes,
+    least_clearances,
+    num_of_obstacles,
+)
 from planner_jax.task.block.end_poses import (
     EndPoses,
     Flight,
@@ -153,7 +157,8 @@ class OnlineBlock(Planner):
     worst: int = 8  # samples with the least distances, at which least squares compute derivatives
     checked: int = 96  # samples of the returned plan at which limits are checked
     margin: float = 0.003  # [m], least distance of the arm from all obstacles and itself
-    pole_margin: float = 0.012  # [m], least distance from the pole; covers gaps between samples
+    # [m], least distance from capsules, boxes and cylinders; covers gaps between samples
+    obstacle_margin: float = 0.012
     slack: float = 0.004  # fraction of every limit that plans leave unused
     # Whether motions from standstill to standstill are as fast as the limits allow, and the fastest
     # straight motion is selected: the arm then waits for the ball. Otherwise the arm moves until
@@ -431,8 +436,8 @@ class OnlineBlock(Planner):
         angles = motion.angles_at(case.angles, first, steps, shares)
         gaps, slopes_at = clearances_and_slopes(case.arm, case.scene, angles)
         gaps = lax.optimization_barrier(gaps)  # (R, S)
-        is_of_pole = np.arange(gaps.shape[0]) < num_of_pole(case.arm)
-        margins = np.where(is_of_pole, self.pole_margin, 1.3 * self.margin)[:, None]
+        is_of_scene = np.arange(gaps.shape[0]) < num_of_obstacles(case.arm, case.scene)
+        margins = np.where(is_of_scene, self.obstacle_margin, 1.3 * self.margin)[:, None]
         near, worst = lax.top_k(jnp.max(margins - gaps, axis=0), self.worst)
         slopes = slopes_at(worst)  # (R, n, W)
         short = jnp.maximum(margins - gaps[:, worst], 0.0) * self.weights.clearance  # (R, W)

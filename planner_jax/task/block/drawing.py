@@ -1,19 +1,24 @@
 """A drawing of one block: the arm from above and from the side, and the rates of its joints."""
 
+import itertools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle, Polygon, Rectangle
+from matplotlib.patches import Polygon, Rectangle
+from scipy.spatial import ConvexHull
+from scipy.spatial.transform import Rotation
 
 from planner_jax.core.checks import require_kind
 from planner_jax.core.choices import require
 from planner_jax.robot.arm import capsules, shield_pose
+from planner_jax.robot.capsule_fit import directions
 from planner_jax.runs import style
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.plan import BlockPlan
-from planner_jax.task.block.scene import Box
+from planner_jax.task.block.scene import Box, Scene
 from planner_jax.trajectory.polynomial import evaluate
 
 SIZE = (11.0, 4.2)  # [inch], size of a figure
@@ -86,12 +91,27 @@ def _draw_scene(axes: Axes, case: BlockCase, across: int, up: int) -> None:
     ):
         corner, size = box.lower[[across, up]], (box.upper - box.lower)[[across, up]]
         axes.add_patch(Rectangle(tuple(corner), *size, **look))
-    if scene.has_pole:
-        x, radius, bottom = float(scene.pole[0]), float(scene.pole_radius), float(scene.floor)
-        if up == 1:
-            axes.add_patch(Circle(tuple(scene.pole), radius, color=style.GREY))
-        else:
-            high = float(scene.outer.upper[2]) - bottom
-            axes.add_patch(Rectangle((x - radius, bottom), 2.0 * radius, high, color=style.GREY))
+    for points in _obstacle_points(scene):
+        flat = points[:, [across, up]]
+        corners = flat[ConvexHull(flat, qhull_options="QJ").vertices]
+        axes.add_patch(Polygon(corners, color=style.GREY))
     if up == 2:
         axes.axhline(float(scene.floor), color=style.INK, linewidth=1.0)
+
+
+def _obstacle_points(scene: Scene) -> list[np.ndarray]:
+    """Return points (V, 3) [m] for each obstacle, whose convex hull is the obstacle."""
+    spread = directions(400)
+    rods = zip(scene.capsule_ends, scene.capsule_radius, strict=True)
+    found = [
+        (ends[:, None] + radius * spread).reshape(-1, 3) for ends, radius in rods if radius >= 0
+    ]
+    signs = np.array([*itertools.product((-1.0, 1.0), repeat=3)])
+    for middle, turn, half in zip(scene.box_middle, scene.box_turn, scene.box_half, strict=True):
+        found.append(middle + Rotation.from_quat(turn, scalar_first=True).apply(signs * half))
+    for ends, radius in zip(scene.cylinder_ends, scene.cylinder_radius, strict=True):
+        axis = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0])
+        rim = spread - np.outer(spread @ axis, axis)
+        rim *= radius / np.linalg.norm(rim, axis=1, keepdims=True)
+        found.append((ends[:, None] + rim).reshape(-1, 3))
+    return found

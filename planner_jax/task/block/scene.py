@@ -17,7 +17,9 @@ from planner_jax.core.rules import Field, Table
 
 INNER_HALF, INNER_HEIGHT = 0.4, 1.35  # [m], half side and height of the protected box
 OUTER_HALF, OUTER_HEIGHT = 1.0, 1.85  # [m], half side and height of the box where balls are met
-POLE, POLE_RADIUS = (0.806, 0.0), 0.05  # [m], x and y of a vertical pole, and its radius
+# [m], x and y of a vertical pole, the height of its top, and its radius
+POLE, POLE_TOP, POLE_RADIUS = (0.806, 0.0), 2.52, 0.05
+ABSENT = -10.0  # [m], radius of a capsule that does not exist
 FLOOR = -0.4826  # [m], height of the floor
 # Four horizontal beams form a square around the robot's pedestal. Each beam is modelled as a
 # capsule that encloses its cross-section of 0.025 m x 0.076 m.
@@ -25,14 +27,18 @@ RIG_HALF, RIG_LENGTH = 0.559, 1.09  # [m], half the side of the square, and leng
 RIG_HEIGHT, RIG_RADIUS = -0.08, 0.0401  # [m], height of the beams' axes, and radius of a capsule
 
 
-# Shapes and ranges that `pj.require_sound` checks for the pole, floor and beams of a case's scene.
+# Shapes and ranges that `pj.require_sound` checks for the obstacles of a case's scene.
 RULES: Table = (
-    Field("scene.pole", (2,)),
-    Field("scene.pole_radius", (), rules.NOT_NEGATIVE),
-    Field("scene.has_pole", (), kind=np.bool_),
+    Field("scene.capsule_ends", ("P", 2, 3)),
+    Field("scene.capsule_radius", ("P",)),
     Field("scene.floor", ()),
     Field("scene.beam_ends", ("N", 2, 3)),
     Field("scene.beam_radius", ("N",), rules.NOT_NEGATIVE),
+    Field("scene.box_middle", ("M", 3)),
+    Field("scene.box_turn", ("M", 4)),
+    Field("scene.box_half", ("M", 3), rules.NOT_NEGATIVE),
+    Field("scene.cylinder_ends", ("L", 2, 3)),
+    Field("scene.cylinder_radius", ("L",), rules.NOT_NEGATIVE),
 )
 
 
@@ -50,11 +56,11 @@ class Scene:
 
     inner: Box  # protected box
     outer: Box  # box in which the shield may meet a ball
-    pole: Array  # (2,) [m], x and y of a vertical pole of infinite length
-    pole_radius: Array  # () [m]
-    has_pole: Array  # () bool, whether the pole exists
+    # (P, 2, 3) [m], ends of the axes of capsules, such as poles. Spheres are capsules, too.
+    capsule_ends: Array
+    capsule_radius: Array  # (P,) [m]; a capsule with a negative radius, `ABSENT`, does not exist
     floor: Array  # () [m], height of the floor
-    beam_ends: Array  # (N, 2, 3) [m], ends of the axes of capsules around beams
+    beam_ends: Array  # (N, 2, 3) [m], ends of the axes of capsules around the rig's beams
     beam_radius: Array  # (N,) [m]
     box_middle: Array  # (M, 3) [m], middles of boxes at any orientation
     # (M, 4) unit quaternions w, x, y, z: rotations of the boxes' frames
@@ -64,12 +70,13 @@ class Scene:
     cylinder_radius: Array  # (L,) [m]
 
 
-def paper_scene(*, has_pole: bool = True, size: float = 1.0) -> Scene:
+def paper_scene(*, has_pole: bool = True, pole: Sequence[float] = POLE, size: float = 1.0) -> Scene:
     """Return the scene of the simulations in [Natarajan2024, Fig. 5], with NumPy float32 leaves.
 
     The sizes are from the model in the authors' repository. The model's box around the camera is
-    left out, since the arm touches this box in the pose in which the authors let it wait. All
-    lengths are multiplied by `size` > 0, which suits arms with another reach than the authors' arm.
+    left out, since the arm touches this box in the pose in which the authors let it wait. A pole
+    stands at x and y `pole` [m], unless `has_pole` is false. All lengths are multiplied by `size`
+    > 0, which suits arms with another reach than the authors' arm.
     """
     require(size > 0.0, "size", "> 0", size)
 
@@ -89,9 +96,8 @@ def paper_scene(*, has_pole: bool = True, size: float = 1.0) -> Scene:
     return Scene(
         inner=box(INNER_HALF, INNER_HEIGHT),
         outer=box(OUTER_HALF, OUTER_HEIGHT),
-        pole=leaf(POLE),
-        pole_radius=leaf(POLE_RADIUS),
-        has_pole=host_leaf(has_pole),
+        capsule_ends=leaf([[[*pole, FLOOR], [*pole, POLE_TOP]]]),
+        capsule_radius=leaf([POLE_RADIUS if has_pole else ABSENT]),
         floor=leaf(FLOOR),
         beam_ends=leaf(ends),
         beam_radius=leaf(np.full(4, RIG_RADIUS)),
@@ -107,7 +113,7 @@ def make_scene(
     cylinders: Sequence[tuple[ArrayLike, float]] = (),
     floor: float = -100.0,
 ) -> Scene:
-    """Return a scene of solid obstacles, without a pole, with NumPy float32 leaves.
+    """Return a scene of solid obstacles, without a rig, with NumPy float32 leaves.
 
     A program is compiled for each combination of numbers of obstacles.
 
@@ -121,11 +127,17 @@ def make_scene(
     """
     rounded = [(np.broadcast_to(middle, (2, 3)), radius) for middle, radius in spheres]
     rounded += [*capsules]
+    for k, (_, radius) in enumerate(rounded):
+        kind = f"spheres[{k}]" if k < len(spheres) else f"capsules[{k - len(spheres)}]"
+        require(radius >= 0.0, f"the radius of {kind}", ">= 0", radius)
+    paper = paper_scene()
     return dataclasses.replace(
-        paper_scene(has_pole=False),
+        paper,
+        capsule_ends=host_leaf([ends for ends, _ in rounded], np.float32).reshape(-1, 2, 3),
+        capsule_radius=host_leaf([radius for _, radius in rounded], np.float32),
         floor=host_leaf(floor, np.float32),
-        beam_ends=host_leaf([ends for ends, _ in rounded], np.float32).reshape(-1, 2, 3),
-        beam_radius=host_leaf([radius for _, radius in rounded], np.float32),
+        beam_ends=paper.beam_ends[:0],
+        beam_radius=paper.beam_radius[:0],
         **_solids(boxes, cylinders),
     )
 

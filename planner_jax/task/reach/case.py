@@ -30,11 +30,6 @@ RULES: Table = (
     Field("limits.velocity", ("J",), rules.POSITIVE),
     Field("limits.acceleration", ("J",), rules.POSITIVE),
     *scene_module.RULES,
-    Field("scene.box_middle", ("M", 3)),
-    Field("scene.box_turn", ("M", 4)),
-    Field("scene.box_half", ("M", 3), rules.NOT_NEGATIVE),
-    Field("scene.cylinder_ends", ("L", 2, 3)),
-    Field("scene.cylinder_radius", ("L",), rules.NOT_NEGATIVE),
 )
 
 

@@ -29,7 +29,7 @@ from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import Attempt, Status, select_first_solved
 from planner_jax.optimise.levenberg import LevenbergConfig
 from planner_jax.task.block.case import BlockCase
-from planner_jax.task.block.clearance import clearances, num_of_pole
+from planner_jax.task.block.clearance import clearances, num_of_obstacles
 from planner_jax.task.block.default_planner import OnlineBlock
 from planner_jax.task.block.end_poses import EndPoses, Flight, end_poses, flight_of
 from planner_jax.task.block.motion import angles_at, profiles, step_weights
@@ -44,7 +44,7 @@ _WEIGHTS = np.array([1.0, 1.0, 1.0, 0.3, 0.3, 0.0])
 # box around the arm and the centre of the box's cell for which a motion was stored.
 _AWAY = 0.02
 _LATE = 10.0  # [rad^2], penalty of a motion that exceeds a joint limit by 100 %
-_NEAR = 30.0  # [rad^2/m], penalty per metre by which the arm is too close to the pole
+_NEAR = 30.0  # [rad^2/m], penalty per metre by which the arm is too close to an obstacle
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,8 +53,10 @@ class Effort(Attempt):
 
     neighbours: int = 8  # number of stored motions that are warped, up to 16
     points: int = 6  # number of points of the ball's trajectory to which each motion is warped
-    screened: int = 8  # number of warped motions whose distances from the pole are computed
-    samples: int = 12  # number of samples of a motion at which its distance from the pole is tested
+    screened: int = 8  # number of warped motions whose distances from obstacles are computed
+    samples: int = (
+        12  # number of samples of a motion at which its distance from obstacles is tested
+    )
     checks: int = 1  # greatest number of motions checked for all collisions, least penalty first
     checked: int = 48  # number of samples of a motion in this check
     refined: int = 0  # greatest number of motions that are refined by least squares
@@ -71,7 +73,7 @@ class Warped:
     points: Array
     # (C,) [rad^2], squared change of the end pose, plus penalties; infinite if none is stored.
     penalty: Array
-    is_open: Array  # (C,) bool, whether joint limits and the least pole distance are kept
+    is_open: Array  # (C,) bool, whether joint limits and the least distance from obstacles are kept
 
 
 @struct.dataclass
@@ -171,7 +173,7 @@ class AdaptBlock(Planner):
         penalty = jnp.where(found[:, None], penalty, jnp.inf).reshape(-1)
         least, place = lax.top_k(-penalty, effort.screened)
         moves = moves.reshape(-1, pieces, 6)[place]
-        short = self.pole_shortfall(case, moves, effort.samples)
+        short = self.obstacle_shortfall(case, moves, effort.samples)
         cost = _NEAR * jnp.maximum(short, 0.0) - least
         order = lax.top_k(-cost, effort.screened)[1]
         place, moves = place[order], moves[order]
@@ -213,8 +215,8 @@ class AdaptBlock(Planner):
         found = jnp.isfinite(row.duration) & is_first & is_last
         return jnp.where(found[:, None, None], row.steps, 0.0), -away, found
 
-    def pole_shortfall(self, case: BlockCase, moves: Array, samples: int) -> Array:
-        """Return the required minus the least distance from arm to pole, (C,) [m], of C motions.
+    def obstacle_shortfall(self, case: BlockCase, moves: Array, samples: int) -> Array:
+        """Return the required minus the least distance from obstacles, (C,) [m], of C motions.
 
         `moves` (C, K, 6) [rad] has the joints' rates at K knots, times the duration. Distances are
         computed at `samples` times of each motion.
@@ -222,8 +224,12 @@ class AdaptBlock(Planner):
         shares = tuple(np.arange(1, samples + 1) / samples)
         rest = jnp.zeros_like(case.angles)
         angles = jax.vmap(lambda steps: angles_at(case.angles, rest, steps, shares))(moves)
-        gaps = clearances(case.arm, case.scene, angles.reshape(-1, 6))[: num_of_pole(case.arm)]
-        return self.online.pole_margin - jnp.min(gaps.reshape(-1, len(moves), samples), axis=(0, 2))
+        gaps = clearances(case.arm, case.scene, angles.reshape(-1, 6))[
+            : num_of_obstacles(case.arm, case.scene)
+        ]
+        return self.online.obstacle_margin - jnp.min(
+            gaps.reshape(-1, len(moves), samples), axis=(0, 2)
+        )
 
 
 def adapt_planner(file: str | os.PathLike) -> AdaptBlock:

@@ -120,9 +120,9 @@ def repair_library(path: str, *, pole: Sequence[float], out: str, retry: bool = 
     require(len(pole) == 2, "pole", "two numbers [m]", shown=f"{len(pole)} numbers")
     require(bool(np.isfinite(pole).all()), "pole", "finite", list(pole))
     require_backend()
-    scene = dataclasses.replace(
-        library.setting.scene, pole=host_leaf(pole, np.float32), has_pole=host_leaf(True)
-    )
+    moved, scene = paper_scene(pole=pole), library.setting.scene
+    rod = {"capsule_ends": moved.capsule_ends, "capsule_radius": moved.capsule_radius}
+    scene = dataclasses.replace(scene, **rod)
     start = time.perf_counter()
     repaired, touched = repair(library, scene, retry=retry)
     save_library(out, repaired)
@@ -147,8 +147,9 @@ def _print(path: str, library: Library, covered: Coverage) -> None:
     acceleration = " ".join(f"{x:.3g}" for x in np.asarray(limits.acceleration))
     print(f"Joints up to {velocity} rad/s and {acceleration} rad/s^2; motions end {ends}.")
     scene = setting.scene
-    x, y = np.asarray(scene.pole)
-    print(f"Pole at ({x:.3f}, {y:.3f}) m." if scene.has_pole else "No pole.")
+    rods = zip(np.asarray(scene.capsule_ends), np.asarray(scene.capsule_radius), strict=True)
+    poles = [f"({x:.3f}, {y:.3f}) m" for ((x, y, _), _), radius in rods if radius >= 0.0]
+    print(f"Pole at {' and '.join(poles)}." if poles else "No pole.")
     of_all = covered.found.mean(axis=1)
     of_feasible, of_centred = (
         covered.share(of) for of in (covered.is_feasible, covered.is_centred)

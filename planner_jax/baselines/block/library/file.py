@@ -1,6 +1,6 @@
 """Library files: a text header, then arrays that are memory-mapped; no pickle.
 
-    planner-jax block library 1
+    planner-jax block library 2
     {"fingerprint": ..., "layout": ..., "links": ..., "arrays": ..., "size": ...}
 
 The second line is JSON. It holds a hash of arm and scene, the cells of both boxes around the arm,
@@ -30,7 +30,7 @@ from planner_jax.core.plan_files import UNREADABLE, build_tree, leaves_by_name
 from planner_jax.host.files import open_plain, replacing
 from planner_jax.robot.arm import Arm
 
-VERSION = 1
+VERSION = 2
 # Version of the planning method. An interrupted build continues only with the same version.
 BUILD_VERSION = 1
 _MAGIC = "planner-jax block library"
