@@ -10,8 +10,7 @@ Hard balls need a search by least squares, or cannot be blocked at all. All hard
 in one call of a compiled program, and the fastest of --repeat calls is reported.
 
 The program also prints the share of balls that the referee, an independent check in float64,
-accepts as blocked. It compares the durations of the motions with motions of the planner `brisk`,
-which minimises the duration.
+accepts as blocked. It compares the costs of the motions with those of the effort "best".
 """
 
 import jax
@@ -52,7 +51,7 @@ def main() -> None:
         )
         median = gap_figures(gaps)["cost_gap_median"]
         if median is not None:
-            bench.say(f"Motions last {100.0 * median:.0f} % longer than brisk's at the median.")
+            bench.say(f"Motions cost {100.0 * median:.0f} % more than by effort best (median).")
 
 
 if __name__ == "__main__":

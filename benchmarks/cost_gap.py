@@ -35,8 +35,9 @@ def cost_gaps(
 ) -> np.ndarray | None:
     """Return by what fraction the costs of plans exceed the costs that a long search finds.
 
-    For a planner that minimises a cost, the long search is L-BFGS and then Newton's method. For any
-    other planner it is another planner, which the task specification names as `yardstick`.
+    For an `OptimisedPlanner`, the long search is L-BFGS and then Newton's method. For any other
+    planner it is the planner that the task specification names as `yardstick`, or the planner
+    itself with the yardstick's effort if both have the same class.
 
     Args:
         planner: the planner that made the plans. If it also decides the order and times of
@@ -68,6 +69,8 @@ def _reference_planner(planner: Any, cases: Any, card: Task | None) -> Any:
     if card is None or not card.yardstick:
         return None
     yardstick = card.planner(**card.yardstick)
+    if type(planner) is type(yardstick) and "effort" in card.yardstick:
+        return planner.with_effort(str(card.yardstick["effort"]))
     return yardstick if isinstance(cases, yardstick.case_type) else None
 
 

@@ -1,12 +1,17 @@
 """Tests of efforts, which state how long a planner continues to search after all limits hold."""
 
+import jax
+import numpy as np
 import pytest
 
 import planner_jax as pj
+from planner_jax.core.choices import EFFORTS
 from planner_jax.core.errors import ArgumentError
 from planner_jax.optimise.settings import Stage
+from planner_jax.sweep.block.settings import BlockSettings
 from planner_jax.sweep.catch.settings import CatchSettings
 from planner_jax.sweep.hit.settings import HitSettings
+from planner_jax.task.block.default_planner import OnlineBlock
 
 
 @pytest.mark.parametrize("task", [pj.hit, pj.catch], ids=["hit", "catch"])
@@ -25,10 +30,35 @@ def test_more_effort_is_a_longer_first_round_and_the_default_is_the_planner_itse
 def test_an_effort_that_is_none_and_planners_without_one_are_named():
     with pytest.raises(ValueError, match="effort must be one of feasible, good, best, got 'more'"):
         pj.hit.planner("exact", effort="more")
-    for task, name in ((pj.hit, "juggle"), (pj.catch, "mpp")):
+    for task, name in ((pj.hit, "juggle"), (pj.catch, "mpp"), (pj.block, "direct")):
         with pytest.raises(ValueError, match="effort must be feasible for a .*, which minimises"):
             task.planner(name, effort="good")
     for kind, name in ((HitSettings, "juggle"), (CatchSettings, "mpp")):
         with pytest.raises(ArgumentError, match=f"effort must be left out for the planner {name}"):
             kind(planner=name, effort="good")
         assert kind(effort="good").planner_options()["effort"] == "good"
+    assert BlockSettings(effort="best").planner_options()["effort"] == "best"
+
+
+def test_more_effort_compares_more_motions_of_blocks_for_longer():
+    own = OnlineBlock()
+    assert pj.block.planner(effort="feasible") == own == own.with_effort("feasible")
+    good, best = (own.with_effort(effort) for effort in ("good", "best"))
+    assert own.settling == 0 < good.settling < best.settling
+    (search,) = best.searches
+    assert search.tries == max(each.first + each.tries for each in own.searches)
+    assert search.solver.max_steps == best.settling
+    assert pj.block.planner("brisk", effort="best") == pj.block.planner(effort="best", brisk=True)
+
+
+@pytest.mark.slow
+def test_more_effort_blocks_the_same_balls_at_less_cost():
+    cases = jax.tree.map(np.asarray, pj.block.draw(12, "pole", 4))
+    plans = [pj.plan(pj.block.planner(effort=each), cases) for each in EFFORTS]
+    success = np.array([pj.block.judge(cases, each).success for each in plans])
+    np.testing.assert_array_equal(success, [pj.are_solved(each) for each in plans])
+    both = success.all(axis=0)
+    assert both.sum() >= 8
+    costs = np.array([each.cost[both] for each in plans])
+    assert (costs[2] <= 1.01 * costs[0]).all()
+    assert np.median(costs[0] / costs[2]) < 1.1

@@ -34,6 +34,7 @@ sweep hit --delay 3            | --delay must be shorter than each serve's fligh
 sweep hit --limit-scale 1e-300               | --limit-scale must be from 0.001 to 1000
 sweep catch --limit-scale nan                | --limit-scale must be from 0.001 to 1000
 sweep hit --effort more                      | --effort must be one of feasible
+sweep block --effort more                    | --effort must be one of feasible
 sweep catch --recovery land                    | --recovery must be one of none
 sweep hit --delay inf                        | --delay must be finite and >= 0
 sweep hit --start nan 0 1                    | --start must be

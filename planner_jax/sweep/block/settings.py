@@ -4,7 +4,7 @@ import dataclasses
 import math
 from typing import Any, ClassVar
 
-from planner_jax.core.choices import require, require_one_of
+from planner_jax.core.choices import EFFORTS, require, require_one_of
 from planner_jax.runs.settings import Options, SweepSettings, option
 
 # Names of the sets of joint limits. They are repeated here, since `robot.arm` would import JAX.
@@ -60,10 +60,12 @@ class BlockSettings(SweepSettings):
     )
     anywhere: bool = option(False, "", "accept a ball anywhere on the shield, at any angle")
     delay: float = option(0.0, "S", "seconds until the arm may start")
+    effort: str = option(EFFORTS[0], "NAME", f"how long the planner searches: {', '.join(EFFORTS)}")
     arm: str | None = arm_option()
     tip: str | None = tip_option()
 
     RUN: ClassVar[str] = "planner_jax.sweep.block.sweep:BlockSweep"
+    PLANNER: ClassVar[tuple[str, ...]] = ("effort",)
     DRAW: ClassVar[tuple[str, ...]] = ("regime", "wide", "anywhere", "delay")
     CASE_BYTES: ClassVar[int] = 60_000
     CPU_BATCH: ClassVar[int] = 256
@@ -72,6 +74,7 @@ class BlockSettings(SweepSettings):
     def __post_init__(self) -> None:
         super().__post_init__()
         require_one_of(REGIMES, "regime", self.regime)
+        require_one_of(EFFORTS, "effort", self.effort)
         require_moderate("delay", self.delay)
         require_own_limits(self.arm, self.tip, self.regime)
 

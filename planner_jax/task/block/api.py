@@ -8,15 +8,19 @@ from planner_jax.task.block.plan import BlockPlan
 from planner_jax.task.block.spec import TASK
 
 
-def planner(name: str = "online", **options: object) -> Planner[BlockCase, BlockPlan]:
+def planner(
+    name: str = "online", *, effort: str = "feasible", **options: object
+) -> Planner[BlockCase, BlockPlan]:
     """Make a planner of blocks by its name.
 
     An end pose is a pose of the arm in which the shield meets the ball.
 
     * `online`: a straight motion in joint space if one is free of collisions. Otherwise least
-      squares find end pose, time of contact and motion together, from several starting points.
-    * `brisk`: the paths of `online` from standstill to standstill, as fast as the limits allow. The
-      arm then waits for the ball. These motions need more torque than the motions of `online`.
+      squares find end pose, time of contact and motion together, from several starting points. The
+      arm moves until the contact. The cost is the root mean square of the joints' accelerations,
+      each divided by its limit, so that motions need little torque.
+    * `brisk`: motions from standstill to standstill, as fast as the limits allow. The arm then
+      waits for the ball, and needs more torque than by `online`. The cost is the duration [s].
     * `library:FILE`: a motion that is stored in a file of `planner-jax library build`. The faces of
       two boxes around the arm are divided into cells, and the file has a motion for each pair of
       an outer and an inner cell through which a ball can fly.
@@ -29,12 +33,21 @@ def planner(name: str = "online", **options: object) -> Planner[BlockCase, Block
     * `insat`: the A* of `epase` interleaved with the optimisation of B-splines [Natarajan2024,
       Algorithm 2]; runs on the host.
 
-    Planners of other packages are also found by name. The options are fields of the planner's
-    class: `OnlineBlock`, `LibraryBlock`, `AdaptBlock`, `DirectBlock`, `RrtConnectBlock`,
-    `EpaseBlock` or `InsatBlock`. `ValueError` is raised for an unknown name, `TypeError` for an
-    unknown option, and `ModuleNotFoundError` if an extra is missing.
+    Planners of other packages are also found by name.
+
+    Args:
+        name: name of the planner, as listed above.
+        effort: "feasible" ends with the first plan that keeps every limit. "good" and "best"
+            compare more motions of `online` or `brisk`, for plans of less cost.
+        options: fields of the planner's class: `OnlineBlock`, `LibraryBlock`, `AdaptBlock`,
+            `DirectBlock`, `RrtConnectBlock`, `EpaseBlock` or `InsatBlock`.
+
+    Raises:
+        ValueError: no planner has the requested name, or it does not support the effort.
+        TypeError: an option is unknown.
+        ModuleNotFoundError: an extra is missing.
     """
-    return TASK.make_planner(name, options)
+    return TASK.make_planner(name, options).with_effort(effort)
 
 
 def judge(cases: BlockCase, plans: BlockPlan, **settings: object) -> BlockVerdict:

@@ -2,24 +2,25 @@
 
 An end pose is a pose of the arm in which the shield meets the ball, between the outer box and the
 protected inner box around the arm. A straight motion follows a straight line in joint space to an
-end pose. The planner returns the first straight motion that is in time and free of collisions. If
-there is none, Levenberg-Marquardt optimises end pose, time of contact and motion together. It
-starts from straight motions with an added bump (a detour of the joints), until one start leads to a
-plan that keeps every limit. [Natarajan2024] takes its motions from a library; this planner stores
-only the bumps.
+end pose. The planner checks straight motions by rising cost, and returns the first one that is free
+of collisions. If there is none, Levenberg-Marquardt optimises end pose, time of contact and motion
+together. It starts from straight motions with an added bump (a detour of the joints), until one
+start leads to a plan that keeps every limit. [Natarajan2024] takes its motions from a library; this
+planner stores only the bumps.
 """
 
 import dataclasses
 import functools
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
+from planner_jax.core.choices import EFFORTS, require_one_of
 from planner_jax.core.compiled import place_numbers, with_run_time_numbers
 from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import (
@@ -48,6 +49,8 @@ from planner_jax.task.block.end_poses import (
     contact_terms,
     end_poses,
     flight_of,
+    rank_straight,
+    thin_points,
 )
 from planner_jax.task.block.plan import BlockPlan, explain_status, make_empty_plan
 
@@ -58,6 +61,8 @@ _HIGHEST = lax.Precision.HIGHEST
 # Straight motions are first checked for collisions at `_COARSE` samples, several motions together.
 # Of the motions that pass, at most `_CHECKS` are checked at all samples.
 _COARSE, _CHECKS = 12, 3
+_EVERY = 3  # straight motions lead to the end poses of one in so many points of the ball's path
+_SETTLING = {"good": 24, "best": 48}  # effort -> number of steps that lower the cost
 _TURN = 5  # steps of least squares on a GPU before searches that have ended make room for others
 
 
@@ -94,8 +99,7 @@ _LEAST_SQUARES = (
     Search(straight=0, tries=4, kept=2),
     Search(straight=0, tries=11, first=4, kept=5, in_turn=False),
 )
-_SEARCHES = (Search(straight=6, tries=0), Search(tries=0), *_LEAST_SQUARES)
-_BRISK = (Search(tries=0), *_LEAST_SQUARES)
+_SEARCHES = (Search(straight=12, tries=0), Search(tries=0), *_LEAST_SQUARES)
 
 
 @functools.cache
@@ -147,7 +151,11 @@ def rank_poses(poses: EndPoses, num: int, most: float) -> Array:
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class OnlineBlock(Planner):
-    """Planner of arm motions that block a ball outside a protected box; cost: the duration [s]."""
+    """Planner of arm motions that block a ball outside a protected box.
+
+    The arm moves until the contact. The cost of a plan is the root mean square, over joints and
+    time, of the joints' accelerations divided by their limits. With `brisk` it is the duration [s].
+    """
 
     case_type: ClassVar[type] = BlockCase
     is_sequential: ClassVar[bool] = True
@@ -160,15 +168,39 @@ class OnlineBlock(Planner):
     # [m], least distance from capsules, boxes and cylinders; covers gaps between samples
     obstacle_margin: float = 0.012
     slack: float = 0.004  # fraction of every limit that plans leave unused
-    # Whether motions from standstill to standstill are as fast as the limits allow, and the fastest
-    # straight motion is selected: the arm then waits for the ball. Otherwise the arm moves until
-    # the contact, which needs less torque.
+    # Whether motions from standstill to standstill are as fast as the limits allow: the arm then
+    # waits for the ball. Otherwise the arm moves until the contact, which needs less torque.
     brisk: bool = False
+    # Number of steps of least squares that lower the cost of a solved plan, unless `brisk` is true.
+    # If the number is not 0, all straight motions and starting points of a search are compared.
+    settling: int = 0
     weights: motion.Weights = motion.Weights()
     searches: tuple[Search, ...] = _SEARCHES
 
     def __post_init__(self) -> None:
         require_settings(self)
+
+    def with_effort(self, effort: str) -> Self:
+        """Return a planner that compares motions, and selects the motion of least cost.
+
+        Args:
+            effort: "good" compares 48 straight motions, or starting points of least squares if none
+                is solved, and lowers the cost of the best plan by up to 24 steps. "best" compares
+                straight motions and all starting points, with up to 48 steps for each starting
+                point. "feasible" returns the planner itself, which ends with the first plan.
+        """
+        require_one_of(EFFORTS, "effort", effort)
+        if effort not in _SETTLING:
+            return self
+        straight = max(search.straight for search in self.searches)
+        bent = tuple(search for search in self.searches if search.tries)
+        if effort == "good":
+            searches = (Search(straight=straight, tries=0), *bent)
+        else:
+            solver = dataclasses.replace(self.searches[0].solver, **_settle_by(_SETTLING[effort]))
+            tries = max(_count_starts(bent), 1)
+            searches = (Search(straight=straight, tries=tries, solver=solver),)
+        return dataclasses.replace(self, searches=searches, settling=_SETTLING[effort])
 
     @property
     def attempts(self) -> tuple[Search, ...]:
@@ -195,13 +227,14 @@ class OnlineBlock(Planner):
 
         With `attempt.in_turn`, starting points are refined one after another. Otherwise all take a
         few trial steps, and the `attempt.kept` points of least cost are refined. The search ends at
-        the first solved plan, but with `brisk` it compares all straight motions.
+        the first solved plan, unless `settling` requires a comparison.
         """
-        flight, poses, order = self._rank(case)
         if isinstance(attempt, StraightSearch):
-            plan = self._plan_straight(case, flight, poses, order, attempt)
+            plan, poses = self._plan_straight(case, attempt)
+            plan = self._settle(case, flight_of(case), plan)
             return dataclasses.replace(plan, status=explain_status(poses, plan.status))
-        straight = self._count_straight(flight, poses, attempt)
+        flight, poses, order = self._rank(case)
+        goals, goal_order, straight = self._rank_straight(case, poses, _EVERY, attempt)
         model = lambda point: self.model(point, case, flight)  # noqa: E731
         solver, tries = attempt.solver, jnp.where(flight.comes, attempt.tries, 0)
         kept = jnp.where(attempt.in_turn, 0, jnp.minimum(attempt.kept, tries))
@@ -213,7 +246,7 @@ class OnlineBlock(Planner):
             is_new = is_straight | is_trial | attempt.in_turn
             index = jnp.where(is_new, index, jnp.argmin(costs))
             start = self._encode_start(case, poses, order, attempt.first + index)
-            straight_start = self.encode_straight(case, poses, order[k])
+            straight_start = self.encode_straight(case, goals, goal_order[k])
             begin = levenberg.start_search(jnp.where(is_straight, straight_start, start), solver)
             pick = lambda new, old: jnp.where(is_new, new, old[index])  # noqa: E731
             search = jax.tree.map(pick, begin, searches)
@@ -227,8 +260,7 @@ class OnlineBlock(Planner):
 
         def is_open(turn: tuple[Array, LevenbergState, Array, BlockPlan]) -> Array:
             k, best = turn[0], turn[-1]
-            compares = (k < straight) if self.brisk else False
-            return (k < straight + tries + kept) & (compares | ~is_solved(best.status))
+            return (k < straight + tries + kept) & (bool(self.settling) | ~is_solved(best.status))
 
         num, dtype = len(self._starts(case)[0]), case.angles.dtype
         size = case.arm.num * self.pieces + 1
@@ -236,18 +268,17 @@ class OnlineBlock(Planner):
         searches = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (num, *leaf.shape)), empty)
         costs, best = jnp.full(num, jnp.inf, dtype), make_empty_plan(case, self.pieces)
         turn = (jnp.zeros((), jnp.int32), searches, costs, best)
-        plan = lax.while_loop(is_open, take_turn, turn)[-1]
+        plan = self._settle(case, flight, lax.while_loop(is_open, take_turn, turn)[-1])
         return dataclasses.replace(plan, status=explain_status(poses, plan.status))
 
     def solve_at_once(self, cases: BlockCase, attempt: Search) -> BlockPlan:
         """Return the plans of a batch, on a GPU: the cases take the steps of searches together."""
-        flights, poses, orders = jax.vmap(self._rank)(cases)
-        given = cases, flights, poses, orders
-        best = jax.vmap(lambda case: make_empty_plan(case, self.pieces))(cases)
-        if isinstance(attempt, StraightSearch) or any(s.straight for s in self.searches if s.tries):
-            best = jax.vmap(functools.partial(self._plan_straight, attempt=attempt))(*given)
+        flights = jax.vmap(flight_of)(cases)
+        best, poses = jax.vmap(lambda case: self._plan_straight(case, attempt))(cases)
         if not isinstance(attempt, StraightSearch):
-            best = self._refine_at_once(*given, best, attempt)
+            _, poses, orders = jax.vmap(self._rank)(cases)
+            best = self._refine_at_once(cases, flights, poses, orders, best, attempt)
+        best = jax.vmap(self._settle)(cases, flights, best)
         return dataclasses.replace(best, status=jax.vmap(explain_status)(poses, best.status))
 
     def _refine_at_once(
@@ -266,6 +297,7 @@ class OnlineBlock(Planner):
         of all cases, one for each case on average, take a few steps.
         """
         solver, kept = attempt.solver, max(search.kept for search in self.searches)
+        is_left = (~is_solved(best.status)) | bool(self.settling)
         slots, num, dtype = kept + 1, orders.shape[0], cases.angles.dtype
 
         def advance(search: LevenbergState, most: Array, given: tuple) -> LevenbergState:
@@ -275,7 +307,7 @@ class OnlineBlock(Planner):
             each = jax.vmap(lambda search: levenberg.is_open(search, solver, solver.max_steps))
             chosen = (jnp.arange(slots) < attempt.kept) & jnp.isfinite(costs)
             is_open = each(searches).reshape(num, slots) & chosen
-            return (is_open & ~is_solved(best.status)[:, None]).reshape(-1)
+            return (is_open & is_left[:, None]).reshape(-1)
 
         def take_turn(state: tuple[Array, Array, LevenbergState]) -> tuple:
             turn, costs, searches = state
@@ -314,19 +346,26 @@ class OnlineBlock(Planner):
         def finish(k: Array, best: BlockPlan) -> BlockPlan:
             lanes = slots * jnp.arange(num) + k
             plans = jax.vmap(self.finish)(cases, flights, ends.point[lanes], ends.steps[lanes])
-            return select(plans, best, jnp.isfinite(costs[:, k]) & ~is_solved(best.status))
+            is_left = bool(self.settling) | ~is_solved(best.status)
+            return select(plans, best, jnp.isfinite(costs[:, k]) & is_left)
 
         return lax.fori_loop(0, jnp.minimum(attempt.kept, kept), finish, best)
 
-    def _plan_straight(
-        self, case: BlockCase, flight: Flight, poses: EndPoses, order: Array, attempt: Search
-    ) -> BlockPlan:
-        """Return the best of an attempt's straight motions, by default the first valid one.
+    def _plan_straight(self, case: BlockCase, attempt: Search) -> tuple[BlockPlan, EndPoses]:
+        """Return the first valid one of an attempt's straight motions, and the end poses.
+
+        With `settling`, all motions are compared, and the best one is returned.
 
         A few samples of each motion are checked for collisions first. Nearly all motions that pass
         are valid, so that few motions are checked at all samples.
         """
-        num = self._count_straight(flight, poses, attempt)
+        flight = flight_of(case)
+        poses = end_poses(case, flight, self.points, self.pieces, every=_EVERY)
+        if not isinstance(attempt, StraightSearch) and not any(
+            search.straight for search in self.searches if search.tries
+        ):
+            return make_empty_plan(case, self.pieces), poses
+        poses, order, num = self._rank_straight(case, poses, 1, attempt)
         shares, coarse = self._shares(), min(_COARSE, self.checked)
         few = tuple(np.arange(1, coarse + 1) / coarse)
         block = max(1, len(shares) // coarse)  # number of motions that are checked together first
@@ -355,12 +394,28 @@ class OnlineBlock(Planner):
 
         def goes_on(state: tuple[Array, Array, BlockPlan]) -> Array:
             turn, free, best = state
-            stops = False if self.brisk else is_solved(best.status) | (turn >= blocks + _CHECKS)
-            return (turn < blocks) | (jnp.any(free) & jnp.logical_not(stops))
+            if self.settling:
+                return (turn < blocks) | jnp.any(free)
+            stops = is_solved(best.status) | (turn >= blocks + _CHECKS)
+            return (turn < blocks) | (jnp.any(free) & ~stops)
 
         free = jnp.zeros(block * -(-len(order) // block), bool)
         start = jnp.zeros((), jnp.int32), free, make_empty_plan(case, self.pieces)
-        return lax.while_loop(goes_on, take_turn, start)[-1]
+        return lax.while_loop(goes_on, take_turn, start)[-1], poses
+
+    def _settle(self, case: BlockCase, flight: Flight, plan: BlockPlan) -> BlockPlan:
+        """Return the plan, or a plan of less cost that least squares find from it."""
+        if self.brisk or not self.settling:
+            return plan
+        solver = dataclasses.replace(Search.solver, **_settle_by(self.settling), hope=None)
+        coeffs, durations = plan.motion.coeffs, plan.motion.durations
+        rates = coeffs[:, 1] + 2.0 * durations[:, None] * coeffs[:, 2]
+        point = jnp.append((jnp.sum(durations) * rates).reshape(-1), plan.contact_time)
+
+        def settle() -> BlockPlan:
+            return select(self.refine(case, flight, point, solver), plan)
+
+        return lax.cond(is_solved(plan.status), settle, lambda: plan)
 
     def _shares(self) -> tuple[float, ...]:
         """Return the samples of a motion that are checked, as fractions of the duration.
@@ -372,18 +427,21 @@ class OnlineBlock(Planner):
 
     def _rank(self, case: BlockCase) -> tuple[Flight, EndPoses, Array]:
         flight = flight_of(case)
-        poses = end_poses(case, flight, self.points, self.pieces, quickest=self.brisk)
+        poses = end_poses(case, flight, self.points, self.pieces)
         ranks, _ = read_learned_starts()
-        num = max(1 + max(ranks), *(search.straight for search in self.searches))
-        return flight, poses, rank_poses(poses, num, 1.0 - self.slack)
+        return flight, poses, rank_poses(poses, 1 + max(ranks), 1.0 - self.slack)
 
-    def _count_straight(self, flight: Flight, poses: EndPoses, attempt: Search) -> Array:
-        in_time = jnp.sum(poses.effort <= 1.0 - self.slack)
-        return jnp.where(flight.comes, jnp.minimum(in_time, attempt.straight), 0)
+    def _rank_straight(
+        self, case: BlockCase, poses: EndPoses, every: int, attempt: Search
+    ) -> tuple[EndPoses, Array, Array]:
+        points = len(thin_points(self.points, _EVERY // every))
+        settings = (points, every, self.pieces, 1.0 - self.slack, self.brisk)
+        poses, order, num = rank_straight(case, poses, *settings)
+        most = max(search.straight for search in self.searches)
+        return poses, order[: max(most, 1)], jnp.minimum(num, attempt.straight)
 
     def _starts(self, case: BlockCase) -> tuple[np.ndarray, np.ndarray]:
-        most = max(search.first + search.tries for search in self.searches)
-        return read_learned_starts(most, case.arm.num)
+        return read_learned_starts(_count_starts(self.searches), case.arm.num)
 
     def _encode_start(self, case: BlockCase, poses: EndPoses, order: Array, k: Array) -> Array:
         ranks, bumps = (jnp.asarray(each) for each in self._starts(case))
@@ -498,12 +556,12 @@ class OnlineBlock(Planner):
         joint_excess = jnp.maximum(joints.excess, beyond)
         excess = _combine_excess(joint_excess, contact, self.margin - jnp.min(gaps[1:]))
         violation = jnp.where(point[-1] > case.delay, excess, jnp.inf)
-        status = status_of(duration, violation, violation > FEASIBILITY_TOLERANCE)
+        status = status_of(joints.load, violation, violation > FEASIBILITY_TOLERANCE)
         is_blocked = (gaps[0] < 0.0) & ~is_solved(status)  # the arm touches something at the start
         plan = BlockPlan(
             motion=motion.polynomial(case.angles, first, moves, duration),
             contact_time=point[-1],
-            cost=duration,
+            cost=joints.load,
             violation=violation,
             iterations=jnp.asarray(steps, jnp.int32),
             status=jnp.where(is_blocked, Status.BLOCKED, status).astype(jnp.int32),
@@ -514,7 +572,8 @@ class OnlineBlock(Planner):
         rate, rise = most * case.limits.velocity, most * case.limits.acceleration
         path, pace = motion.speed_up(plan.motion, rate, rise)
         rests = is_solved(plan.status) & case.ends_at_rest & jnp.all(case.rates == 0.0)
-        quick = dataclasses.replace(plan, motion=path, cost=pace * plan.cost)
+        plan = dataclasses.replace(plan, cost=duration)
+        quick = dataclasses.replace(plan, motion=path, cost=pace * duration)
         return jax.tree.map(lambda new, old: jnp.where(rests, new, old), quick, plan)
 
     def replanner(self) -> "ReplanBlock":
@@ -524,6 +583,15 @@ class OnlineBlock(Planner):
         return ReplanBlock(warm=WarmBlock(planner=self), planner=self)
 
 
+def _settle_by(steps: int) -> dict[str, Any]:
+    """Return fields of a solver that continues at feasible points, for `steps` steps at most."""
+    return {"max_steps": steps, "settled": 3, "tolerance": 2e-3}
+
+
+def _count_starts(searches: tuple[Search, ...]) -> int:
+    return max((search.first + search.tries for search in searches), default=0)
+
+
 def brisk(**fields: object) -> OnlineBlock:
     """Make an `OnlineBlock` whose motions end as early as possible; the arm waits for the ball."""
-    return OnlineBlock(**{"searches": _BRISK, "brisk": True, **fields})
+    return OnlineBlock(**{"brisk": True, **fields})

@@ -1,5 +1,7 @@
 """Arm poses in which the shield meets a ball, and residuals of this contact for least squares."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -17,6 +19,8 @@ _PLANE = 1e-3  # [m], greatest distance of the ball from the shield's plane at t
 # Tried offsets of the ball from the shield's middle along the two edges, divided by the greatest
 # offset that the case allows.
 _OFFSETS = np.array([(0.0, 0.0), (0.8, 0.0), (0.0, 0.8), (-0.8, 0.0), (0.0, -0.8)])
+
+_DELAYED = 0.4  # see `rank_straight`
 
 
 @struct.dataclass
@@ -73,19 +77,26 @@ def profile_peaks(pieces: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return np.max(np.abs(shapes), axis=1), np.max(np.abs(rises), axis=1), rests
 
 
+def _rms_rises(pieces: int) -> np.ndarray:
+    """Return the root mean square acceleration (P,) [rad/s^2] of the profiles of `all_profiles`."""
+    rises = np.diff(all_profiles(pieces)[0], axis=1, prepend=0.0) * pieces
+    return np.sqrt(np.mean(rises**2, axis=1))
+
+
 def end_poses(
-    case: BlockCase, flight: Flight, points: int, pieces: int, *, quickest: bool = False
+    case: BlockCase, flight: Flight, points: int, pieces: int, *, every: int = 1
 ) -> EndPoses:
     """Return the arm poses that meet the ball at each of `points` points of its path.
 
     The points lie where the ball has entered the outer box but not the inner box. The poses are the
     solutions of the inverse kinematics. The last joint keeps its angle if it only turns the shield
-    in its own plane. A straight motion of `pieces` pieces leads to each pose. Its speed
-    profile is the one that stays farthest below the joints' limits; with `quickest`, motions that
-    end at rest have the profile that can be executed in the least time.
+    in its own plane. A straight motion of `pieces` pieces leads to each pose. Its speed profile is
+    the one that stays farthest below the joints' limits. Only the points that `thin_points` selects
+    have poses.
     """
-    time = flight.earliest + (np.arange(points) + 0.5) / points * (flight.latest - flight.earliest)
-    offset = case.offset * jnp.asarray(_OFFSETS[np.arange(points) % len(_OFFSETS)], time.dtype)
+    chosen = thin_points(points, every)
+    time = flight.earliest + (chosen + 0.5) / points * (flight.latest - flight.earliest)
+    offset = case.offset * jnp.asarray(_OFFSETS[chosen % len(_OFFSETS)], time.dtype)
 
     def solve_point(time: Array, offset: Array) -> tuple[Array, Array]:
         ball = drag_free_flight(case.ball, time, case.gravity)
@@ -98,27 +109,89 @@ def end_poses(
         angles = angles.at[:, :, -1].set(case.angles[-1])
     time = jnp.repeat(time, angles.shape[1])
     angles = angles.reshape(-1, case.arm.num)
-    duration = jnp.maximum(time - case.delay, 1e-3)
-    turned = jnp.abs(angles - coast(case, duration, pieces))
-    rates, rises, rests = profile_peaks(pieces)
-    of_rate = jnp.max(turned / case.limits.velocity[None], axis=1) / duration
-    of_rise = jnp.max(turned / case.limits.acceleration[None], axis=1) / duration**2
-    of_rates, of_rises = of_rate[:, None] * rates[None], of_rise[:, None] * rises[None]
-    efforts = jnp.maximum(of_rates, of_rises)
-    is_allowed = rests | ~case.ends_at_rest
-    paces = efforts
-    if quickest:
-        paces = jnp.where(case.ends_at_rest, jnp.maximum(of_rates, jnp.sqrt(of_rises)), efforts)
-    profile = jnp.argmin(jnp.where(is_allowed, paces, jnp.inf), axis=1)
-    effort = jnp.min(jnp.where(is_allowed, efforts, jnp.inf), axis=1)
+    _, rates, rises = _shares_of_limits(case, angles, time, pieces)
+    efforts = jnp.maximum(rates, rises)
     exists = found.reshape(-1) & (time > case.delay) & flight.comes
     return EndPoses(
         angles=angles,
         time=time,
-        effort=jnp.where(exists, effort, jnp.inf),
-        profile=profile.astype(jnp.int32),
+        effort=jnp.where(exists, jnp.min(efforts, axis=1), jnp.inf),
+        profile=jnp.argmin(efforts, axis=1).astype(jnp.int32),
         is_found=found.reshape(-1) & flight.comes,
     )
+
+
+def thin_points(points: int, every: int) -> np.ndarray:
+    """Return the indices of the last of `points` points, and of every `every`-th before it."""
+    return np.arange(points)[::-every][::-1]
+
+
+def rank_straight(
+    case: BlockCase,
+    poses: EndPoses,
+    points: int,
+    every: int,
+    pieces: int,
+    most: float,
+    is_quick: bool,
+) -> tuple[EndPoses, Array, Array]:
+    """Return poses with profiles of least cost, the order in which to check them, and their number.
+
+    The cost of a straight motion is the root mean square of the joints' accelerations divided by
+    their limits. With `is_quick`, a motion from standstill to standstill is as fast as its limits
+    allow, and the cost is its duration [s]. The order is by rising cost. A pose for which the same
+    branch of the inverse kinematics has k poses of less cost is ranked as if its cost were larger
+    by the factor 1 + 0.4 k. The first motions in the order thus differ in their branches.
+
+    Args:
+        case: the case.
+        poses: poses at each of `points` points of the ball's path, from `end_poses`.
+        points: number of points, of which only those that `thin_points` selects are ranked.
+        every: argument of `thin_points`.
+        pieces: number of pieces of each motion.
+        most: greatest allowed ratio of a rate or acceleration to its limit.
+        is_quick: whether motions are as fast as the limits allow.
+    """
+    load, rates, rises = _shares_of_limits(case, poses.angles, poses.time, pieces)
+    costs = load[:, None] * jnp.asarray(_rms_rises(pieces), load.dtype)[None]
+    if is_quick:
+        paces = jnp.maximum(rates, jnp.sqrt(rises)) * (poses.time - case.delay)[:, None]
+        costs = jnp.where(case.ends_at_rest, paces, costs)
+    costs = jnp.where(jnp.maximum(rates, rises) <= most, costs, jnp.inf)
+    is_ranked = np.isin(np.arange(points), thin_points(points, every))
+    is_ranked = is_ranked.repeat(len(poses.time) // points) & (poses.effort <= most)
+    cost = jnp.where(is_ranked, jnp.min(costs, axis=1), jnp.inf)
+    behind = jnp.argsort(jnp.argsort(cost.reshape(points, -1), axis=0), axis=0)
+    order = jnp.argsort(cost * (1.0 + _DELAYED * behind.reshape(-1).astype(cost.dtype)))
+    profile = jnp.argmin(costs, axis=1).astype(jnp.int32)
+    return dataclasses.replace(poses, profile=profile), order, jnp.sum(is_ranked)
+
+
+def _shares_of_limits(
+    case: BlockCase, angles: Array, time: Array, pieces: int
+) -> tuple[Array, Array, Array]:
+    """Return shares of limits in straight motions to C poses at `angles` (C, n) and `time` (C,).
+
+    The P speed profiles are those of `all_profiles`; profiles that the case does not allow have
+    infinite shares.
+
+    Returns:
+        load: (C,), root mean square of the joints' angles turned, divided by the limits of
+            acceleration and the square of the duration.
+        rates: (C, P), greatest ratio of a joint's rate to its limit.
+        rises: (C, P), greatest ratio of a joint's acceleration to its limit.
+    """
+    duration = jnp.maximum(time - case.delay, 1e-3)
+    turned = jnp.abs(angles - coast(case, duration, pieces))
+    rates, rises, rests = profile_peaks(pieces)
+    of_rate = jnp.max(turned / case.limits.velocity[None], axis=1) / duration
+    loads = turned / case.limits.acceleration[None] / duration[:, None] ** 2
+    of_rates = of_rate[:, None] * rates[None]
+    of_rises = jnp.max(loads, axis=1)[:, None] * rises[None]
+    is_allowed = rests | ~case.ends_at_rest
+    load = jnp.sqrt(jnp.mean(loads**2, axis=1))
+    of_rates, of_rises = (jnp.where(is_allowed, each, jnp.inf) for each in (of_rates, of_rises))
+    return load, of_rates, of_rises
 
 
 def coast(case: BlockCase, duration: Array, pieces: int) -> Array:

@@ -74,6 +74,7 @@ class JointTerms(NamedTuple):
     gradient: Array  # (n, K + 1), J^T r
     curvature: Array  # (n, K + 1, K + 1), J^T J
     excess: Array  # (), largest relative excess over a limit
+    load: Array  # (), root mean square of accelerations divided by their limits
 
 
 def joint_terms(
@@ -129,6 +130,7 @@ def joint_terms(
         jnp.einsum("irk,ir->ik", slopes, values, precision=lax.Precision.HIGHEST),
         jnp.einsum("irk,irl->ikl", slopes, slopes, precision=lax.Precision.HIGHEST),
         jnp.max(jnp.stack(excess)) - 1.0,
+        jnp.sqrt(jnp.maximum(jnp.mean(rise_shares**2), 1e-12)),
     )
 
 
@@ -206,17 +208,17 @@ def profiles(pieces: int, ends_at_rest: bool) -> np.ndarray:
     A profile has the joint's rates at the ends of K = `pieces` pieces, times the duration [rad].
 
     The rate rises linearly, is then constant and, with `ends_at_rest`, falls linearly to zero. The
-    ramps last 1 to K / 2 pieces, or 1 to K pieces without `ends_at_rest`.
+    ramps last 1 to K / 2 pieces, or 1 to K pieces without `ends_at_rest`. In the last profile the
+    rate is a parabola, whose mean square acceleration is least.
     """
     knots = np.arange(1, pieces + 1)
     shapes = []
     for ramp in range(1, (pieces // 2 if ends_at_rest else pieces) + 1):
         shape = np.minimum(knots / ramp, 1.0)
-        if ends_at_rest:
-            shape = np.minimum(shape, (pieces - knots) / ramp)
-        rates = np.concatenate([[0.0], shape])
-        shapes.append(shape * pieces / np.sum(0.5 * (rates[1:] + rates[:-1])))
-    return np.array(shapes)
+        shapes.append(np.minimum(shape, (pieces - knots) / ramp) if ends_at_rest else shape)
+    shapes.append(knots * ((1 if ends_at_rest else 2) * pieces - knots))
+    means = [np.sum(shape) - 0.5 * shape[-1] for shape in shapes]
+    return np.array([shape * pieces / mean for shape, mean in zip(shapes, means, strict=True)])
 
 
 def lift_to_unknowns(

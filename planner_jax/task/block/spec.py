@@ -41,5 +41,5 @@ TASK = Task(
     flight="planner_jax.sims.settings:BlockFly",
     contact="contact_time",
     single="planner_jax.cli.plan.settings:SingleBlockSettings",
-    yardstick={"name": "brisk"},
+    yardstick={"name": "brisk", "effort": "best"},
 )
