@@ -1,9 +1,8 @@
-"""The planner of joint motions: the fastest motion if it is free, else least squares from a path.
+"""The planner of joint motions: the fastest motion if it is free, else a path and shortcuts.
 
 The planner first checks the fastest motion and the straight motion to each goal. If none is free of
-collisions, Levenberg-Marquardt shortens motions that start from straight motions with a bump (a
-detour of the joints), or from a path that RRT-Connect finds. A path itself is also a plan, if the
-arm stops at its corners.
+collisions, RRT-Connect finds a path. The arm could follow the path and stop at its corners. Random
+shortcuts in time then remove the stops and make the motion fast.
 """
 
 import dataclasses
@@ -26,18 +25,17 @@ from planner_jax.core.protocol import (
     select,
     status_of,
 )
-from planner_jax.optimise.levenberg import LevenbergConfig, continue_search, start_search
 from planner_jax.robot.arm import Arm, ArmPlan
 from planner_jax.task.block.clearance import clearances
-from planner_jax.task.block.motion import bump_steps
-from planner_jax.task.reach import motion, tree
+from planner_jax.task.reach import motion, shortcut, tree
 from planner_jax.task.reach.case import ReachCase
-from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate, total_duration
+from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
 
-_TURN = 0.018  # [rad], greatest joint-space distance between two states that are checked
-_CHUNK = 64  # number of states that are checked together
-_POWERS = (2.0, 4.0, 8.0)  # powers of relative accelerations in the cost, one after another
-_CUTS = 200  # number of attempts to shorten a path
+# Distances [m] between states of a motion that are checked: of plans, and of motions that shortcuts
+# make faster. If the coarse distance misses a collision, the shortcuts are repeated with the other.
+_RESOLUTION, _COARSE = 0.02, 0.04
+_CHUNK = 16  # number of states that are checked together
+_CUTS = 30  # number of attempts to shorten a path
 
 
 @struct.dataclass
@@ -52,20 +50,14 @@ class Search(Attempt):
     """An attempt: check the fastest and the straight motion to each goal."""
 
 
-@dataclasses.dataclass(frozen=True)
-class BumpSearch(Search):
-    """An attempt: shorten straight motions with bumps until one is free of collisions."""
-
-    bumps: int = 8
-
-
-@with_run_time_numbers("rays", "seed")
+@with_run_time_numbers("rays", "shortcuts", "seed")
 @dataclasses.dataclass(frozen=True)
 class TreeSearch(Search):
-    """An attempt: find a path by RRT-Connect, and shorten the motion along it."""
+    """An attempt: find a path by RRT-Connect, and make the motion along it faster."""
 
     rays: int = 1000  # greatest number of attempts to grow a tree of joint states
-    seed: int = 0  # of the random states
+    shortcuts: int = 300  # number of attempts to make the motion faster
+    seed: int = 0  # of the random states and shortcuts
 
 
 @jax.tree_util.register_static
@@ -76,21 +68,19 @@ class ReachPlanner(Planner):
     case_type: ClassVar[type] = ReachCase
     plan_type: ClassVar[type] = ReachPlan
     is_sequential: ClassVar[bool] = True
-    pieces: int = 30  # greatest number of pieces of a motion
-    samples: int = 60  # samples of a motion at which least squares compute distances
-    worst: int = 12  # samples with the least distances, at which derivatives are computed
+    pieces: int = 96  # greatest number of pieces of a motion
     capacity: int = 8192  # greatest number of states of a tree
     margin: float = 0.002  # [m], distance from obstacles, if start and goal have twice as much
     slack: float = 1e-4  # fraction of every limit of rates and accelerations that is left unused
-    solver: LevenbergConfig = LevenbergConfig(12, 1e-2, 0.25, 6.0, longest=2.0)
     searches: tuple[Search, ...] = (
         Search(),
-        BumpSearch(),
         TreeSearch(),
-        TreeSearch(rays=8000, seed=1),
-        TreeSearch(rays=8000, seed=2),
-        TreeSearch(rays=16000, seed=3),
+        TreeSearch(rays=2000, seed=1),
+        TreeSearch(rays=4000, seed=2),
+        TreeSearch(rays=8000, seed=3),
         TreeSearch(rays=16000, seed=4),
+        TreeSearch(rays=16000, seed=5),
+        TreeSearch(rays=16000, seed=6),
     )
 
     def __post_init__(self) -> None:
@@ -106,13 +96,6 @@ class ReachPlanner(Planner):
         if isinstance(attempt, TreeSearch):
             return place_numbers(attempt)
         return super().load_attempt(attempt, cases)
-
-    def compiles_quickly(self, attempt: Search) -> bool:
-        """Return whether a search's program is compiled in less time, though it then runs slower.
-
-        This is true for all but the first search, since fewer cases need these programs.
-        """
-        return type(getattr(attempt, "attempt", attempt)) is not Search
 
     def solve(self, case: ReachCase, attempt: Search) -> ReachPlan:
         """Return the plan of one case by one search."""
@@ -130,7 +113,7 @@ class ReachPlanner(Planner):
         is_open = jnp.any(is_good) & (gaps[0] >= 0.0)
         best = self._stand_still(case)
         # Goals in the order of the least durations; goals that cannot be reached come last.
-        times = jax.vmap(lambda goal: motion.quickest_knots(case.angles, goal, limits)[0][-1])(
+        times = jax.vmap(lambda goal: jnp.sum(motion.quickest_knots(case.angles, goal, limits)[0]))(
             case.goals
         )
         order = jnp.argsort(jnp.where(is_good, times, jnp.inf))
@@ -141,8 +124,6 @@ class ReachPlanner(Planner):
                 lambda: self._plan_by_tree(case, rows, is_good, order, num, attempt),
                 lambda: best,
             )
-        elif isinstance(attempt, BumpSearch):
-            plan = self._plan_by_bumps(case, rows, order, num, attempt, best)
         else:
             plan = self._plan_directly(case, rows, order, num, best)
         status = jnp.where(is_open, plan.status, jnp.where(gaps[0] < 0.0, Status.BLOCKED, blocked))
@@ -158,41 +139,11 @@ class ReachPlanner(Planner):
             quickest = motion.quickest_knots(points[0], points[1], case.limits)
             straight = motion.straight_knots(points, case.limits)
             both = [motion.pad_knots(*each, self.pieces) for each in (quickest, straight)]
-            times, rates = jax.tree.map(lambda a, b: jnp.where(k < num, a, b), *both)
-            return k + 1, select(self.finish(case, rows, index, times, rates), best)
+            knots = jax.tree.map(lambda a, b: jnp.where(k < num, a, b), *both)
+            return k + 1, select(self.finish(case, rows, index, *knots), best)
 
         def is_open(state: tuple[Array, ReachPlan]) -> Array:
             return (state[0] < 2 * num) & ~is_solved(state[1].status)
-
-        return lax.while_loop(is_open, try_next, (jnp.zeros((), jnp.int32), best))[1]
-
-    def _plan_by_bumps(
-        self,
-        case: ReachCase,
-        rows: Array,
-        order: Array,
-        num: Array,
-        attempt: BumpSearch,
-        best: ReachPlan,
-    ) -> ReachPlan:
-        joints = case.angles.shape[0]
-        heights = np.random.default_rng(0).normal(size=(attempt.bumps, joints))
-        heights[0] = 0.0
-        heights *= np.where(np.arange(joints) < joints - 3, 0.6, 0.3)
-
-        def try_next(state: tuple[Array, ReachPlan]) -> tuple[Array, ReachPlan]:
-            k, best = state
-            index = order[k % num]
-            points = jnp.stack([case.angles, case.goals[index]])
-            start = motion.steps_along(points, case.limits, self.pieces)
-            height = jnp.asarray(heights, start.dtype)[k]
-            start += bump_steps(height, self.pieces)[:-1]
-            point, steps = self._refine(case, rows, index, start)
-            plan = self.finish(case, rows, index, *motion.steps_knots(point, case.limits))
-            return k + 1, select(dataclasses.replace(plan, iterations=steps), best)
-
-        def is_open(state: tuple[Array, ReachPlan]) -> Array:
-            return (state[0] < attempt.bumps) & (num > 0) & ~is_solved(state[1].status)
 
         return lax.while_loop(is_open, try_next, (jnp.zeros((), jnp.int32), best))[1]
 
@@ -232,16 +183,27 @@ class ReachPlanner(Planner):
         def follow() -> ReachPlan:
             path = tree.shorten(is_free, points, _CUTS, attempt.seed) / lever[None]
             goal = jnp.argmin(jnp.sum((case.goals - path[-1][None]) ** 2, axis=1))
-            start = motion.steps_along(path, case.limits, self.pieces)
-            point, steps = self._refine(case, rows, goal, start)
-            both = [motion.steps_knots(point, case.limits), self._stop_at_corners(case, path)]
-            knots = jax.tree.map(lambda *each: jnp.stack(each), *both)
+            own = self._floors(jnp.minimum(rows[:, 0], rows[:, 1 + goal]))
+            stops = self._stop_at_corners(case, path)
 
-            def check(k: Array, best: ReachPlan) -> ReachPlan:
-                return select(self.finish(case, rows, goal, *(each[k] for each in knots)), best)
+            def try_next(state: tuple[Array, ReachPlan]) -> tuple[Array, ReachPlan]:
+                k, best = state
+                resolution = jnp.where(k == 0, _COARSE, _RESOLUTION)
+                fast = shortcut.hasten(
+                    lambda path: self._least_excess(case, own, path, resolution) >= 0.0,
+                    case.angles,
+                    stops,
+                    case.limits,
+                    jnp.where(k < 2, attempt.shortcuts, 0),
+                    attempt.seed,
+                )
+                return k + 1, select(self.finish(case, rows, goal, *fast), best)
 
-            plan = lax.fori_loop(0, 2, check, self._stand_still(case))
-            return dataclasses.replace(plan, iterations=steps)
+            def is_open(state: tuple[Array, ReachPlan]) -> Array:
+                return (state[0] < 3) & ~is_solved(state[1].status)
+
+            first = (jnp.zeros((), jnp.int32), self._stand_still(case))
+            return lax.while_loop(is_open, try_next, first)[1]
 
         plan = lax.cond(is_found, follow, lambda: self._stand_still(case))
         return dataclasses.replace(plan, iterations=plan.iterations + rays)
@@ -269,33 +231,12 @@ class ReachPlanner(Planner):
         fits = jnp.sum(bends, dtype=jnp.int32) < most
         return knots[0], jnp.where(fits, knots[1], jnp.nan)
 
-    def _refine(
-        self, case: ReachCase, rows: Array, goal: Array, start: Array
-    ) -> tuple[Array, Array]:
-        """Return unknowns (K - 1, n) with less duration and collisions, and the number of steps."""
-        turn = case.goals[goal] - case.angles
-        ends = jnp.minimum(rows[:, 0], rows[:, 1 + goal])
-        sizes = (self.pieces, self.samples, self.worst)
-
-        def refine(k: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
-            point, steps = state
-            whole = motion.end_at(point.reshape(start.shape), turn)
-            duration = motion.least_duration(whole, case.limits)
-            power = jnp.asarray(_POWERS, point.dtype)[k]
-            model = motion.make_model(case, turn, ends, duration, power, sizes)
-            search = continue_search(model, start_search(point, self.solver), self.solver)
-            return search.point, steps + search.steps
-
-        first = (start.reshape(-1), jnp.zeros((), jnp.int32))
-        point, steps = lax.fori_loop(0, len(_POWERS), refine, first)
-        return motion.end_at(point.reshape(start.shape), turn), steps
-
     def _floors(self, ends: Array) -> Array:
         """Return the distance (R,) [m] that each pair keeps, by its distance (R,) at the ends."""
         return jnp.clip(0.5 * ends, 0.0, self.margin)
 
     def finish(
-        self, case: ReachCase, rows: Array, goal: Array, times: Array, rates: Array
+        self, case: ReachCase, rows: Array, goal: Array, durations: Array, rates: Array
     ) -> ReachPlan:
         """Return the plan of a motion with these knots, and check it for collisions.
 
@@ -303,15 +244,14 @@ class ReachPlanner(Planner):
             case: the case.
             rows: (R, 1 + G) [m], distances of R pairs of bodies at the start and at the goals.
             goal: () index of the motion's goal.
-            times: (M + 1,) [s], of the knots.
+            durations: (M,) [s], of the pieces.
             rates: (M + 1, n) [rad/s], joint rates at the knots.
         """
-        path = motion.join_knots(case.angles, times, rates)
-        duration = times[-1]
+        path = motion.join_knots(case.angles, durations, rates)
+        duration = jnp.sum(durations)
         floors = self._floors(jnp.minimum(rows[:, 0], rows[:, 1 + goal]))
-        fastest = jnp.max(jnp.sqrt(jnp.sum(rates**2, axis=1)))
-        violation = 100.0 * jnp.maximum(-self._least_excess(case, floors, path, fastest), 0.0)
-        violation = jnp.where(jnp.isfinite(duration * fastest), violation, jnp.inf)
+        violation = 100.0 * jnp.maximum(-self._least_excess(case, floors, path, _RESOLUTION), 0.0)
+        violation = jnp.where(jnp.isfinite(duration + jnp.sum(rates)), violation, jnp.inf)
         return ReachPlan(
             motion=path,
             goal=goal.astype(jnp.int32),
@@ -322,29 +262,47 @@ class ReachPlanner(Planner):
         )
 
     def _least_excess(
-        self, case: ReachCase, floors: Array, path: PiecewisePolynomial, fastest: Array
+        self,
+        case: ReachCase,
+        floors: Array,
+        path: PiecewisePolynomial,
+        resolution: Array | float,
     ) -> Array:
         """Return the least excess [m] of a pair's distance over its required distance.
 
-        It is -inf if a joint exceeds its limits of angle. The check ends at the first collision.
+        It is -inf if a joint exceeds its limits of angle. Each chunk of states covers the motion,
+        and the check ends after the first chunk with a collision. The offsets of successive chunks
+        follow the golden ratio, so that the first chunks leave no wide gaps.
         """
-        duration = total_duration(path)
-        count = jnp.maximum(jnp.ceil(duration * fastest / _TURN), 1.0)
+        rates = path.coeffs[:, 1]
+        last = rates[-1:] + 2.0 * path.durations[-1] * path.coeffs[-1:, 2]
+        speed = jnp.concatenate([rates, last]) * _levers(case.arm)[None]
+        speed = jnp.sqrt(jnp.sum(speed**2, axis=1))
+        # Bounds of the distances from the start to the ends of the pieces.
+        passed = jnp.cumsum(path.durations * jnp.maximum(speed[1:], speed[:-1]))
+        passed, ends = (jnp.append(0.0, each) for each in (passed, jnp.cumsum(path.durations)))
+        chunks = jnp.maximum(jnp.ceil(passed[-1] / (resolution * _CHUNK)), 1.0)
+        num, lane = chunks.astype(jnp.int32), jnp.arange(_CHUNK, dtype=chunks.dtype)
+        # The step between offsets has no common divisor with their number.
+        steps = (0.618 * chunks).astype(jnp.int32) + jnp.arange(1, 9, dtype=jnp.int32)
+        step = steps[jnp.argmax(jnp.gcd(steps, num) == 1)]
 
         def check(state: tuple[Array, Array]) -> tuple[Array, Array]:
             done, least = state
-            share = jnp.minimum(done + jnp.arange(_CHUNK, dtype=done.dtype), count) / count
-            angles = jax.vmap(lambda share: evaluate(path, share * duration))(share)
+            offset = (done * step % num).astype(chunks.dtype)
+            share = (lane * chunks + offset + 0.5) / (chunks * _CHUNK)
+            times = jnp.interp(share * passed[-1], passed, ends)
+            angles = jax.vmap(lambda time: evaluate(path, time))(times)
             near = jnp.min(clearances(case.arm, case.scene, angles) - floors[:, None])
             beyond = jnp.any(
                 (angles < case.arm.lower[None] - 1e-4) | (angles > case.arm.upper[None] + 1e-4)
             )
-            return done + _CHUNK, jnp.minimum(least, jnp.where(beyond, -jnp.inf, near))
+            return done + 1, jnp.minimum(least, jnp.where(beyond, -jnp.inf, near))
 
         def is_open(state: tuple[Array, Array]) -> Array:
-            return (state[0] <= count) & (state[1] >= 0.0)
+            return (state[0] < num) & (state[1] >= 0.0)
 
-        first = (jnp.zeros_like(count), jnp.full_like(count, jnp.inf))
+        first = (jnp.zeros_like(num), jnp.full_like(floors[0], jnp.inf))
         return lax.while_loop(is_open, check, first)[1]
 
     def _stand_still(self, case: ReachCase) -> ReachPlan:
@@ -352,7 +310,7 @@ class ReachPlanner(Planner):
         none = jnp.full((), jnp.inf, dtype)
         path = motion.join_knots(
             case.angles,
-            jnp.linspace(0.0, 1.0, self.pieces + 1, dtype=dtype),
+            jnp.full(self.pieces, 1.0 / self.pieces, dtype),
             jnp.zeros((self.pieces + 1, num), dtype),
         )
         return ReachPlan(

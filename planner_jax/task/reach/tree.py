@@ -1,7 +1,8 @@
 """Paths of an arm among obstacles by RRT-Connect [Kuffner2000], as one compiled program.
 
 Two trees of joint states grow, one from the start and one from the goals. In turn a tree grows
-towards a random state, and the other tree then grows towards the new state, until both meet.
+towards a random state until it reaches the state or an obstacle, and the other tree then grows
+towards the new state, until both meet.
 """
 
 from collections.abc import Callable
@@ -12,8 +13,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 RESOLUTION = 0.035  # [m], distance between states of a path that are checked
-_STEP = 1.0  # [m], greatest distance by which a tree grows towards a random state
-_CHUNK = 32  # number of states that are checked together
+_CHUNK = 16  # number of states that are checked together
 _SLOTS = 128  # number of points of a path
 
 
@@ -30,25 +30,23 @@ class _Trees(NamedTuple):
 
 
 def advance(
-    is_free: Callable[[Array], Array], start: Array, goal: Array, longest: Array | float
+    is_free: Callable[[Array], Array], start: Array, goal: Array
 ) -> tuple[Array, Array, Array]:
     """Move straight from one joint state (n,) [rad] towards another, until a state is not free.
 
     Returns:
-        end: (n,) [rad], the last free state, at most `longest` [rad] from the start.
+        end: (n,) [rad], the last free state.
         is_goal: () bool, whether the end is the goal.
         moved: () [rad], the distance from start to end.
     """
     line = goal - start
     length = jnp.sqrt(jnp.sum(line**2))
-    most = jnp.minimum(length, longest)
-    count = jnp.maximum(jnp.ceil(most / RESOLUTION), 1.0)
-    step = most / (count * jnp.maximum(length, 1e-9))
+    count = jnp.maximum(jnp.ceil(length / RESOLUTION), 1.0)
 
     def check(state: tuple[Array, Array]) -> tuple[Array, Array]:
         done, _ = state
         index = jnp.minimum(done + 1.0 + jnp.arange(_CHUNK, dtype=done.dtype), count)
-        free = is_free(start[None] + (index * step)[:, None] * line[None])
+        free = is_free(start[None] + (index / count)[:, None] * line[None])
         passed = jnp.sum(jnp.cumprod(free.astype(done.dtype)))
         return jnp.minimum(done + passed, count), passed == _CHUNK
 
@@ -56,9 +54,8 @@ def advance(
         return state[1] & (state[0] < count)
 
     done, _ = lax.while_loop(is_open, check, (jnp.zeros_like(count), jnp.ones((), bool)))
-    is_goal = (done >= count) & (length <= longest)
-    end = jnp.where(is_goal, goal, start + done * step * line)
-    return end, is_goal, done * step * length
+    end = jnp.where(done >= count, goal, start + done / count * line)
+    return end, done >= count, done / count * length
 
 
 def find_path(
@@ -109,8 +106,7 @@ def find_path(
         nearest = jnp.argmin(jnp.where(jnp.arange(capacity) < count, away, jnp.inf)).astype(
             jnp.int32
         )
-        most = jnp.where(joins, jnp.inf, _STEP)
-        end, is_target, moved = advance(is_free, nodes[nearest], target, most)
+        end, is_target, moved = advance(is_free, nodes[nearest], target)
         is_new = moved > 0.5 * RESOLUTION
         index = jnp.where(is_new, count, nearest)
         is_joined = joins & is_target
@@ -181,7 +177,7 @@ def shorten(
 
         (begin, a), (until, b) = locate(first), locate(second)
         has_slots = until - begin >= 2
-        _, is_clear, _ = advance(is_free, a, b, jnp.where(has_slots, jnp.inf, 0.0))
+        _, is_clear, _ = advance(is_free, a, jnp.where(has_slots, b, a))
         inside = (position > begin) & (position <= until) & is_clear & has_slots
         middle = (begin + until + 1) // 2
         return jnp.where(
