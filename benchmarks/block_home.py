@@ -29,7 +29,7 @@ import planner_jax as pj
 from planner_jax.benchmarks.run import argument_parser, begin
 from planner_jax.robot.arm_file import irb1600
 from planner_jax.sweep.block.settings import REGIMES
-from planner_jax.task.block.clearance import clearances, num_of_pole
+from planner_jax.task.block.clearance import clearances, num_of_obstacles
 from planner_jax.task.block.default_planner import OnlineBlock, Search
 from planner_jax.task.block.scene import paper_scene
 
@@ -74,7 +74,7 @@ def draw_candidates(random: np.random.Generator, num: int, around: np.ndarray | 
 
     @jax.jit
     def is_free(angles: jax.Array) -> jax.Array:
-        gaps, of_pole = clearances(arm, scene, angles), num_of_pole(arm)
+        gaps, of_pole = clearances(arm, scene, angles), num_of_obstacles(arm, scene)
         near_pole = jnp.min(gaps[:of_pole], axis=0) < POLE_MARGIN
         return (jnp.min(gaps, axis=0) > MARGIN) & ~near_pole
 

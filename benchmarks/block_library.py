@@ -21,7 +21,6 @@ the faces into cells --layout. Then the program reports:
 """
 
 import argparse
-import dataclasses
 import time
 from pathlib import Path
 from typing import Any
@@ -268,8 +267,8 @@ def measure_repair(bench: Bench, library: Library, shift: float, num: int) -> No
     independent check.
     """
     scene = library.setting.scene
-    pole: Any = np.asarray(scene.pole) + np.array([0.0, shift], np.float32)
-    moved = dataclasses.replace(scene, pole=pole)
+    x, y = np.asarray(scene.capsule_ends)[0, 0, :2]
+    moved = paper_scene(pole=(x, y + shift))
     (fixed, touched), seconds = time_call(building.repair, library, moved, progress=False)
     stored = int(library.found.sum())
     bench.say(

@@ -68,6 +68,7 @@ def arm_of(origin, turn, lower, upper):
         shield_centre=np.array((0.05, 0.02, 0.1)),
         shield_turn=np.array((0.1, 0.7, -0.1, 0.7)),
         shield_half=np.array((0.15, 0.15)),
+        shield_corners=0.15 * np.array([(1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0), (1.0, -1.0)]),
         capsule_link=(),
         pairs=(),
         shield_pairs=(),

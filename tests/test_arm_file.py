@@ -459,3 +459,51 @@ def test_a_file_that_is_missing_or_is_no_model_is_named(folder):
         read_arm(folder / "text.xml")
     with pytest.raises(ArgumentError, match=r"shield.half must be > 0"):
         Shield(half=(0.0, 0.1))
+
+
+def test_a_disc_and_a_triangle_have_the_inertia_of_their_outlines(folder, six):
+    path, turn = folder / "maker/urdf/six.urdf", np.eye(3)
+    settings = {"limits": {"acceleration": 5}, "tip": "tool0", "dtype": np.float64}
+    radius, num = 0.2, 32
+    disc = read_arm(path, shield=Shield(radius=radius, mass=1e6), **settings)
+    turn = Rotation.from_quat(disc.shield_turn, scalar_first=True).as_matrix()
+    found = turn.T @ disc.inertia[5] @ turn / 1e6
+    of_polygon = radius**2 / 6.0 * (2.0 + np.cos(2.0 * np.pi / num))
+    flat = 0.5 * of_polygon + 0.01**2 / 12.0
+    np.testing.assert_allclose(found, np.diag([of_polygon, flat, flat]), atol=2e-5)
+    np.testing.assert_allclose(np.linalg.norm(disc.shield_corners, axis=1), radius)
+    corners = ((-0.1, -0.1), (-0.1, 0.2), (0.3, -0.1))  # clockwise
+    arm = read_arm(path, shield=Shield(corners=corners, mass=1e6), **settings)
+    middle = arm.shield_centre + turn @ np.array([-0.005, *np.mean(corners, axis=0)])
+    np.testing.assert_allclose(arm.centre[5], middle, atol=1e-5)
+    own = np.diag([0.0, 0.4**2 / 18.0, 0.3**2 / 18.0])
+    own[1, 2] = own[2, 1] = -0.4 * 0.3 / 36.0
+    found = turn.T @ arm.inertia[5] @ turn / 1e6
+    expected = np.trace(own) * np.eye(3) - own
+    np.testing.assert_allclose(found, expected, atol=2e-5)
+    np.testing.assert_allclose(arm.shield_half, [0.3, 0.2])
+    np.testing.assert_allclose(arm.shield_corners, corners[::-1])
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"radius": 0.0}, "shield.radius must be > 0, got 0"),
+        (
+            {"radius": 0.1, "half": (0.1, 0.1)},
+            "the shield must be described by one of half, radius",
+        ),
+        ({"corners": ((0.0, 1.0), (1.0, 0.0))}, "shield.corners must be at least three corners"),
+        (
+            {"corners": ((0.1, 0.0), (0.2, 0.1), (0.2, -0.1))},  # not around the middle
+            r"shield.corners must be corners of a convex polygon around \(0, 0\), in their order",
+        ),
+        (
+            {"corners": ((0.1, 0.1), (-0.1, 0.1), (0.01, 0.0), (-0.1, -0.1), (0.1, -0.1))},
+            "shield.corners must be corners of a convex polygon",
+        ),
+    ],
+)
+def test_an_outline_that_is_no_convex_polygon_is_rejected(options, message):
+    with pytest.raises(ArgumentError, match=f"^{message}"):
+        Shield(**options)

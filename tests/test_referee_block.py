@@ -501,6 +501,21 @@ def test_every_kind_of_obstacle_is_hit_and_named():
     assert_good(good(scene=make_scene(boxes=boxes[:1], capsules=rods[:1], cylinders=rods[:1])))
 
 
+def test_a_ball_must_be_within_the_outline_of_the_shield():
+    corners = np.array([(1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0), (1.0, -1.0)])
+    leaves = good(at=CONTACT + 0.12 * ROTATION[:, 1], anywhere=True)
+    assert_good(leaves)
+    for half, success in (((0.13, 0.01), True), ((0.11, 0.3), False), ((0.1195, 0.01), True)):
+        leaves["arm.shield_corners"] = (corners * half)[None]
+        assert judge(leaves).success[0] == success
+    ring = np.arange(6) * np.pi / 3.0  # a hexagon, whose side is nearer than its corners
+    for radius, success in ((0.118, False), (0.125, True)):
+        for turned in (ring, ring + np.pi / 6.0):
+            outline = radius * np.stack([np.cos(turned), np.sin(turned)], axis=1)
+            leaves["arm.shield_corners"] = outline[None]
+            assert judge(leaves).success[0] == (success and turned is ring)
+
+
 def unequal_lanes():
     failed = [FAILURES[key][0] for key in ("tilt: by TURN", "time: an hour", "self: wrist")]
     return [good(), *failed, good(durations=(0.05, 0.06)), good(durations=(0.1, 0.3)), good()]

@@ -129,7 +129,7 @@ def referee_blocks(
         tolerance: relative tolerance of velocities, accelerations, and the case's `offset` and
             `tilt` at the contact; absolute tolerance of the start and of jumps between pieces
             [rad], [rad/s], and of joint angles beyond their limits [rad].
-        contact_tolerance: [m], greatest distance of the ball from the shield's square face at the
+        contact_tolerance: [m], greatest distance of the ball from the shield's face at the
             contact, and greatest depth of the arm in an obstacle. The ball must be blocked inside
             the outer box, before it enters the protected inner box. The outer box is enlarged,
             and the inner box reduced, by this length.
@@ -163,6 +163,7 @@ def _read(cases, plans) -> dict[str, np.ndarray]:
             "arm.capsule_ends": (capsules, 2, 3),
             "arm.capsule_radius": (capsules,),
             "arm.shield_gap_radius": (capsules,),
+            "arm.shield_corners": ((*np.shape(cases.arm.shield_corners), 0, 0)[1], 2),
         }
     )
     for kind, parts in _OBSTACLES.items():
@@ -371,8 +372,11 @@ def _judge_contact(case: dict, angles: np.ndarray, relative: float, contact: flo
     toward, *across = rotate_back(turn, fall * time - case["ball.vel"].T)
     miss, tilt = np.hypot(*beside), np.arctan2(np.hypot(*across), toward)
     is_off = np.abs(height) > contact
+    corners = np.moveaxis(case["arm.shield_corners"], 2, 0)  # (2, B, K), counterclockwise
+    (y, z), (wide, high) = corners, np.roll(corners, -1, axis=2) - corners
+    beyond = (beside[0][:, None] - y) * high - (beside[1][:, None] - z) * wide
     is_beside = (miss > case["offset"] * (1.0 + relative)) | (
-        (np.abs(beside) > case["arm.shield_half"].T + contact).any(axis=0)
+        (beyond > contact * np.hypot(wide, high)).any(axis=1)
     )
     tests = {
         "ball": (is_off | is_beside, np.where(is_off, np.abs(height), miss), time),

@@ -48,7 +48,12 @@ class Arm:
     # (4,) unit quaternion w, x, y, z: rotation of the shield's frame in the frame of link n. The
     # axes of the shield's frame are the outward normal and the directions of the two edges.
     shield_turn: Array
-    shield_half: Array  # (2,) [m], halves of the shield's edges
+    # (2,) [m], halves of the edges of a rectangle around the shield's middle, parallel to its two
+    # edges, that contains the shield. Collisions are tested with this rectangle.
+    shield_half: Array
+    # (K, 2) [m], corners of the shield's convex outline along the two edges, counterclockwise
+    # around the middle. Balls must be met within the outline.
+    shield_corners: Array
     # (C,) link of each capsule: 0 to n - 1 are links 1 to n, -1 is the base.
     capsule_link: tuple[int, ...] = struct.field(pytree_node=False)
     # Bodies that must not touch: pairs of capsules, the first one of the later link; capsules and
@@ -147,6 +152,23 @@ def shield_pose(arm: Arm, angles: Array) -> tuple[Array, Array]:
     last, turn = rotations[-1], quaternion_rotation(jnp.asarray(arm.shield_turn))
     middle = positions[-1] + product(last, jnp.asarray(arm.shield_centre))
     return product(last, turn), middle
+
+
+def shield_sides(arm: Arm) -> Array:
+    """Return vectors s (K, 2) [1/m] of the K sides of the shield's outline.
+
+    A point p of the shield's plane, relative to the middle, is within the outline if  s . p <= 1
+    for all sides. The side's distance from the middle is  1 / |s|.
+    """
+    corners = jnp.asarray(arm.shield_corners)
+    along = jnp.roll(corners, -1, axis=0) - corners
+    normal = jnp.stack([along[:, 1], -along[:, 0]], axis=1)
+    return normal / jnp.sum(normal * corners, axis=1, keepdims=True)
+
+
+def shield_inradius(arm: Arm) -> Array:
+    """Return the radius () [m] of the greatest disc around the shield's middle in its outline."""
+    return 1.0 / jnp.sqrt(jnp.max(jnp.sum(shield_sides(arm) ** 2, axis=1)))
 
 
 def reach_of(arm: Arm) -> float:

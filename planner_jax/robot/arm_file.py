@@ -27,28 +27,69 @@ from planner_jax.robot.capsule_fit import Cover, cover, measure_excess
 
 _THICKNESS = 0.01  # [m], of a shield's plate
 _FORK = 0.71  # see `irb1600`
+_SIDES = 32  # number of corners of the polygon in a disc
 _CORNERS = np.array([(0.0, a, b) for a in (-1.0, 1.0) for b in (-1.0, 1.0)])  # of a plate
 
 
 @dataclasses.dataclass(frozen=True)
 class Shield:
-    """A rectangular shield, 0.01 m thick, at the tip of an arm.
+    """A flat shield, 0.01 m thick, at the tip of an arm: a rectangle, a disc or a convex polygon.
 
     The origin of the shield's frame is the middle of the front face. The axis x is the outward
     normal, y and z are parallel to the edges. By default x is the axis z of the tip, as for the
-    frame `tool0` of ROS.
+    frame `tool0` of ROS. One of `half`, `radius` and `corners` describes the outline; without them
+    the shield is a square of 0.30 m. Collisions are tested with a rectangle around the outline.
     """
 
-    half: tuple[float, float] = (0.15, 0.15)  # [m], halves of the edges along y and z
+    half: tuple[float, float] | None = None  # [m], halves of a rectangle's edges along y and z
+    radius: float | None = None  # [m], of a disc, whose outline is a regular polygon in the circle
+    # [m], corners (y, z) of a convex polygon in their order around the middle, which is inside.
+    corners: tuple[tuple[float, float], ...] | list | None = None
     position: tuple[float, float, float] = (0.0, 0.0, 0.02)  # [m], in the frame of the tip
     # Unit quaternion w, x, y, z: rotation of the shield's frame in the frame of the tip.
     turn: tuple[float, float, float, float] = (0.5**0.5, 0.0, -(0.5**0.5), 0.0)
     mass: float = 0.0  # [kg], spread evenly over the plate
 
     def __post_init__(self) -> None:
-        require(min(self.half) > 0.0, "shield.half", "> 0", self.half)
+        given = [x for x in (self.half, self.radius, self.corners) if x is not None]
+        rule = "described by one of half, radius and corners"
+        require(len(given) <= 1, "the shield", rule, shown=f"{len(given)} of them")
+        if not given:
+            object.__setattr__(self, "half", (0.15, 0.15))
+        if self.half is not None:
+            require(min(self.half) > 0.0, "shield.half", "> 0", self.half)
+        if self.radius is not None:
+            require(self.radius > 0.0, "shield.radius", "> 0", self.radius)
+        corners = self.outline
+        turns = corners[:, 0] + 1j * corners[:, 1]
+        sides = np.roll(turns, -1) - turns
+        # The polygon is convex around the middle if its corners and its sides turn once.
+        angles = [np.angle(np.roll(each, -1) * each.conj()) for each in (turns, sides)]
+        is_convex = all(bool(np.all(x > 1e-9)) and np.sum(x) < 6.3 for x in angles)
+        rule = "corners of a convex polygon around (0, 0), in their order"
+        require(bool(is_convex), "shield.corners", rule, self.corners)
         require(self.mass >= 0.0, "shield.mass", ">= 0", self.mass)
         require(any(self.turn), "shield.turn", "a quaternion other than zero", self.turn)
+
+    @property
+    def outline(self) -> np.ndarray:
+        """Corners (K, 2) [m] of the shield along y and z, counterclockwise."""
+        if self.half is not None:
+            return _rectangle(np.array(self.half, float))
+        if self.radius is not None:
+            angles = np.arange(_SIDES) * (2.0 * np.pi / _SIDES)
+            return self.radius * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+        corners = np.array(self.corners, float)
+        is_list = corners.ndim == 2 and corners.shape[1] == 2 and len(corners) > 2
+        rule = "at least three corners (y, z)"
+        is_sound = is_list and bool(np.isfinite(corners).all())
+        require(is_sound, "shield.corners", rule, self.corners)
+        (y, z), (y_next, z_next) = corners.T, np.roll(corners, -1, axis=0).T
+        return corners if np.sum(y * z_next - z * y_next) > 0.0 else corners[::-1]
+
+
+def _rectangle(half: np.ndarray) -> np.ndarray:
+    return half * np.array([(1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0), (1.0, -1.0)])
 
 
 class _Mount(NamedTuple):
@@ -56,9 +97,14 @@ class _Mount(NamedTuple):
 
     centre: np.ndarray  # (3,) [m], middle of the front face
     turn: np.ndarray  # (3, 3), rotation of the shield's frame
-    half: np.ndarray  # (2,) [m], halves of the edges; 0 without a shield
+    corners: np.ndarray  # (K, 2) [m], of the outline; 0 without a shield
     mass: float = 0.0  # [kg], in addition to the masses of the file's bodies
     geom: int = -1  # index of the file's geom that is the shield, or -1
+
+    @property
+    def half(self) -> np.ndarray:
+        """Halves of the edges (2,) [m] of a rectangle around the middle with the outline in it."""
+        return np.max(np.abs(self.corners), axis=0)
 
 
 @functools.cache
@@ -185,6 +231,7 @@ def _read(
         "shield_centre": mount.centre,
         "shield_turn": _quaternion(mount.turn),
         "shield_half": mount.half,
+        "shield_corners": mount.corners,
     }
     poses = [model.frames(angles) for angles in (rest, np.clip(0.0, lower, upper))]
     checked = _pairs(link, ends, radius, box, mount, poses)
@@ -229,10 +276,18 @@ def _plate(mount: _Mount) -> list[tuple[float, np.ndarray, np.ndarray]]:
     """Return mass, centre and inertia of a shield that is not a body of the file, in a list."""
     if not mount.mass:
         return []
-    squares = np.array([_THICKNESS, *(2.0 * mount.half)]) ** 2
-    moments = mount.mass / 12.0 * (np.sum(squares) - squares)
-    centre = mount.centre - 0.5 * _THICKNESS * mount.turn[:, 0]
-    return [(mount.mass, centre, mount.turn * moments @ mount.turn.T)]
+    # Triangles of the middle and a side have the corners 0, a and b, and the area  a x b / 2. The
+    # integral of p p^T over a triangle is  area / 12 (a a^T + b b^T + (a + b) (a + b)^T).
+    a, b = mount.corners, np.roll(mount.corners, -1, axis=0)
+    share = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+    share = share / np.sum(share)
+    middle = np.array([-0.5 * _THICKNESS, *(share @ (a + b) / 3.0)])
+    spread = np.diag([_THICKNESS**2 / 12.0, 0.0, 0.0])
+    spread[1:, 1:] = sum((share[:, None] * x).T @ x for x in (a, b, a + b)) / 12.0
+    spread[1:, 1:] -= np.outer(middle[1:], middle[1:])
+    inertia = mount.mass * (np.trace(spread) * np.eye(3) - spread)
+    centre = mount.centre + mount.turn @ middle
+    return [(mount.mass, centre, mount.turn @ inertia @ mount.turn.T)]
 
 
 def _mount(model: ArmModel, shield: Shield | None, usual: Shield | None) -> _Mount:
@@ -245,8 +300,8 @@ def _mount(model: ArmModel, shield: Shield | None, usual: Shield | None) -> _Mou
         shield = shield or usual
         own = shield or Shield(position=(0.0, 0.0, 0.0))
         rotation = Rotation.from_quat(own.turn, scalar_first=True).as_matrix()
-        half = np.array(own.half, float) if shield else np.zeros(2)
-        return _Mount(origin + turn @ np.array(own.position), turn @ rotation, half, own.mass)
+        corners = own.outline if shield else np.zeros((4, 2))
+        return _Mount(origin + turn @ np.array(own.position), turn @ rotation, corners, own.mass)
     geom, half = geoms[0], mj.geom_size[geoms[0]]
     if mj.geom_type[geom] != kinds.mjGEOM_BOX or model.link[mj.geom_bodyid[geom]] != last:
         raise model.error(
@@ -264,7 +319,7 @@ def _mount(model: ArmModel, shield: Shield | None, usual: Shield | None) -> _Mou
         raise model.error('site "shield"', "in the middle of a face of the shield's box", "be")
     y, z = (k + 1) % 3, (k + 2) % 3
     own = np.eye(3)[[k, y, z]].T * [sign, 1.0, sign]
-    return _Mount(middle + turn @ front, turn @ own, half[[y, z]], geom=geom)
+    return _Mount(middle + turn @ front, turn @ own, _rectangle(half[[y, z]]), geom=geom)
 
 
 def _cover(model: ArmModel, plate: int) -> tuple[list[tuple[int, Cover]], np.ndarray | None]:

@@ -45,6 +45,7 @@ RULES: Table = (
     Field("arm.mass", ("J",), rules.POSITIVE),
     Field("arm.capsule_radius", ("C",), rules.NOT_NEGATIVE),
     Field("arm.shield_half", (2,), rules.POSITIVE),
+    Field("arm.shield_corners", ("S", 2)),
     Field("limits.velocity", ("J",), rules.POSITIVE),
     Field("limits.acceleration", ("J",), rules.POSITIVE),
     Field("ends_at_rest", (), kind=np.bool_),
@@ -62,7 +63,7 @@ RULES: Table = (
 # angle [rad] between the shield's normal and the reversed velocity of the ball.
 STRICT = (0.002, np.deg2rad(0.5))
 WIDE = (0.1, np.deg2rad(30.0))
-ANYWHERE = (0.25, np.deg2rad(90.0))  # the shield's corners are less than 0.25 m from its middle
+ANYWHERE = (0.25, np.deg2rad(90.0))  # the offset is at least the distance of the shield's corners
 
 
 @struct.dataclass
@@ -174,6 +175,8 @@ def case(
 
     repeat = functools.partial(repeat_leaves, batch=batch, dtype=dtype)
     offset, tilt = ANYWHERE if anywhere else WIDE if wide else STRICT
+    if anywhere:
+        offset = max(offset, float(np.max(np.linalg.norm(arm.shield_corners, axis=1))))
     cases = BlockCase(
         ball=BallState(pos=leaf("ball_pos", ball_pos, 3), vel=leaf("ball_vel", ball_vel, 3)),
         gravity=leaf("gravity", gravity),

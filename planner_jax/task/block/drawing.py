@@ -23,7 +23,6 @@ from planner_jax.trajectory.polynomial import evaluate
 
 SIZE = (11.0, 4.2)  # [inch], size of a figure
 _SHOWN, _SAMPLES = 5, 200  # numbers of drawn poses, and of samples of the rates
-_SIGNS = np.array([(1, 1), (1, -1), (-1, -1), (-1, 1)])  # of the shield's corners
 
 
 def draw_plan(case: BlockCase, plan: BlockPlan, figure: Figure) -> None:
@@ -52,8 +51,8 @@ def draw_plan(case: BlockCase, plan: BlockPlan, figure: Figure) -> None:
     angles = jax.vmap(lambda time: evaluate(motion, time))(times)
     arms = np.asarray(jax.vmap(capsules, (None, 0))(arm, angles))
     turns, middles = (np.asarray(x) for x in jax.vmap(shield_pose, (None, 0))(arm, angles))
-    edges = turns[:, :, 1:] * case.arm.shield_half
-    corners = middles[:, None] + np.einsum("kij,cj->kci", edges, _SIGNS)
+    outline = case.arm.shield_corners
+    corners = middles[:, None] + np.einsum("kij,cj->kci", turns[:, :, 1:], outline)
     contact = float(plan.contact_time)
     flown = np.linspace(0.0, contact, _SAMPLES)[:, None]
     ball = case.ball.pos + case.ball.vel * flown - 0.5 * case.gravity * flown**2 * np.eye(3)[2]

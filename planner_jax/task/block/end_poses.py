@@ -9,7 +9,13 @@ from flax import struct
 from jax import Array
 
 from planner_jax.ball.flight import drag_free_flight
-from planner_jax.robot.arm import product, shield_jacobian, shield_pose
+from planner_jax.robot.arm import (
+    product,
+    shield_inradius,
+    shield_jacobian,
+    shield_pose,
+    shield_sides,
+)
 from planner_jax.robot.arm_ik import inverse_kinematics
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.motion import Weights, profiles, step_weights
@@ -17,8 +23,9 @@ from planner_jax.task.block.scene import entry_time
 
 _PLANE = 1e-3  # [m], greatest distance of the ball from the shield's plane at the contact
 # Tried offsets of the ball from the shield's middle along the two edges, divided by the greatest
-# offset that the case allows.
+# offset that case and shield allow.
 _OFFSETS = np.array([(0.0, 0.0), (0.8, 0.0), (0.0, 0.8), (-0.8, 0.0), (0.0, -0.8)])
+_SPARE = 0.95  # greatest planned fraction of the distance from the shield's middle to a side
 
 _DELAYED = 0.4  # see `rank_straight`
 
@@ -96,7 +103,9 @@ def end_poses(
     """
     chosen = thin_points(points, every)
     time = flight.earliest + (chosen + 0.5) / points * (flight.latest - flight.earliest)
-    offset = case.offset * jnp.asarray(_OFFSETS[chosen % len(_OFFSETS)], time.dtype)
+    # Within the outline of the shield, which may have any rotation about its normal.
+    most = jnp.minimum(case.offset, shield_inradius(case.arm))
+    offset = most * jnp.asarray(_OFFSETS[chosen % len(_OFFSETS)], time.dtype)
 
     def solve_point(time: Array, offset: Array) -> tuple[Array, Array]:
         ball = drag_free_flight(case.ball, time, case.gravity)
@@ -224,11 +233,12 @@ def contact_terms(
     """Return the residuals of the contact of shield and ball at angles (n,) [rad] and a time [s].
 
     Returns:
-        rows: (6,), weighted residuals: the ball's distance from the shield's plane; its offset from
+        rows: (7,), weighted residuals: the ball's distance from the shield's plane; its offset from
             the shield's middle in the plane (2); the shield's tilt (2); the time by which the
-            contact is before the interval `flight` or after it. Offset and tilt count only beyond
-            the tolerances of the case.
-        slopes: (6, n + 1), derivatives of the rows by the angles and the time.
+            contact is before the interval `flight` or after it; the ball's distance beyond the side
+            of the shield's outline that it exceeds most. Offset and tilt count only beyond the
+            tolerances of the case.
+        slopes: (7, n + 1), derivatives of the rows by the angles and the time.
         excess: (), largest relative excess over a tolerance, without weights.
     """
     rotation, middle = shield_pose(case.arm, angles)
@@ -266,6 +276,15 @@ def contact_terms(
     # A contact 1 ms too early or too late weighs as much as a distance of 1 cm.
     pace = 10.0 * weights.meeting
     across = rotation[:, 1:]
+    sides = shield_sides(case.arm)
+    shares = product(sides, product(beside, across))
+    side = sides[jnp.argmax(shares)]
+    side = side / jnp.sum(side**2)  # vector from the middle to the side
+    width = jnp.sqrt(jnp.sum(side**2))
+    outside = jnp.maximum(jnp.max(shares) - _SPARE, 0.0) * width
+    # If the allowed offsets are within the outline, the residual of the offset suffices.
+    reaches = case.offset > _SPARE * shield_inradius(case.arm)
+    is_outside = jnp.where(reaches & (outside > 0.0), weights.meeting, 0.0)
     # Derivative of the direction of flight by time: the component of gravity that is perpendicular
     # to the velocity, divided by the speed.
     speed_squared = jnp.maximum(jnp.sum(velocity**2), 1e-12)
@@ -278,6 +297,7 @@ def contact_terms(
             weights.meeting * beside_share * product(beside, across),
             weights.tilt * tilt_share * product(tilt, frame),
             pace * (early + late)[None],
+            (is_outside * outside)[None],
         ]
     )
     is_beside = jnp.where(beside_share > 0.0, weights.meeting, 0.0)
@@ -289,12 +309,14 @@ def contact_terms(
             is_beside * product(beside_slope, across).T,
             is_tilted * tilt_rows.T,
             pace * jnp.zeros((1, angles.size + 1), angles.dtype).at[0, -1].set(edge),
+            is_outside * product(beside_slope, product(across, side / width))[None],
         ]
     )
     excess = jnp.stack(
         [
             jnp.abs(off) / _PLANE - 1.0,
             distance / case.offset - 1.0,
+            jnp.max(shares) - 1.0,
             angle / case.tilt - 1.0,
             jnp.maximum(flight.earliest - time, time - flight.latest) / 1e-3,
         ]

@@ -164,7 +164,7 @@ class ShieldArm:
             arm.capsule_link, arm.capsule_ends, arm.capsule_radius, strict=True
         ):
             solids[link + 1].append(capsule_solid(ends[0], ends[1], float(radius)))
-        ring = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1)]) * arm.shield_half
+        ring = np.concatenate([arm.shield_corners, arm.shield_corners[:1]])
         rim = arm.shield_centre + np.pad(ring, ((0, 0), (1, 0)))
         return [
             *(Shape([], [], solids=tuple(each)) for each in solids),

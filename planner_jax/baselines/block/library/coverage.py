@@ -21,6 +21,7 @@ from planner_jax.core.errors import ArgumentError
 from planner_jax.core.protocol import are_solved
 from planner_jax.planning.plan import plan
 from planner_jax.referee.block import BlockVerdict, referee_blocks
+from planner_jax.robot.arm import shield_inradius
 from planner_jax.task.block.case import ANYWHERE, BlockCase
 
 _SPEEDS = (7.0, 10.0)  # [m/s], range of random balls' mean speed from outer to inner box
@@ -49,7 +50,7 @@ def coverage(library: Library) -> Coverage:
     tunnel = tunnels(library.table.layout, scene.inner, scene.outer)
     row = unpack_rows(np.asarray(library.table.rows))
     far = np.asarray(_farthest(tunnel.outer, tunnel.inner, row))
-    half = float(np.min(library.setting.arm.shield_half))
+    half = float(shield_inradius(library.setting.arm))
     return Coverage(
         is_feasible=tunnel.is_feasible,
         is_centred=tunnel.is_centred,

@@ -29,7 +29,7 @@ from planner_jax.core.protocol import (
     status_of,
 )
 from planner_jax.optimise.levenberg import LevenbergConfig, Model, least_squares
-from planner_jax.robot.arm import product, shield_jacobian, shield_pose
+from planner_jax.robot.arm import product, shield_inradius, shield_jacobian, shield_pose
 from planner_jax.robot.arm_ik import inverse_kinematics
 from planner_jax.task.block.case import STRICT, BlockCase
 from planner_jax.task.block.clearance import least_clearances
@@ -141,7 +141,7 @@ class PairPlanner(Planner):
             rotation = frame_of(face_ball(there.vel))
             far = farthest_crossing(pair.outer, pair.inner, there.pos, rotation)
             angles, found = inverse_kinematics(arm, rotation, there.pos)
-            return angles, found & (pair.is_coarse | (far < jnp.min(jnp.asarray(arm.shield_half))))
+            return angles, found & (pair.is_coarse | (far < shield_inradius(arm)))
 
         after = jnp.asarray(shares, span.dtype) * span
         angles, found = jax.vmap(of_point)(after)
@@ -210,7 +210,7 @@ class PairPlanner(Planner):
         moves, first, _ = self.online.decode(case, point)
         rotation, middle = shield_pose(case.arm, angles_at(case.angles, first, moves, (1.0,))[0])
         far = farthest_crossing(pair.outer, pair.inner, middle, rotation)
-        beyond = jnp.where(pair.is_coarse, 0.0, far / jnp.min(case.arm.shield_half) - 1.0)
+        beyond = jnp.where(pair.is_coarse, 0.0, far / shield_inradius(case.arm) - 1.0)
         violation = jnp.maximum(plan.violation, beyond)
         return PairPlan(
             cost=entry,

@@ -21,6 +21,7 @@ from planner_jax.baselines.block.library.table import (
 from planner_jax.core.choices import require
 from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import FEASIBILITY_TOLERANCE, Attempt, Status, status_of
+from planner_jax.robot.arm import product, shield_sides
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.motion import polynomial
 from planner_jax.task.block.plan import BlockPlan
@@ -128,7 +129,7 @@ def _plan_from_answer(table: Table, case: BlockCase, home: Array) -> BlockPlan:
     angle = jnp.arccos(jnp.clip(answer.cosine, -1.0, 1.0))
     excess = [
         early - 1.0,
-        jnp.max(jnp.abs(beside) / case.arm.shield_half) - 1.0,
+        jnp.max(product(shield_sides(case.arm), beside)) - 1.0,
         jnp.sqrt(jnp.maximum(jnp.sum(beside**2), 1e-12)) / case.offset - 1.0,
         angle / case.tilt - 1.0,
         -answer.slack / 1e-3,
