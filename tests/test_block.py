@@ -299,6 +299,18 @@ def test_drawn_starting_points_lead_to_plans():
 
 
 @pytest.mark.slow
+def test_detours_from_the_best_plan_lead_to_further_plans():
+    last = pj.block.planner().attempts[-1]
+    assert isinstance(last, Search) and last.detours and last.within is not None
+    case = jax.tree.map(np.asarray, pj.take(pj.block.draw(1, "pole", 977, first=276), 0))
+    for detours in (0, last.detours):
+        planner = OnlineBlock(searches=(dataclasses.replace(last, detours=detours),))
+        plan = pj.plan(planner, case)
+        assert pj.are_solved(plan) == (detours > 0)
+    assert pj.block.judge(case, plan).success
+
+
+@pytest.mark.slow
 def test_a_batch_on_a_gpu_is_solved_where_its_cases_are_one_by_one():
     straight = Search(straight=12, tries=0)
     bent = Search(straight=0, tries=4, kept=2, in_turn=False, solver=LevenbergConfig(8, trial=3))

@@ -28,7 +28,7 @@ class Model:
     violation: Array  # (), largest relative excess over a limit; feasible if <= 0
 
 
-@with_run_time_numbers("max_steps", "tolerance", "settled")
+@with_run_time_numbers("max_steps", "tolerance", "settled", "fade")
 @dataclasses.dataclass(frozen=True)
 class LevenbergConfig:
     """Settings of a Levenberg-Marquardt search; hashable, so static under jit."""

@@ -66,7 +66,7 @@ _SETTLING = {"good": 24, "best": 48}  # effort -> number of steps that lower the
 _TURN = 5  # steps of least squares on a GPU before searches that have ended make room for others
 
 
-@with_run_time_numbers("straight", "tries", "first", "kept", "in_turn")
+@with_run_time_numbers("straight", "tries", "first", "kept", "in_turn", "detours")
 @dataclasses.dataclass(frozen=True)
 class Search(Attempt):
     """An attempt: check some straight joint motions, then run least squares from several starts.
@@ -82,6 +82,9 @@ class Search(Attempt):
     # Whether each starting point is refined to its end before the next, if a single case is
     # planned. Otherwise all take a few trial steps first, and only the `kept` best ones continue.
     in_turn: bool = True
+    # Number of further starting points: the best plan so far, with half of a stored detour added.
+    # Searches of a batch on a GPU leave them out.
+    detours: int = 0
     # `hope`: a starting point is abandoned if its cost after the trial steps is higher. Nearly all
     # starting points that lead to a valid plan have a lower cost.
     solver: LevenbergConfig = LevenbergConfig(
@@ -98,6 +101,13 @@ class StraightSearch(Search):
 _LEAST_SQUARES = (
     Search(straight=0, tries=4, kept=2),
     Search(straight=0, tries=11, first=4, kept=5, in_turn=False),
+    # Plans that are at most some 6 cm inside an obstacle are often mended by longer searches.
+    Search(
+        straight=0,
+        detours=4,
+        within=6.0,
+        solver=dataclasses.replace(Search.solver, max_steps=40, fade=0.85),
+    ),
 )
 _SEARCHES = (Search(straight=12, tries=0), Search(tries=0), *_LEAST_SQUARES)
 
@@ -243,9 +253,12 @@ class OnlineBlock(Planner):
             k, searches, costs, best = turn
             is_straight, index = k < straight, jnp.maximum(k - straight, 0)
             is_trial = ~is_straight & jnp.logical_not(attempt.in_turn) & (index < tries)
-            is_new = is_straight | is_trial | attempt.in_turn
+            is_detour = index >= tries + kept
+            is_new = is_straight | is_trial | attempt.in_turn | is_detour
             index = jnp.where(is_new, index, jnp.argmin(costs))
             start = self._encode_start(case, poses, order, attempt.first + index)
+            bump = 0.5 * self._encode_bump(case, index - tries - kept)
+            start = jnp.where(is_detour, _encode(best) + bump, start)
             straight_start = self.encode_straight(case, goals, goal_order[k])
             begin = levenberg.start_search(jnp.where(is_straight, straight_start, start), solver)
             pick = lambda new, old: jnp.where(is_new, new, old[index])  # noqa: E731
@@ -260,7 +273,8 @@ class OnlineBlock(Planner):
 
         def is_open(turn: tuple[Array, LevenbergState, Array, BlockPlan]) -> Array:
             k, best = turn[0], turn[-1]
-            return (k < straight + tries + kept) & (bool(self.settling) | ~is_solved(best.status))
+            most = straight + tries + kept + jnp.where(flight.comes, attempt.detours, 0)
+            return (k < most) & (bool(self.settling) | ~is_solved(best.status))
 
         num, dtype = len(self._starts(case)[0]), case.angles.dtype
         size = case.arm.num * self.pieces + 1
@@ -408,12 +422,9 @@ class OnlineBlock(Planner):
         if self.brisk or not self.settling:
             return plan
         solver = dataclasses.replace(Search.solver, **_settle_by(self.settling), hope=None)
-        coeffs, durations = plan.motion.coeffs, plan.motion.durations
-        rates = coeffs[:, 1] + 2.0 * durations[:, None] * coeffs[:, 2]
-        point = jnp.append((jnp.sum(durations) * rates).reshape(-1), plan.contact_time)
 
         def settle() -> BlockPlan:
-            return select(self.refine(case, flight, point, solver), plan)
+            return select(self.refine(case, flight, _encode(plan), solver), plan)
 
         return lax.cond(is_solved(plan.status), settle, lambda: plan)
 
@@ -444,11 +455,14 @@ class OnlineBlock(Planner):
         return read_learned_starts(_count_starts(self.searches), case.arm.num)
 
     def _encode_start(self, case: BlockCase, poses: EndPoses, order: Array, k: Array) -> Array:
-        ranks, bumps = (jnp.asarray(each) for each in self._starts(case))
-        k = jnp.minimum(k, len(ranks) - 1)
-        point = self.encode_straight(case, poses, order[ranks[k]])
-        bump = motion.bump_steps(bumps[k].astype(point.dtype), self.pieces)
-        return point.at[:-1].add(bump.reshape(-1))
+        ranks = jnp.asarray(self._starts(case)[0])
+        rank = ranks[jnp.minimum(k, len(ranks) - 1)]
+        return self.encode_straight(case, poses, order[rank]) + self._encode_bump(case, k)
+
+    def _encode_bump(self, case: BlockCase, k: Array) -> Array:
+        bumps = jnp.asarray(self._starts(case)[1], case.angles.dtype)
+        bump = motion.bump_steps(bumps[jnp.minimum(k, len(bumps) - 1)], self.pieces)
+        return jnp.append(bump.reshape(-1), jnp.zeros((), bump.dtype))
 
     def refine(
         self, case: BlockCase, flight: Flight, start: Array, solver: LevenbergConfig
@@ -581,6 +595,13 @@ class OnlineBlock(Planner):
         from planner_jax.task.block.replan import ReplanBlock, WarmBlock
 
         return ReplanBlock(warm=WarmBlock(planner=self), planner=self)
+
+
+def _encode(plan: BlockPlan) -> Array:
+    """Return the unknowns of a plan whose motion lasts until the contact."""
+    coeffs, durations = plan.motion.coeffs, plan.motion.durations
+    rates = coeffs[:, 1] + 2.0 * durations[:, None] * coeffs[:, 2]
+    return jnp.append((jnp.sum(durations) * rates).reshape(-1), plan.contact_time)
 
 
 def _settle_by(steps: int) -> dict[str, Any]:
