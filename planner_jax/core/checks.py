@@ -168,32 +168,25 @@ def require_path(
         raise ArgumentTypeError(name, "a path, with a method at(time)", path)
     of = f" of {whose}" if whose else ""
     arrays = require_beginning(name, path, axes, f"the shape {axes}{of}")
-    layout = tuple([(array.shape, array.dtype) for array in arrays])
+    layout = tuple([(array.shape[len(axes) :], array.dtype) for array in arrays])
     try:
-        found, is_bare = _shape_of_positions(jax.tree.structure(path), layout, axes)
+        position, is_bare = _shape_of_position(jax.tree.structure(path), layout)
     except (TypeError, ValueError, IndexError, AttributeError) as error:
         rule = f"a path whose at(time) returns a position, with the axes {axes}{of}"
         shown = f"a {type(path).__name__} with {format_shapes(path)}"
         raise ArgumentTypeError(name, rule, shown=shown) from error
-    if found != (*axes, dimensions):
+    if position != (dimensions,):
         rule = f"positions of the shape {(*axes, dimensions)}"
-        raise ArgumentError(name, rule, found, verb="return")
+        raise ArgumentError(name, rule, (*axes, *position), verb="return")
     return is_bare
 
 
 @functools.lru_cache(maxsize=256)
-def _shape_of_positions(
-    tree: PyTree, layout: tuple, axes: tuple[int, ...]
-) -> tuple[tuple[int, ...], bool]:
-    def at(path: _Path, time: Numbers) -> PyTree:
-        return path.at(time)
-
-    for _ in axes:
-        at = jax.vmap(at)
+def _shape_of_position(tree: PyTree, layout: tuple) -> tuple[tuple[int, ...], bool]:
     kinds = [(shape, jax.dtypes.canonicalize_dtype(dtype)) for shape, dtype in layout]
     path = jax.tree.unflatten(tree, [jax.ShapeDtypeStruct(*each) for each in kinds])
     floating = (dtype for _, dtype in kinds if jnp.issubdtype(dtype, np.floating))
-    time = jax.ShapeDtypeStruct(axes, next(floating, np.float32))
-    state = jax.eval_shape(at, path, time)
+    time = jax.ShapeDtypeStruct((), next(floating, np.float32))
+    state = jax.eval_shape(lambda path, time: path.at(time), path, time)
     pos = getattr(state, "pos", state)  # `at` may return the position alone
     return pos.shape, pos is state

@@ -95,11 +95,12 @@ def obstacles(
         polygon = polygons[owner[k]]
         radius[k] = polygon.radius if isinstance(polygon, Circle) else 0.0
     leaves = (centre, corners, velocity, np.arange(num) < len(parts), radius, rates)
-    cast = [jnp.asarray(x if x.dtype == bool else x.astype(dtype)) for x in leaves]
+    kinds = [bool if x.dtype == bool else dtype for x in leaves]
+    cast = [jnp.asarray(x.astype(kind), kind) for x, kind in zip(leaves, kinds, strict=True)]
     track = None
     if any(table is not None for table in tables):
         rows = _resample(tables, num, centre, velocity, shift)
-        track = Track(*(jnp.asarray(row.astype(dtype)) for row in rows))
+        track = Track(*(jnp.asarray(row.astype(dtype), dtype) for row in rows))
     return Obstacles(*cast, track=track)
 
 

@@ -48,7 +48,7 @@ def repeat_leaves(tree: TreeT, *, batch: tuple[int, ...], dtype: DTypeLike) -> T
     def repeat(value: ArrayLike) -> Array:
         value = np.asarray(value)
         kind = np.dtype(dtype) if value.dtype.kind == "f" else value.dtype
-        return jnp.asarray(np.broadcast_to(value, batch + value.shape), kind)
+        return jnp.asarray(np.broadcast_to(value.astype(kind), batch + value.shape), kind)
 
     return jax.tree.map(repeat, tree)
 

@@ -164,7 +164,7 @@ def case(
         targets=targets,
         present=_broadcast_present(present, shape),
         horizon=leaf("horizon", horizon, num),
-        order=jnp.asarray(np.broadcast_to(np.arange(num), shape), jnp.int32),
+        order=jnp.asarray(np.broadcast_to(np.arange(num, dtype=np.int32), shape), jnp.int32),
         times=leaf("horizon", shares * np.asarray(horizon)[..., :1], num),
         head_state=quadrotor.hover_at(start, batch, dtype),
         gravity=leaf("gravity", gravity),

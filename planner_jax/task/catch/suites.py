@@ -94,7 +94,7 @@ def draw(
     targets, horizon = make_targets(random.random((num, columns)))
     place = np.where(np.arange(size) < own, np.arange(size), 0)  # index into the suite's targets
     cases = case(
-        jax.tree.map(lambda leaf: jnp.asarray(leaf[:, place], dtype), targets),
+        jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf[:, place], dtype), dtype), targets),
         horizon[:, place],
         present=np.arange(size) < own,
         robot=robot,

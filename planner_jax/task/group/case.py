@@ -123,6 +123,8 @@ def case(
         raise ArgumentError("present", f"True or False of {num} targets", present)
     return InterceptGroup(
         shared=dataclasses.replace(shared, target=targets),
-        present=jnp.asarray(np.broadcast_to(exists, (*batch, num))),
-        order=jnp.asarray(np.broadcast_to(np.arange(num), (*batch, num)), jnp.int32),
+        present=jnp.asarray(np.broadcast_to(exists, (*batch, num)), exists.dtype),
+        order=jnp.asarray(
+            np.broadcast_to(np.arange(num, dtype=np.int32), (*batch, num)), jnp.int32
+        ),
     )

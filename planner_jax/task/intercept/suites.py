@@ -241,7 +241,7 @@ def path_of(draws: Draws, dtype: DTypeLike) -> TurningPath:
     """Return the paths of targets from their position, angle, speed and turn rate in `draws`."""
     velocity = draws["speed"][..., None] * _unit(draws["angle"])
     parts = (np.asarray(part, dtype) for part in (draws["pos"], velocity, draws["rate"]))
-    return TurningPath(*map(jnp.asarray, parts))
+    return TurningPath(*(jnp.asarray(part, dtype) for part in parts))
 
 
 def cases_of(draws: Draws, dtype: DTypeLike) -> InterceptCase:
@@ -251,12 +251,12 @@ def cases_of(draws: Draws, dtype: DTypeLike) -> InterceptCase:
         present = draws[f"{kind} present"]
         corners = np.where(present[..., None, None], draws[kind], 0.0)
         centre = corners.mean(axis=2)
-        none = jnp.asarray(np.zeros(present.shape, dtype))
+        none = jnp.asarray(np.zeros(present.shape, dtype), dtype)
         return Obstacles(
-            centre=jnp.asarray(centre.astype(dtype)),
-            corners=jnp.asarray((corners - centre[:, :, None]).astype(dtype)),
-            velocity=jnp.asarray(np.where(present[..., None], velocity, 0.0).astype(dtype)),
-            present=jnp.asarray(present),
+            centre=jnp.asarray(centre.astype(dtype), dtype),
+            corners=jnp.asarray((corners - centre[:, :, None]).astype(dtype), dtype),
+            velocity=jnp.asarray(np.where(present[..., None], velocity, 0.0).astype(dtype), dtype),
+            present=jnp.asarray(present, bool),
             radius=none,
             growth=none,
         )
