@@ -14,10 +14,6 @@ os.environ.setdefault("JAX_PLATFORMS", "cpu")
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(CACHE))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 os.environ.setdefault("MPLBACKEND", "agg")
-# Without XLA's newer fusion emitters, tests compile in two thirds of the time, and their small
-# batches run as fast. Later versions of XLA do not know this flag and would end the process.
-if version("jaxlib") < "0.11":
-    os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false")
 
 import jax  # noqa: E402
 import pytest  # noqa: E402
@@ -31,6 +27,21 @@ install_import_hook([f"planner_jax.{name}" for name in PACKAGES], "typecheck.che
 # Number of a process's memory mappings above which compiled programs, which use some mappings each,
 # are released. Above Linux's default limit of 65,530 mappings, a compilation aborts the process.
 MOST_MAPPINGS = 40_000
+
+
+def pytest_configure(config):
+    """Let XLA compile in less time, before JAX reads its flags.
+
+    Without XLA's newer fusion emitters, tests compile in two thirds of the time, and their small
+    batches run as fast. Without LLVM's optimisation, default tests compile in half of that time.
+    Slow tests run for longer, and need the optimisation. Later versions of XLA may not know these
+    flags and would end the process.
+    """
+    flags = "--xla_cpu_use_fusion_emitters=false"
+    if "not slow" in config.option.markexpr:
+        flags += " --xla_backend_optimization_level=0 --xla_cpu_parallel_codegen_split_count=1"
+    if version("jaxlib") < "0.11":
+        os.environ.setdefault("XLA_FLAGS", flags)
 
 
 def pytest_runtest_teardown(item, nextitem):
@@ -76,13 +87,13 @@ def finished(request, tmp_path_factory):
     return out, start_sweep(module.TASK, module.SETTINGS, out, progress=False)
 
 
-# Test modules, without "test_", of baselines, observed balls, policies, clusters and benchmarks,
-# which only `make test-slow` runs.
+# Test modules, without "test_", of baselines, observed balls, plans that replace others, policies,
+# clusters and benchmarks, which only `make test-slow` runs.
 SLOW = (
     *("b_spline", "baselines", "bezier", "block_adapt", "block_library", "block_peers"),
     *("catch_peer", "hybrid_astar", "minimum_jerk", "mpp", "paper_catch", "path_smoothing"),
     *("path_then_speed", "qp", "speed", "station_time"),
-    *("block_eye", "block_receding"),
+    *("block_eye", "block_receding", "catch_replan", "sims_camera", "trip_peers"),
     *("policy", "training", "learned_start"),
     "cluster",
     *("bench", "benchmark_ipopt", "intercept_oracle"),
