@@ -90,9 +90,8 @@ PLANS = {  # planner, cases that share one program, end variables of a segment
 }
 
 
-@pytest.mark.parametrize(
-    "name", ["hit", *(pytest.param(name, marks=pytest.mark.slow) for name in ("pairs", "throw"))]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["hit", "pairs", "throw"])
 def test_second_derivatives_of_a_plan_are_those_of_its_objective(name):
     planner, cases, num_own = PLANS[name]()
     segments = cases[0].num_targets if num_own == 12 else 1

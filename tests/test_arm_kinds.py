@@ -187,14 +187,14 @@ def test_closed_forms_try_four_rolls_unless_the_last_joint_rolls_the_shield():
 def test_the_solutions_of_the_search_move_as_the_jacobian_says():
     arm = KINDS["offset wrist"]
     velocity, spin = np.random.default_rng(2).normal(size=(2, 3))
-    turn, middle = shield_pose(arm, some_angles(arm, 1)[0])
+    turn, middle = jax.jit(shield_pose)(arm, some_angles(arm, 1)[0])
 
     def solve(time):
         turning = jnp.cross(spin[None], turn.T).T
         return inverse_kinematics(arm, turn + time * turning, middle + time * velocity)
 
     (solutions, found), (rates, _) = jax.jit(lambda: jax.jvp(solve, (0.0,), (1.0,)))()
-    slopes = jax.vmap(lambda q: shield_jacobian(arm, q))(solutions)
+    slopes = jax.jit(jax.vmap(lambda q: shield_jacobian(arm, q)))(solutions)
     solutions, found = np.asarray(solutions), np.asarray(found)
     inside = found & within(arm, solutions + 1e-6) & within(arm, solutions - 1e-6)
     driven = np.einsum("kij,kj->ki", slopes, rates)[inside]

@@ -398,6 +398,7 @@ def test_an_arm_has_limits_of_its_own_and_no_regime_of_another_arm():
         throw(arm=foreign, regime="R1")
 
 
+@pytest.mark.slow
 def test_after_a_warm_up_no_case_waits_for_the_compiler():
     planner, hard = pj.block.planner(), throw()
     easy = pj.block.case(hard.ball.pos, hard.ball.vel, scene=paper_scene(has_pole=False))

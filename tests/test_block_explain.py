@@ -47,6 +47,7 @@ def test_a_moving_joint_first_brakes_if_it_would_turn_too_far(rate):
         assert (found < abs(rate) / a + alone).all()
 
 
+@pytest.mark.slow
 def test_a_ball_that_comes_too_early_could_be_blocked_if_it_came_later():
     ready = pj.block.case(*BALL, scene=OPEN)
     spare = -pj.block.prospects(ready).later

@@ -165,7 +165,9 @@ def test_help_names_the_defaults_and_loads_no_jax(task, parts):
         assert part in said
 
 
-@pytest.mark.parametrize("module", ["sims.run", "policies.training"])
+@pytest.mark.parametrize(
+    "module", ["sims.run", pytest.param("policies.training", marks=pytest.mark.slow)]
+)
 def test_imports_of_commands_print_nothing(module):
     script = f"import planner_jax.{module}"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)

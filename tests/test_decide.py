@@ -186,7 +186,10 @@ class LongFirst(ExactCatch):
 
 @pytest.mark.parametrize(
     "kind, num, calls",
-    [(ExactCatch, 2, [(1, 10), (1, 2)]), (LongFirst, 3, [(1, 10), (1, 2), (1, 2)])],
+    [
+        (ExactCatch, 2, [(1, 10), (1, 2)]),
+        pytest.param(LongFirst, 3, [(1, 10), (1, 2), (1, 2)], marks=pytest.mark.slow),
+    ],
 )
 def test_later_rounds_are_for_cases_without_any_solved_order(kind, num, calls, pairs, monkeypatch):
     horizon = np.array(pairs.horizon)
@@ -310,6 +313,7 @@ def test_an_order_of_optional_targets_is_proposed_in_several_lengths(swarm):
     assert (np.diff(ranked.astype(int), axis=2) <= 0).all(), "taken targets come first"
 
 
+@pytest.mark.slow
 def test_what_is_taken_of_a_swarm_is_caught_and_counted(swarm, caught):
     verdict = referee_catches(swarm, caught)
     solved = np.asarray(is_solved(caught.status))

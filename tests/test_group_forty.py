@@ -69,6 +69,7 @@ def test_estimated_ends_are_those_of_drives_one_after_another():
     assert (ends_of(group, table, start, orders, 0) > ends).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_the_search_of_orders_is_near_the_best_of_all(seed):
     group = few(pj.take(pj.group.draw(1, "forty", seed), 0), 6)
@@ -105,6 +106,7 @@ def test_the_referee_confirms_plans_of_forty_targets():
     np.testing.assert_allclose(verdict.meeting_time[solved], plans.cost[solved], atol=1e-3)
 
 
+@pytest.mark.slow
 def test_a_direct_plan_of_few_targets_is_confirmed():
     group = as_numpy(few(pj.take(pj.group.draw(1, "forty", 1), 0), 3))
     group = dataclasses.replace(group, present=np.array([True, False, True]))

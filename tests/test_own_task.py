@@ -128,6 +128,7 @@ def test_a_sweep_that_ctrl_c_stops_is_resumed_to_the_same_rows(swept, tmp_path):
     assert rows[0] == rows[1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("planner", "num"), [("smooth", 16), ("scipy", 2)])
 def test_throughput_is_measured_with_success_and_cost_beside(meet, tmp_path, planner, num):
     settings = ["--task", "meet", "--planner", planner, "--batch", str(num), "--repeat", "1"]

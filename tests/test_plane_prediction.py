@@ -116,6 +116,7 @@ def test_cubics_are_fitted_in_single_precision_far_from_the_origin_of_time():
     np.testing.assert_allclose(at(found, 2000.0 + AHEAD), at(cubic, 2000.0 + AHEAD), atol=2e-3)
 
 
+@pytest.mark.slow
 @float64
 def test_absent_observations_have_no_effect():
     seen, weights, times = noisy(TURN), ONES.copy(), TIMES.copy()
@@ -171,6 +172,7 @@ def test_half_and_nine_tenths_of_the_targets_are_within_the_predicted_radii():
     assert np.mean(off**2) < np.mean(np.square([error for *_, error in found]))
 
 
+@pytest.mark.slow
 def test_a_batch_in_single_precision_equals_its_targets_one_by_one_in_double():
     truth, seen = (each[:: NUM // 4] for each in draw_targets())
     many = jax.jit(jax.vmap(predict, in_axes=(None, 0, None, None, None, 0)))

@@ -106,7 +106,7 @@ def test_limits_apply_to_the_recovery(hits, braked):
     assert set(verdict.failed_limit) <= {"continuity", "head state", "speed"}
 
 
-@pytest.mark.parametrize("to", ["brake", "home"])
+@pytest.mark.parametrize("to", ["brake", pytest.param("home", marks=pytest.mark.slow)])
 def test_a_fast_flight_ends_at_the_requested_position(to):
     head = np.zeros((NUM, 4, 3), np.float32)
     head[:, 0, 2] = 1.5

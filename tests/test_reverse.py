@@ -33,12 +33,14 @@ def solve(case):
     return np.asarray(plan.speed), plan, verdict
 
 
+@pytest.mark.slow
 def test_a_target_behind_the_car_in_a_corridor_is_met_in_reverse():
     speed, _, verdict = solve(case_of(1.0))
     assert speed.min() >= -0.7 * 1.001 and speed.max() <= 1e-3
     assert verdict.max_speed == pytest.approx(-speed.min(), rel=1e-6)
 
 
+@pytest.mark.slow
 def test_a_car_that_drives_forward_changes_the_gear_and_one_in_reverse_does_so_too():
     speed = solve(case_of(1.0, start=(4.0, 4.0, 0.0), initial_speed=0.5))[0]
     assert speed[0] == 0.5 and speed[-1] < -0.1
@@ -46,6 +48,7 @@ def test_a_car_that_drives_forward_changes_the_gear_and_one_in_reverse_does_so_t
     assert speed[0] == -0.5 and speed[-1] > 0.1
 
 
+@pytest.mark.slow
 def test_a_stop_is_an_end_speed_of_zero_and_the_end_may_be_bounded_to_reverse():
     stop = dataclasses.replace(case_of(3.0), end_speed=jnp.zeros(2))
     assert abs(solve(stop)[0][-1]) <= 1e-3 * 1.5
@@ -53,6 +56,7 @@ def test_a_stop_is_an_end_speed_of_zero_and_the_end_may_be_bounded_to_reverse():
     assert -0.601 <= solve(moving)[0][-1] <= -0.499
 
 
+@pytest.mark.slow
 def test_the_plan_in_reverse_does_not_depend_on_units():
     case = case_of(1.0)
     scaled = {name: 1000.0 * getattr(case.body, name) for name in vars(case.body)}
@@ -72,6 +76,7 @@ def test_the_plan_in_reverse_does_not_depend_on_units():
     np.testing.assert_allclose(solve(small)[0], 1000.0 * solve(case)[0], atol=1.0)
 
 
+@pytest.mark.slow
 def test_the_referee_rejects_reverse_without_the_gear_or_faster_than_allowed():
     case = case_of(1.0)
     _, plan, _ = solve(case)

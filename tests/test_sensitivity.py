@@ -73,7 +73,10 @@ def bowls(float64):
     return Bowl(random.standard_normal((5, 3)), random.standard_normal(5), np.zeros(5, np.int32))
 
 
-@pytest.mark.parametrize("options", [{"steps": 3}, {"steps": 1, "curvature": "whole"}])
+@pytest.mark.parametrize(
+    "options",
+    [{"steps": 3}, pytest.param({"steps": 1, "curvature": "whole"}, marks=pytest.mark.slow)],
+)
 def test_gradient_of_a_quadratic_is_the_closed_form(bowls, options):
     found = pj.gradient(BowlPlanner(), bowls, of=square, by=("b", "k"), **options)
     inverse = np.linalg.inv(CURVED)

@@ -85,6 +85,7 @@ def ideal():
     return execute_motions()
 
 
+@pytest.mark.slow
 def test_a_plan_is_tracked_within_a_milliradian_by_ideal_drives(ideal):
     _, flown = ideal
     assert np.abs(flown.angles[0] - HOME).max() < 1e-5  # the home, against gravity
@@ -96,6 +97,7 @@ def test_a_plan_is_tracked_within_a_milliradian_by_ideal_drives(ideal):
     assert (flown.saturation == 0.0).all()
 
 
+@pytest.mark.slow
 def test_joints_that_turn_when_a_plan_ends_are_braked(ideal):
     courses, flown = ideal
     end = 0.05 + MOVING
@@ -118,6 +120,7 @@ def test_a_reference_is_smooth_where_a_plan_begins_and_its_rates_are_slopes():
     assert np.median(np.abs(rises - reference.accelerations[:-1])) < 0.02
 
 
+@pytest.mark.slow
 def test_torque_limits_are_active_and_not_exceeded():
     small = tuple(0.2 * torque for torque in TORQUES)
     _, flown = execute_motions(Drives(torques=small))
@@ -127,6 +130,7 @@ def test_torque_limits_are_active_and_not_exceeded():
     assert flown.error_worst[0].max() < 1e-4  # the limits suffice for a standstill
 
 
+@pytest.mark.slow
 def test_a_late_plan_is_tracked_as_exactly_as_a_plan_in_time(ideal):
     late = 0.02
     _, flown = execute_motions(Drives(latency=0.5 * late), late=0.5 * late)
@@ -137,6 +141,7 @@ def test_a_late_plan_is_tracked_as_exactly_as_a_plan_in_time(ideal):
     assert flown.tracking[1, 1] > 0.01
 
 
+@pytest.mark.slow
 def test_noise_lag_and_mass_errors_hardly_matter_and_a_seed_gives_the_same_bits():
     drives = Drives(lag=0.005, angle_std=1e-4, rate_std=0.01, mass_error=0.05)
     _, flown = execute_motions(drives)
@@ -163,6 +168,7 @@ def score_standstill(cases, angles, end=0.8):
     return score(cases, plans(*[STILL] * num, contact=0.5), flown, Budget(*[none] * 6))
 
 
+@pytest.mark.slow
 def test_a_ball_on_the_shield_is_blocked_and_one_beside_it_is_not():
     places = [(0.0, 0.0), (0.1, -0.14), (0.16, 0.0), (0.0, -0.5)]
     found = score_standstill(throw_at_shield(places), HOME)
@@ -174,6 +180,7 @@ def test_a_ball_on_the_shield_is_blocked_and_one_beside_it_is_not():
     assert np.isnan(found.contact[2:]).all() and np.isnan(found.contact_pos[2:]).all()
 
 
+@pytest.mark.slow
 def test_a_ball_that_comes_from_behind_or_too_late_is_not_blocked():
     from_behind = throw_at_shield([(0.0, 0.0)], speed=-8.0)
     assert not score_standstill(from_behind, HOME).blocked.any()
@@ -185,6 +192,7 @@ def test_a_ball_that_comes_from_behind_or_too_late_is_not_blocked():
     assert not found.blocked.any() and np.isnan(found.miss).all()
 
 
+@pytest.mark.slow
 def test_an_arm_that_runs_into_the_pole_does_not_succeed():
     ahead = np.array([0.0, 1.0, -0.6, 0.0, 0.0, 0.0])
     turn, middle = map(np.asarray, shield_pose(irb1600(), jnp.asarray(ahead)))
@@ -194,6 +202,7 @@ def test_an_arm_that_runs_into_the_pole_does_not_succeed():
     assert found.nearest[0].endswith(" and capsule 1, obstacle") and found.clearance[0] < -0.01
 
 
+@pytest.mark.slow
 def test_clearances_of_an_exact_execution_equal_the_clearances_of_the_referee():
     cases = throws("pole", LANES, 3).cases
     plan = plans(*MOTIONS, contact=MOVING)
@@ -210,6 +219,7 @@ def test_clearances_of_an_exact_execution_equal_the_clearances_of_the_referee():
     assert found.clearance.min() < found.clearance.max()
 
 
+@pytest.mark.slow
 def test_the_parts_of_the_time_budget_add_up_and_a_late_plan_starts_late():
     cases = throws("open", LANES, 1, regime="R1", delay=0.15)
     seconds = np.array([0.01, 0.05, 0.07, 0.02])
@@ -232,6 +242,7 @@ def test_the_parts_of_the_time_budget_add_up_and_a_late_plan_starts_late():
     assert within.tolist() == [[False, True]] * LANES
 
 
+@pytest.mark.slow
 def test_arms_that_observe_their_balls_execute_the_motions_they_decided():
     cases = throws("open", LANES, 1, regime="R1", delay=0.15)
     plan = plans(*MOTIONS, contact=0.15 + MOVING)
@@ -288,6 +299,7 @@ def recorded():
     return task, flights, task.recording(cases, flights, np.arange(LANES))
 
 
+@pytest.mark.slow
 def test_a_recording_shows_the_ball_until_and_after_its_block(recorded, tmp_path):
     task, flights, kept = recorded
     draw_flight(tmp_path / "block.png", task, kept, 0)
@@ -306,6 +318,7 @@ def test_a_recording_shows_the_ball_until_and_after_its_block(recorded, tmp_path
     assert np.isnan(kept.met[1:]).all()
 
 
+@pytest.mark.slow
 def test_the_viewer_places_the_links_of_the_arm(recorded):
     pytest.importorskip("viser")
     task, _, kept = recorded

@@ -92,6 +92,7 @@ def forces_of(vehicle, vel, steering):
     return tyre_forces(vehicle, jnp.zeros(3), vel, steering, jnp.zeros(()), 0.005)
 
 
+@pytest.mark.slow
 def test_line_and_slalom_without_noise_are_tracked_within_a_centimetre(noiseless):
     drives, frames = noiseless
     assert (drives.worst_tracking[[0, 2]] < 0.01).all() and not drives.saturated.any()
@@ -99,6 +100,7 @@ def test_line_and_slalom_without_noise_are_tracked_within_a_centimetre(noiseless
     assert apart.max() <= drives.worst_tracking.max() + 1e-5
 
 
+@pytest.mark.slow
 def test_noise_on_the_pose_is_filtered_and_the_same_seed_gives_the_same_bits():
     first, frames = drive_paths(NOISY)
     again, _ = drive_paths(NOISY)
@@ -170,6 +172,7 @@ def test_contacts_of_planned_poses_equal_those_of_the_referee():
     assert not found.success.any()
 
 
+@pytest.mark.slow
 def test_predictions_use_only_observations_that_have_arrived():
     loop = DriveLoop(driving.CAR_WORLD, dataclasses.replace(EXACT, target_std=0.1, latency=0.05))
     seen = driving.meetings("easy", 2, seed=4, observation_rate=1.0)
@@ -208,6 +211,7 @@ class StraightOn(pj.Planner):
         return jax.tree.map(np.asarray, plan.replace(status=states))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solved", [1, 2])
 def test_a_new_plan_starts_at_the_estimated_pose_and_is_driven_if_it_is_solved(solved):
     start = np.array([[0.8, 2.0, 0.0], [0.8, 4.0, 0.0], [0.8, 6.0, 0.0]], np.float32)

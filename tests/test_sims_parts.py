@@ -159,6 +159,7 @@ def tracked():
     return jax.device_get(jax.jit(jax.vmap(one))(jnp.array([0.0, 1.0])))
 
 
+@pytest.mark.slow
 def test_a_trajectory_is_tracked_within_two_centimetres_and_a_tilt_of_one_radian_ends(tracked):
     level, tilted = tracked[0]
     assert level.max() < 0.02 and tilted.max() < 1.0 and tilted[-1] < 0.1
@@ -328,6 +329,7 @@ def test_a_plan_or_world_of_another_robot_is_refused():
         require_plan(plan, Plan, np.zeros((2, 4, 3)))
 
 
+@pytest.mark.slow
 def test_shapes_of_plans_are_known_without_planning():
     planner, cases = quick_hit(), pj.hit.draw(2)
     found = jax.eval_shape(functools.partial(pj.solve, planner), cases)

@@ -109,6 +109,7 @@ def test_the_command_writes_plan_setpoints_and_pictures(hit, tmp_path, capsys):
     assert "--out must be a new folder, got" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_ball_that_flies_away_is_told_so_with_the_limit_that_fails(capsys):
     away = "--pos -2 0 2 --vel -14 0 6 --target 4 0 0"
     assert main(["plan", "hit", *away.split()]) == 1

@@ -52,6 +52,7 @@ def test_a_file_with_utm_coordinates_keeps_millimetres(tmp_path):
     np.testing.assert_allclose(world, target["position"], atol=1e-6)
 
 
+@pytest.mark.slow
 def test_the_command_writes_plan_setpoints_and_picture(tmp_path, capsys):
     out = tmp_path / "out"
     command = ["plan", "intercept", "--map", str(write_case(tmp_path)), "--out", str(out)]
