@@ -326,6 +326,7 @@ def test_what_is_taken_of_a_swarm_is_caught_and_counted(swarm, caught):
     np.testing.assert_array_equal(np.asarray(taken).sum(axis=1), caught.num_taken)
 
 
+@pytest.mark.slow
 def test_a_claimed_catch_of_an_optional_target_has_to_hold(swarm, caught):
     moved = np.array(swarm.targets.ball.pos)
     moved[np.arange(NUM), caught.order[:, 0]] += 1.0
@@ -336,6 +337,7 @@ def test_a_claimed_catch_of_an_optional_target_has_to_hold(swarm, caught):
     assert (verdict.num_caught < caught.num_taken).all()
 
 
+@pytest.mark.slow
 def test_a_search_takes_more_of_a_swarm_than_greed(swarm, caught):
     found = beams(swarm)
     number = np.asarray(found.taken.sum(axis=2))

@@ -70,6 +70,7 @@ def test_the_command_writes_plan_setpoints_and_picture(tmp_path, capsys):
     assert float(setpoints[2][0]) == pytest.approx(0.02) and float(setpoints[-1][0]) == 4.0
 
 
+@pytest.mark.slow
 def test_a_target_out_of_reach_is_reported_with_the_limit_that_fails(tmp_path, capsys):
     path = write_case(tmp_path, target={"position": [7.5, 4.6]}, time=0.5)
     assert main(["plan", "intercept", "--map", str(path)]) == 1
