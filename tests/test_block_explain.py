@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import planner_jax as pj
-from planner_jax.task.block.explain import least_times
+from planner_jax.task.block.motion import least_times
 from planner_jax.task.block.scene import paper_scene
 
 OPEN = paper_scene(has_pole=False)
@@ -16,7 +16,9 @@ BALL = (9.0, 0.5, 0.3), (-8.0, -0.4, 5.4)
 
 def least(away, *, rates=0.0, regime="R2"):
     case = pj.block.case(*BALL, rates=rates, regime=regime)
-    return np.asarray(least_times(case, case.angles + jnp.asarray(away, jnp.float32))), case.limits
+    limits, away = case.limits, jnp.asarray(away, jnp.float32)
+    settings = case.rates, limits.velocity, limits.acceleration, case.ends_at_rest
+    return np.asarray(least_times(away, *settings)[0]), limits
 
 
 @pytest.mark.parametrize("away", [0.05, -0.05, 1.5, -1.5])

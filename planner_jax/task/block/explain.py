@@ -11,6 +11,7 @@ from planner_jax.core.checks import require_kind
 from planner_jax.core.choices import require
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.end_poses import end_poses, flight_of
+from planner_jax.task.block.motion import least_times
 
 _POINTS, _PIECES = (
     192,
@@ -72,26 +73,8 @@ def prospects(case: BlockCase) -> Prospects:
 def _measure(case: BlockCase) -> tuple[Array, Array, Array]:
     flight = flight_of(case)
     poses = end_poses(case, flight, _POINTS, _PIECES)
-    least = jax.vmap(lambda angles: jnp.max(least_times(case, angles)))(poses.angles)
+    settings = case.rates, case.limits.velocity, case.limits.acceleration, case.ends_at_rest
+    away = poses.angles - case.angles[None]
+    least = jax.vmap(lambda away: jnp.max(least_times(away, *settings)[0]))(away)
     late = case.delay + least - poses.time
     return poses.is_found, case.clearances(poses.angles), late
-
-
-def least_times(case: BlockCase, angles: Array) -> Array:
-    """Return the least time (n,) [s] in which each joint alone turns to its angle, without gravity.
-
-    A joint starts with its rate in the case. It ends at rest if the case requires this. The motion
-    has the greatest acceleration, then the greatest rate, and then the greatest deceleration.
-    """
-    most, rise = case.limits.velocity, case.limits.acceleration
-    away, rate = angles - case.angles, case.rates
-    stop = 0.5 * rate * jnp.abs(rate) / rise  # angle in which the joint stops
-    sign = jnp.where(away >= jnp.where(case.ends_at_rest, stop, 0.0), 1.0, -1.0)
-    away, rate = sign * away, sign * rate
-    ends = jnp.where(case.ends_at_rest, 1.0, 0.0)
-    # Rate at which the joint stops to accelerate: it reaches `away` at rest, or with this rate.
-    peak = jnp.sqrt(jnp.maximum((2.0 * rise * away + rate**2) / (1.0 + ends), 0.0))
-    peak = jnp.minimum(peak, most)
-    turned = ((1.0 + ends) * peak**2 - rate**2) / (2.0 * rise)
-    ramps = ((1.0 + ends) * peak - rate) / rise
-    return ramps + jnp.maximum(away - turned, 0.0) / jnp.maximum(peak, 1e-9)

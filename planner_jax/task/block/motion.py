@@ -184,6 +184,27 @@ def speed_up(
     ), pace
 
 
+def least_times(
+    away: Array, rate: Array, velocity: Array, acceleration: Array, ends_at_rest: Array | bool
+) -> tuple[Array, Array]:
+    """Return the least times (n,) [s] in which each joint alone turns by `away` (n,) [rad].
+
+    A joint starts with the rate (n,) [rad/s], and may end at rest. The motion has the greatest
+    acceleration, then the greatest rate, and then the greatest deceleration. The second result is
+    the duration (n,) of the acceleration.
+    """
+    stop = jnp.where(ends_at_rest, 0.5 * rate * jnp.abs(rate) / acceleration, 0.0)
+    sign = jnp.where(away >= stop, 1.0, -1.0)
+    away, rate = sign * away, sign * rate
+    halves = jnp.where(ends_at_rest, 2.0, 1.0)
+    # Rate at which the joint stops to accelerate: it reaches `away` at rest, or with this rate.
+    peak = jnp.sqrt(jnp.maximum((2.0 * acceleration * away + rate**2) / halves, 0.0))
+    peak = jnp.minimum(peak, velocity)
+    turned = (halves * peak**2 - rate**2) / (2.0 * acceleration)
+    cruise = jnp.maximum(away - turned, 0.0) / jnp.maximum(peak, 1e-9)
+    return (halves * peak - rate) / acceleration + cruise, (peak - rate) / acceleration
+
+
 def append_braking(case: BlockCase, motion: PiecewisePolynomial) -> PiecewisePolynomial:
     """Append a piece in which all joints brake uniformly and stop at the same time.
 

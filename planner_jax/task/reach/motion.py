@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from planner_jax.robot.arm import ArmLimits
+from planner_jax.task.block.motion import least_times
 from planner_jax.trajectory.polynomial import PiecewisePolynomial
 
 
@@ -24,13 +25,6 @@ def pad_knots(durations: Array, rates: Array, pieces: int) -> tuple[Array, Array
     return jnp.pad(durations, (0, missing)), jnp.pad(rates, ((0, missing), (0, 0)))
 
 
-def _ramp(distance: Array, velocity: Array, acceleration: Array) -> tuple[Array, Array]:
-    """Return the durations [s] of a trapezoid of speed over a distance, and of its ramps."""
-    ramp = jnp.minimum(velocity / acceleration, jnp.sqrt(distance / acceleration))
-    cruise = distance / jnp.maximum(acceleration * ramp, 1e-12) - ramp
-    return 2.0 * ramp + jnp.maximum(cruise, 0.0), ramp
-
-
 def quickest_knots(start: Array, goal: Array, limits: ArmLimits) -> tuple[Array, Array]:
     """Return the knots of the motion in which every joint takes the time of the slowest joint.
 
@@ -43,7 +37,8 @@ def quickest_knots(start: Array, goal: Array, limits: ArmLimits) -> tuple[Array,
     """
     turn, most = goal - start, limits.acceleration
     size = jnp.abs(turn)
-    total = jnp.max(_ramp(size, limits.velocity, most)[0])
+    still = jnp.zeros_like(size)
+    total = jnp.max(least_times(size, still, limits.velocity, most, ends_at_rest=True)[0])
     speed = most * total
     speed = 0.5 * (speed - jnp.sqrt(jnp.maximum(speed**2 - 4.0 * most * size, 0.0)))
     speed = jnp.minimum(speed, limits.velocity)
@@ -68,7 +63,8 @@ def straight_knots(points: Array, limits: ArmLimits) -> tuple[Array, Array]:
     speed, rise = (
         jnp.min(limit[None] / size, axis=1) for limit in (limits.velocity, limits.acceleration)
     )
-    total, ramp = _ramp(jnp.ones_like(speed), speed, rise)
+    one, still = jnp.ones_like(speed), jnp.zeros_like(speed)
+    total, ramp = least_times(one, still, speed, rise, ends_at_rest=True)
     moves = jnp.max(jnp.abs(turn), axis=1) > 0.0
     total, ramp = jnp.where(moves, total, 0.0), jnp.where(moves, ramp, 0.0)
     durations = jnp.stack([ramp, total - 2.0 * ramp, ramp], axis=1).reshape(-1)
