@@ -216,8 +216,13 @@ def reach_set(
     vehicle: Vehicle,
     initial_speed: Array,
     needed: Array,
+    goal: Array | None = None,
 ) -> ReachSet:
     """Compute which states a vehicle can reach at each time layer.
+
+    With `goal` it is the set of the states from which the vehicle can reach a goal at the horizon:
+    time runs backwards, so that layer 0 of the result is at the horizon. The speeds of `vehicle`
+    are then the negative speeds of its levels.
 
     Args:
         grid: positions of the cells and times of the layers, from `grid_of`.
@@ -228,6 +233,7 @@ def reach_set(
         vehicle: sizes and limits of the vehicle.
         initial_speed: () [m/s].
         needed: () int32, number of layers to compute, equal for all cases of a batch.
+        goal: (levels, headings, cells along y, cells along x) bool, states at the goal.
     """
     lattice, speeds = grid.lattice, vehicle.speeds
     levels, headings, (columns, rows) = lattice.num_speeds, lattice.headings, lattice.cells
@@ -248,7 +254,7 @@ def reach_set(
     before = jnp.arange(lattice.layers + 1, dtype=dtype)[:, None]
     whole = jnp.diff(jnp.floor(before * most[None] + 0.1), axis=0)  # (layers, levels)
     turns = jnp.abs(jnp.arange(-SPAN, SPAN + 1, dtype=dtype))[None, None] <= whole[..., None]
-    gap = jnp.maximum(speeds[-1] - speeds[-2], speeds[1] - speeds[0])
+    gap = jnp.max(jnp.abs(jnp.diff(speeds)))
     change = vehicle.acceleration * grid.step / jnp.maximum(gap, 1e-6)
     layer_ends = jnp.arange(lattice.layers + 1, dtype=dtype)
     changes = jnp.diff(jnp.floor(layer_ends * jnp.minimum(change, 1.0) + 0.1)) >= 1.0
@@ -261,6 +267,8 @@ def reach_set(
     packed = _pack(allowed)
 
     times = 0.5 * grid.step * jnp.arange(2 * lattice.layers + 2, dtype=dtype)
+    if goal is not None:  # entry 1 is at the horizon
+        times = 0.5 * grid.step * (2 * grid.num + 1).astype(dtype) - (times - times[1])
     halves_needed = 2 * needed + 2
 
     def draw_obstacles(time: Array) -> Array:
@@ -310,8 +318,11 @@ def reach_set(
         bits = lax.platform_dependent(bits, n, cpu=apart, default=at_once)
         return bits, lax.dynamic_update_index_in_dim(layers, bits, n + 1, 0)
 
-    first = _start_bits(grid, initial_speed, speeds)
-    first = _shift(first & free[0][:, None], halves[0]) & free[1][:, None]
+    if goal is None:
+        first = _start_bits(grid, initial_speed, speeds)
+        first = _shift(first & free[0][:, None], halves[0]) & free[1][:, None]
+    else:
+        first = _pack(goal) & free[1][:, None]
     layers = jnp.zeros((lattice.layers + 1, *first.shape), first.dtype).at[0].set(first)
     _, layers = lax.fori_loop(0, needed, layer, (first, layers))
     return ReachSet(bits=layers, moves=moves, turns=turns, changes=changes, speeds=speeds)
@@ -340,6 +351,16 @@ def _turn(bits: Array, turns: Array) -> Array:
         by = jnp.roll(bits, k - SPAN, axis=2)
         reached |= jnp.where(turns[:, k, None, None], by, jnp.uint32(0))
     return reached
+
+
+def widen(bits: Array) -> Array:
+    """Add all neighbours in speed level, heading and cell to a bitmap of states."""
+    bits = _change_speed(bits)
+    bits |= jnp.roll(bits, 1, axis=2) | jnp.roll(bits, -1, axis=2)
+    one = jnp.ones(bits.shape[1:3], jnp.int32)
+    for move in (_move_x, _move_y):
+        bits |= move(bits, one) | move(bits, -one)
+    return bits
 
 
 def bit_at(bits: Array, level: Array, heading: Array, cell: Array) -> Array:

@@ -5,7 +5,8 @@ an obstacle stays on the path, no speed avoids it. Here path and speed are plann
 unknowns are the car's speed and curvature at equally spaced times, found by Levenberg-Marquardt
 (`problem`). The first starting point is the direct motion to the target. If it leads to no plan,
 the others are random paths of cells through the reach set (`plane.reach`), which holds the cells of
-the map in which the car can be at each time. There are three stages:
+the map in which the car can be at each time. The last search starts from motions of `state_paths`.
+There are three stages:
 
 1. follow the positions of the starting point;
 2. keep every limit;
@@ -26,7 +27,6 @@ from jax import Array, lax
 from planner_jax.core import protocol
 from planner_jax.core.choices import EFFORTS, require, require_one_of
 from planner_jax.core.planner import Planner
-from planner_jax.plane.cell_paths import PathNoise
 from planner_jax.task.intercept.case import InterceptCase
 from planner_jax.task.intercept.plan import InterceptPlan, explain, make_straight_plan
 from planner_jax.task.intercept.problem import (
@@ -44,13 +44,14 @@ from planner_jax.task.intercept.searches import (
     LoadedSearch,
     Reachability,
     Search,
+    choose_searches,
     draw_cell_path,
-    leave_out_fine,
     load_search,
     make_field,
     make_grid,
     search_reach,
 )
+from planner_jax.task.intercept.state_paths import StatePaths, find_state_paths
 from planner_jax.task.intercept.units import enter_units, leave_units, units_of
 
 _EFFORTS = {"good": (8, 48), "best": (32, 96)}  # numbers of paths, and of steps of the last stage
@@ -92,8 +93,8 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
         return self.searches or SEARCHES[self.meet]
 
     def attempts_for(self, cases: InterceptCase) -> tuple[Search, ...]:
-        """Return the searches of `attempts` whose cells are not smaller than the cases need."""
-        return leave_out_fine(self.attempts, cases)
+        """Return the searches of `attempts` that the cases need."""
+        return choose_searches(self.attempts, cases)
 
     @property
     def problem(self) -> MotionProblem:
@@ -163,7 +164,9 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
         grid = make_grid(case, search.lattice, is_time_free=is_free)
         field, stages = make_field(case, grid), problem.list_stages(search)
 
-        def find() -> Reachability:
+        def find() -> Reachability | StatePaths:
+            if search.states:
+                return find_state_paths(case, search, grid, field, self.pieces)
             return search_reach(case, search, grid, field, is_time_free=is_free)
 
         def try_start(state: tuple) -> tuple:
@@ -171,13 +174,10 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
             # Start -1 is the direct motion. If it solves the case, nothing is searched.
             found = lax.cond(k == 0, find, lambda: found)
 
-            def guess_along_cells() -> Guess:
-                noise = jax.tree.map(lambda leaf: leaf[k], search.noise)
-                return self._guess(case, found, noise, search)
-
             directly = lambda: problem.guess_directly(case, search.is_late)  # noqa: E731
-            guess = lax.cond(k < 0, directly, guess_along_cells)
+            guess = lax.cond(k < 0, directly, lambda: self._guess(case, found, k, search))
             plan = problem.refine(case, field, guess, search, stages)
+            plan = self._select_guess(case, guess, search, plan)
             is_path = (k < 0) | found.is_reached
             return k + 1, found, protocol.select(plan, best, is_path)
 
@@ -210,15 +210,21 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
         is_free = problem.is_time_free
         grid = make_grid(case, attempt.lattice, is_time_free=is_free)
         field, stages = make_field(case, grid), problem.list_stages(attempt)
-        found = search_reach(case, attempt, grid, field, is_time_free=is_free, layers=layers)
+        if attempt.states:
+            found = find_state_paths(case, attempt, grid, field, self.pieces)
+        else:
+            found = search_reach(case, attempt, grid, field, is_time_free=is_free, layers=layers)
 
         def solve_from(guess: Guess) -> InterceptPlan:
             if self.tries_all:
-                return problem.refine(case, field, guess, attempt, stages)
-            points, steps = problem.run_stages(case, field, guess, attempt, stages[:-1])
-            return problem.decode(case, points[-1], steps)
+                plan = problem.refine(case, field, guess, attempt, stages)
+            else:
+                points, steps = problem.run_stages(case, field, guess, attempt, stages[:-1])
+                plan = problem.decode(case, points[-1], steps)
+            return self._select_guess(case, guess, attempt, plan)
 
-        guesses = jax.vmap(lambda noise: self._guess(case, found, noise, attempt))(attempt.noise)
+        each = jnp.arange(len(attempt.noise.layers))
+        guesses = jax.vmap(lambda k: self._guess(case, found, k, attempt))(each)
         direct = problem.guess_directly(case, attempt.is_late)
         guesses = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), direct, guesses)
         plans = jax.vmap(solve_from)(guesses)
@@ -242,10 +248,13 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
         return load_search(attempt, attempts, is_apart, has_reverse)
 
     def _guess(
-        self, case: InterceptCase, found: Reachability, noise: PathNoise, attempt: Search
+        self, case: InterceptCase, found: Reachability | StatePaths, k: Array, attempt: LoadedSearch
     ) -> Guess:
-        layer = found.grid.num
-        if self.problem.is_time_free:
+        problem = self.problem
+        if isinstance(found, StatePaths):
+            return problem.guess_at(problem.pack(found.speed[k], found.curvature[k], case.time))
+        layer, noise = found.grid.num, jax.tree.map(lambda leaf: leaf[k], attempt.noise)
+        if problem.is_time_free:
             allowed = found.layers
             if self.meet == "early":
                 allowed &= jnp.cumsum(found.layers) <= _SPREAD
@@ -254,7 +263,15 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
             latest = jnp.max(jnp.where(found.layers, numbers, 0))
             layer = jnp.where(attempt.is_late, latest, layer)
         path = draw_cell_path(case, found, layer, noise, attempt.directness)
-        return self.problem.guess_along(case, found.grid, found.reach.speeds, path, layer)
+        return problem.guess_along(case, found.grid, found.reach.speeds, path, layer)
+
+    def _select_guess(
+        self, case: InterceptCase, guess: Guess, attempt: LoadedSearch, plan: InterceptPlan
+    ) -> InterceptPlan:
+        """Return the better of a plan and its starting point, if this point is a whole motion."""
+        if not attempt.states:
+            return plan
+        return protocol.select(plan, self.problem.decode(case, guess.point, plan.iterations))
 
     def _explain(
         self, case: InterceptCase, attempt: LoadedSearch, is_reached: Array, plan: InterceptPlan

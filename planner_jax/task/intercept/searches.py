@@ -5,6 +5,7 @@ can be there. Random paths through the set are the starting points of least squa
 """
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -52,6 +53,9 @@ class Search(Attempt):
     # narrow passages that are open in truth.
     body_scale: float = 1.0
     body_discs: int = 2  # number of discs that cover the body in the reach set
+    # Number of states that are continued after each step of a search for motions (`state_paths`),
+    # from which least squares start instead of paths of cells; 0: paths of cells.
+    states: int = 0
     # Whether least squares also start from the direct motion to the target (`guess_directly`).
     is_direct: bool = False
     # Whether the search is left out if the cells of the default lattice are small enough.
@@ -90,12 +94,15 @@ def load_search(
 ) -> LoadedSearch:
     """Return one of a planner's searches, with its settings as arguments of a compiled program.
 
-    All `searches` of the planner with equal lattices share one program. Its arrays of random
-    numbers, which select the paths, are padded to the greatest numbers of paths and candidates of
-    these searches. If `is_apart`, the search has its own program without padding, because a GPU
-    would try padded paths, too. `has_reverse` is whether the car has a reverse gear.
+    All `searches` of the planner with equal lattices and numbers of states share one program. Its
+    arrays of random numbers, which select the paths, are padded to the greatest numbers of paths
+    and candidates of these searches. If `is_apart`, the search has its own program without
+    padding, because a GPU would try padded paths, too. `has_reverse` is whether the car has a
+    reverse gear.
     """
-    same = [each for each in searches if each.lattice == search.lattice]
+    same = [
+        each for each in searches if each.lattice == search.lattice and each.states == search.states
+    ]
     is_last = search == same[-1]
     sizes = (search,) if is_apart else same
     if has_reverse:
@@ -150,6 +157,18 @@ _FINE = Search(
     is_for_small_cars=True,
     lattice=reach.Lattice((256, 192), layers=60, levels=8, pace=5.0),
 )
+# Last search, for cases that least squares from paths of cells do not solve.
+_STATES = Search(
+    16,
+    LevenbergConfig(60),
+    following=0,
+    body_scale=0.6,
+    candidates=1,
+    discs=5,
+    margin=0.006,
+    slack=1e-3,
+    states=1000,
+)
 _COARSE = 0.6  # a cell that is longer than this share of the car's width is coarse
 QUICK = tuple(
     dataclasses.replace(search, paths=paths, solver=LevenbergConfig(steps), settling=12)
@@ -175,28 +194,31 @@ _EARLY = Search(
 )
 _LEAST = Search(16, LevenbergConfig(60, tolerance=5e-4), is_direct=True)
 # Later searches for a free meeting time first find a plan for the latest time, and then improve it.
-_LATER = tuple(dataclasses.replace(each, is_late=True) for each in (*_GIVEN, _FINE))
+_LATER = tuple(dataclasses.replace(each, is_late=True) for each in (*_GIVEN, _FINE, _STATES))
 SEARCHES = {
-    "given": (*_GIVEN, _FINE),
+    "given": (*_GIVEN, _FINE, _STATES),
     "early": (_EARLY, *_LATER),
     "least": (_LEAST, *_LATER),
 }
 
 
-def leave_out_fine(searches: tuple[Search, ...], cases: InterceptCase) -> tuple[Search, ...]:
-    """Leave out searches for small cars if the usual cells are small enough for all cases.
+def choose_searches(searches: tuple[Search, ...], cases: InterceptCase) -> tuple[Search, ...]:
+    """Leave out searches that the cases do not need.
 
-    They are also left out inside compiled functions, where they would double the compile time.
+    Searches for small cars are left out if the usual cells are small enough for all cases.
+    Searches of states are left out if a car has a reverse gear. Both are left out inside compiled
+    functions, since they would more than double the compile time.
     """
     usual = reach.Lattice().cells
     leaves = (cases.lower, cases.upper, cases.limits.speed, cases.time, cases.body.width)
-    if any(isinstance(leaf, Tracer) for leaf in leaves):
-        is_coarse = False
-    else:
+    is_coarse, is_traced = False, any(isinstance(leaf, Tracer) for leaf in leaves)
+    if not is_traced:
         lower, upper, speed, time, width = (np.asarray(leaf, np.float64) for leaf in leaves)
         cell = np.minimum(upper - lower, 2.0 * (speed * time)[..., None]) / np.asarray(usual)
-        is_coarse = np.any(cell > _COARSE * width[..., None])
-    return tuple(each for each in searches if is_coarse or not each.is_for_small_cars)
+        is_coarse = bool(np.any(cell > _COARSE * width[..., None]))
+    omits_states = is_traced or cases.limits.reverse_speed is not None
+    small = (each for each in searches if is_coarse or not each.is_for_small_cars)
+    return tuple(each for each in small if not (each.states and omits_states))
 
 
 @struct.dataclass
@@ -284,6 +306,32 @@ def search_reach(
     equally spaced times; by default they extend to the case's time. `is_time_free` is true if the
     target may be met before the case's time.
     """
+    found = compute_reach(case, search, grid, field, grid.num if layers is None else layers)
+    numbers = jnp.arange(grid.lattice.layers + 1)
+    num = grid.num.astype(numbers.dtype)
+    meet = functools.partial(_meeting_cells, case, grid)
+    is_met = jax.vmap(lambda n: jnp.any(meet(found.bits[n], found.speeds, n)[1]))
+    if is_time_free:
+        times = (numbers.astype(grid.step.dtype) + 0.5) * grid.step
+        reached = is_met(numbers) & (numbers >= 1) & (numbers <= num) & (times >= case.earliest)
+    else:
+        reached = is_met(grid.num[None])[0] & (numbers == num)
+    return Reachability(grid=grid, reach=found, layers=reached)
+
+
+def compute_reach(
+    case: InterceptCase,
+    search: Search,
+    grid: reach.Grid,
+    field: DistanceField,
+    needed: Array,
+    is_backward: bool = False,
+) -> reach.ReachSet:
+    """Compute the states that the car can reach, as `search_reach` does.
+
+    With `is_backward` the result has the states from which the car can meet the target at the
+    case's time, and layer 0 is at this time.
+    """
     lattice, limits, speed = search.lattice, case.limits, _top_speed(case)
     radius, ahead = discs_of(case.body, search.body_discs)
     shares = [
@@ -299,19 +347,27 @@ def search_reach(
     vehicle = reach.Vehicle(
         search.body_scale * radius + case.margin, ahead, level, turn_rates, limits.acceleration
     )
-    needed = grid.num if layers is None else layers
     coarse = field.values[::_NODES, ::_NODES]
     allowed = _allowed_cells(case, grid)
-    found = reach.reach_set(grid, coarse, allowed, case.movers, vehicle, case.speed, needed)
-    numbers = jnp.arange(lattice.layers + 1)
-    num = grid.num.astype(numbers.dtype)
-    is_met = jax.vmap(lambda n: jnp.any(_meeting_cells(case, grid, found, n)[1]))
-    if is_time_free:
-        times = (numbers.astype(grid.step.dtype) + 0.5) * grid.step
-        reached = is_met(numbers) & (numbers >= 1) & (numbers <= num) & (times >= case.earliest)
-    else:
-        reached = is_met(grid.num[None])[0] & (numbers == num)
-    return Reachability(grid=grid, reach=found, layers=reached)
+    goal = None
+    if is_backward:
+        goal = _mark_goal(case, grid, level)
+        vehicle = dataclasses.replace(vehicle, speeds=-level)
+    return reach.reach_set(grid, coarse, allowed, case.movers, vehicle, case.speed, needed, goal)
+
+
+def _mark_goal(case: InterceptCase, grid: reach.Grid, speeds: Array) -> Array:
+    """Return the states that meet the target at the horizon, bool, as `reach.reach_set` needs."""
+    lattice = grid.lattice
+    columns, rows = lattice.cells
+    every = jnp.full((columns // 32, speeds.size, lattice.headings, rows), 2**32 - 1, jnp.uint32)
+    cells, is_met = _meeting_cells(case, grid, every, speeds, grid.num)
+    column, row = jnp.moveaxis(cells, -1, 0)
+    bins = jnp.arange(lattice.headings)[:, None]
+    inside = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
+    at = bins, jnp.clip(row, 0, rows - 1), jnp.clip(column, 0, columns - 1)
+    none = jnp.zeros((lattice.headings, rows, columns), bool)
+    return jax.vmap(lambda met: none.at[at].max(met & inside))(is_met)
 
 
 def _allowed_cells(case: InterceptCase, grid: reach.Grid) -> Array:
@@ -329,7 +385,7 @@ def _allowed_cells(case: InterceptCase, grid: reach.Grid) -> Array:
 
 
 def _meeting_cells(
-    case: InterceptCase, grid: reach.Grid, found: reach.ReachSet, layer: Array
+    case: InterceptCase, grid: reach.Grid, bits: Array, speeds: Array, layer: Array
 ) -> tuple[Array, Array]:
     goal = case.target.at((layer.astype(grid.step.dtype) + 0.5) * grid.step).pos
     num = grid.lattice.headings
@@ -341,11 +397,9 @@ def _meeting_cells(
     grid_points = jnp.asarray(reach.AROUND, extent.dtype) * extent[None]
     away, _ = jax.vmap(nearest_in_region, (None, 0))(case.region, grid_points)
     points = goal[None] + grid_points - away
-    cells, is_reached = reach.goal_cells(
-        grid, found.bits[layer], points, case.body.middle, headings
-    )
-    gap = jnp.max(jnp.diff(found.speeds))
-    levels = (found.speeds > case.end_speed[0] - gap) & (found.speeds < case.end_speed[1] + gap)
+    cells, is_reached = reach.goal_cells(grid, bits, points, case.body.middle, headings)
+    gap = jnp.max(jnp.diff(speeds))
+    levels = (speeds > case.end_speed[0] - gap) & (speeds < case.end_speed[1] + gap)
     return cells, is_reached & levels[:, None, None]
 
 
@@ -361,9 +415,9 @@ def draw_cell_path(
     `noise` holds the random numbers that select the path. The greater `directness` >= 0, the
     straighter are the paths, and the more even is their speed.
     """
-    cells, is_reached = _meeting_cells(case, found.grid, found.reach, layer)
-    draw = cell_paths.draw_path
-    return draw(found.grid, found.reach, layer, cells, is_reached, noise, directness)
+    reached = found.reach
+    meetings = _meeting_cells(case, found.grid, reached.bits[layer], reached.speeds, layer)
+    return cell_paths.draw_path(found.grid, reached, layer, *meetings, noise, directness)
 
 
 # Settings of `earliest_arrival`. They do not use the defaults of `Search`, because the cases of the
