@@ -12,6 +12,7 @@ from planner_jax.core.plan_files import leaves_by_name
 from planner_jax.optimise.levenberg import LevenbergConfig
 from planner_jax.referee.arm_clearance import KINDS
 from planner_jax.referee.arm_clearance import clearances as referee_clearances
+from planner_jax.referee.block import entry_time as body_entry_time
 from planner_jax.robot.arm import REGIMES, reach_of
 from planner_jax.robot.arm_file import irb1600
 from planner_jax.runs.timing import CompileClock
@@ -139,6 +140,48 @@ def test_balls_are_blocked_among_two_poles_a_box_a_sphere_and_a_cylinder():
     np.testing.assert_array_equal(verdict.success, pj.are_solved(plans))
     assert verdict.success.mean() > 0.8 > bare.success.mean()
     assert "obstacle" in bare.failed_limit
+
+
+def test_a_ball_with_a_radius_and_a_rounded_body_are_touched_when_the_referee_says():
+    usual = pj.block.draw(60, "open", 3)
+    person = make_scene(protected_capsule=([(0.0, 0.0, 1.2), (0.0, 0.0, 0.3)], 0.3))
+    of_flights = jax.jit(jax.vmap(flight_of))
+    for scene, radius in ((None, 0.05), (person, 0.0), (person, 0.04)):
+        ball = usual.ball
+        cases = pj.block.case(ball.pos, ball.vel, scene=scene, ball_radius=radius)
+        flight = of_flights(cases)
+        leaves = {name: np.asarray(leaf, float) for name, leaf in leaves_by_name(cases).items()}
+        with np.errstate(invalid="ignore"):
+            entry = body_entry_time(leaves, 0.0)
+        np.testing.assert_array_equal(flight.comes, np.isfinite(entry))
+        comes = np.asarray(flight.comes)
+        assert comes.any() and np.all(comes) == (scene is None)
+        np.testing.assert_allclose(np.asarray(flight.latest)[comes], entry[comes], atol=2e-4)
+
+
+def test_throws_at_a_scene_hit_its_body_and_miss_its_obstacles():
+    ends = [(0.0, 0.0, 0.3), (0.0, 0.0, 1.1)]
+    shelf = {"boxes": [((2.0, 0.0, 1.0), (0.1, 2.0, 2.0), (1.0, 0.0, 0.0, 0.0))]}
+    bare, full = (make_scene(protected_capsule=(ends, 0.3), **each) for each in ({}, shelf))
+    cases, fewer = (pj.block.draw(20, "open", 3, scene=scene) for scene in (bare, full))
+    flights = jax.jit(jax.vmap(flight_of))
+    assert flights(cases).comes.all() and flights(fewer).comes.all()
+    assert not np.array_equal(cases.ball.pos, fewer.ball.pos)
+    wall = make_scene(boxes=[((1.5, 0.0, 0.8), (0.1, 9.0, 9.0), (1.0, 0.0, 0.0, 0.0))])
+    with pytest.raises(ValueError, match="scene must be reached by one of 2000 random throws"):
+        pj.block.draw(1, "open", 3, scene=wall)
+
+
+@pytest.mark.slow
+def test_balls_with_a_radius_are_blocked_before_they_touch_a_person():
+    scene = make_scene(protected_capsule=([(0.0, 0.0, 0.3), (0.0, 0.0, 1.1)], 0.35))
+    usual = pj.block.draw(40, "open", 3, scene=scene)
+    ball = usual.ball
+    cases = pj.block.case(ball.pos, ball.vel, wide=True, scene=scene, ball_radius=0.05)
+    plans = pj.plan(pj.block.planner(), cases)
+    verdict = pj.block.judge(cases, plans)
+    np.testing.assert_array_equal(verdict.success, pj.are_solved(plans))
+    assert verdict.success.mean() > 0.85 and np.abs(verdict.height).max() < 1e-3
 
 
 def with_outline(half):

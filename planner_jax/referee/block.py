@@ -14,7 +14,7 @@ import numpy as np
 
 from planner_jax.referee import judging
 from planner_jax.referee.arm_clearance import KINDS, clearances, links_of, shield_pose
-from planner_jax.referee.solids import rotate_back
+from planner_jax.referee.solids import length, rotate_back
 
 _SENTENCES = {
     "not finite": "the plan or its case is not finite",
@@ -50,9 +50,9 @@ _OBSTACLES: dict[str, dict[str, tuple[int, ...]]] = {
     "cylinder": {"ends": (2, 3), "radius": ()},
 }
 _CASE_SHAPES: dict[str, tuple[int, ...]] = {
-    **{"ball.pos": (3,), "ball.vel": (3,), "gravity": ()},
+    **{"ball.pos": (3,), "ball.vel": (3,), "gravity": (), "ball_radius": ()},
     **{"delay": (), "ends_at_rest": (), "offset": (), "tilt": ()},
-    **{"arm.base_box": (2, 3), "scene.floor": ()},
+    **{"arm.base_box": (2, 3), "scene.floor": (), "scene.inner_radius": ()},
     **{"arm.shield_centre": (3,), "arm.shield_turn": (4,), "arm.shield_half": (2,)},
     **{f"scene.{box}.{side}": (3,) for box in ("inner", "outer") for side in _SIDES},
 }
@@ -72,6 +72,7 @@ _FASTEST = 100.0
 LONGEST_PLAN = 60.0  # [s], latest contact that the referee accepts
 REST = 0.01  # [rad/s], greatest joint rate that counts as standstill
 _HALVINGS = 45  # number of bisections in the search for the time of a joint's extreme angle or rate
+_ENTRIES = 2049  # number of times at which a ball's distance from a rounded body is computed
 _SAMPLES = 16384  # number of poses whose clearances are computed together and fit the cache
 
 
@@ -99,7 +100,9 @@ class BlockVerdict(judging.Verdict):
     base_clearance: np.ndarray  # (B,) [m], least distance of shield and links from the base
     self_clearance: np.ndarray  # (B,) [m], least distance between two parts of the arm
     miss: np.ndarray  # (B,) [m], ball to the shield's middle at the contact, in the face's plane
-    height: np.ndarray  # (B,) [m], of the ball above the plane of the shield's face at the contact
+    height: (
+        np.ndarray
+    )  # (B,) [m], of the ball's nearest point above the face's plane at the contact
     tilt: np.ndarray  # (B,) [rad], angle between shield's normal and minus the ball's velocity
 
     def success_message(self, k: int | tuple) -> str:
@@ -131,7 +134,7 @@ def referee_blocks(
             [rad], [rad/s], and of joint angles beyond their limits [rad].
         contact_tolerance: [m], greatest distance of the ball from the shield's face at the
             contact, and greatest depth of the arm in an obstacle. The ball must be blocked inside
-            the outer box, before it enters the protected inner box. The outer box is enlarged,
+            the outer box, before it touches the protected body. The outer box is enlarged,
             and the inner box reduced, by this length.
 
     Returns:
@@ -369,6 +372,7 @@ def _judge_contact(case: dict, angles: np.ndarray, relative: float, contact: flo
     turns, positions = links_of(case, angles[..., None])
     turn, middle = (each[..., 0] for each in shield_pose(case, turns, positions))
     height, *beside = rotate_back(turn, ball - middle)
+    height = height - case["ball_radius"]
     toward, *across = rotate_back(turn, fall * time - case["ball.vel"].T)
     miss, tilt = np.hypot(*beside), np.arctan2(np.hypot(*across), toward)
     is_off = np.abs(height) > contact
@@ -392,14 +396,37 @@ def _tunnel(case: dict, contact: float) -> tuple:
     def off(grown: float) -> np.ndarray:
         begin, end = times_inside(case, "outer", grown)
         out = np.maximum(np.maximum(begin - time, time - end), 0.0).min(axis=0)
-        begin, end = times_inside(case, "inner", -grown)
-        entry = np.where(end >= 0.0, np.maximum(begin, 0.0), np.inf).min(axis=0)
-        return np.maximum(out, time - entry)
+        return np.maximum(out, time - entry_time(case, grown))
 
     return off(contact) > 0.0, off(0.0), time
 
 
-def times_inside(case: dict, name: str, grown: float) -> tuple[np.ndarray, np.ndarray]:
+def entry_time(case: dict, within: float) -> np.ndarray:
+    """Return when the balls of B cases get `within` [m] into the protected body, (B,) [s].
+
+    The body is the inner box with the points up to `inner_radius` and the ball's radius from it.
+    A ball that never gets there has the time infinity.
+    """
+    radius = case["scene.inner_radius"] + case["ball_radius"] - within
+    begin, end = times_inside(case, "inner", radius)
+    entry = np.where(end >= 0.0, np.maximum(begin, 0.0), np.inf)
+    rounded = np.flatnonzero(radius > 0.0)
+    if len(rounded):  # the edges of the enlarged box are rounded: sample the path in it
+        begin, end = entry[:, rounded], end[:, rounded]
+        never = ~np.isfinite(begin)
+        share = np.linspace(0.0, 1.0, _ENTRIES)[:, None, None]
+        times = np.where(never, 0.0, begin + share * np.where(never, 0.0, end - begin))
+        fall = np.array([0.0, 0.0, 0.5])[:, None, None, None] * case["gravity"][rounded]
+        pos, vel = (case[f"ball.{name}"][rounded].T[:, None, None] for name in ("pos", "vel"))
+        lower, upper = (case[f"scene.inner.{side}"][rounded].T[:, None, None] for side in _SIDES)
+        path = pos + vel * times - fall * times**2
+        near = length(path - np.clip(path, lower, upper)) <= radius[rounded] + 1e-12
+        first = np.take_along_axis(times, near.argmax(axis=0)[None], axis=0)[0]
+        entry[:, rounded] = np.where(near.any(axis=0) & ~never, first, np.inf)
+    return entry.min(axis=0)
+
+
+def times_inside(case: dict, name: str, grown: float | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the times at which the balls of B cases enter a box and at which they leave it.
 
     Both results are (2, B) [s]: a ball may pass the box while it rises (row 0) and while it falls

@@ -163,12 +163,12 @@ def read_arm(
 
 
 @functools.cache
-def read_shield_arm(path: str, tip: str | None = None) -> Arm:
+def read_shield_arm(path: str, tip: str | None = None, shield: Shield | None = None) -> Arm:
     """Read an arm for blocks: as `read_arm`, with a shield of 0.30 m at `tip` if it has none.
 
     A process reads each file once.
     """
-    return _read(path, tip=tip, usual=Shield())[0]
+    return _read(path, shield=shield, tip=tip, usual=Shield())[0]
 
 
 def describe_arm(path: str | os.PathLike, **settings: Any) -> str:

@@ -19,7 +19,7 @@ from planner_jax.core.errors import ArgumentError
 from planner_jax.core.plan_files import leaves_by_name
 from planner_jax.core.protocol import is_solved
 from planner_jax.referee.arm_clearance import clearances, links_of, shield_pose
-from planner_jax.referee.block import times_inside
+from planner_jax.referee.block import entry_time
 from planner_jax.referee.solids import from_segment, rotate, rotate_back
 from planner_jax.robot.arm import Arm
 from planner_jax.runs.timing import measure_plans
@@ -245,8 +245,7 @@ def referee_leaves(cases: BlockCase) -> dict[str, np.ndarray]:
 def entry_times(cases: BlockCase) -> np.ndarray:
     """Return when B balls enter the inner (protected) box, (B,) [s]; infinite for never."""
     with np.errstate(invalid="ignore"):  # NaN for balls that never rise as high as the box
-        begin, end = times_inside(referee_leaves(cases), "inner", 0.0)
-    return np.where(end >= 0.0, np.maximum(begin, 0.0), np.inf).min(axis=0)
+        return entry_time(referee_leaves(cases), 0.0)
 
 
 def ball_places(case: dict[str, np.ndarray], times: np.ndarray) -> np.ndarray:

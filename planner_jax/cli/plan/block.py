@@ -26,11 +26,9 @@ class SingleBlock(Single[SingleBlockSettings]):
     def case(self) -> PyTree:
         """Make the case of the specified ball."""
         given = self.settings
-        own: Entries = {"regime": given.regime}
-        if given.arm is not None:
-            own = arm_options(given.arm, given.tip)
-        scene = scene_for(own.get("arm"), has_pole=not given.no_pole)
-        return case(given.pos, given.vel, delay=given.delay, wide=given.wide, scene=scene, **own)
+        own: Entries = {"regime": given.regime} | arm_options(given)
+        own.setdefault("scene", scene_for(own.get("arm"), has_pole=not given.no_pole))
+        return case(given.pos, given.vel, delay=given.delay, wide=given.wide, **own)
 
     def contact(self, answer: Answer) -> list[str]:
         """Describe the contact of ball and shield in one sentence."""

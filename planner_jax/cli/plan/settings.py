@@ -13,6 +13,8 @@ from planner_jax.sweep.block.settings import (
     REGIMES,
     arm_option,
     require_own_limits,
+    scene_option,
+    shield_option,
     tip_option,
 )
 from planner_jax.sweep.quadrotor_settings import resolve_robot, robot_option
@@ -68,12 +70,16 @@ class SingleBlockSettings(PlanSettings):
     no_pole: bool = option(False, "", "leave out the pole before the arm")
     arm: str | None = arm_option()
     tip: str | None = tip_option()
+    scene: str | None = scene_option()
+    shield: str | None = shield_option()
 
     RUN: ClassVar[str] = "planner_jax.cli.plan.block:SingleBlock"
 
     def __post_init__(self) -> None:
         require_one_of(REGIMES, "regime", self.regime)
         require_own_limits(self.arm, self.tip, self.regime)
+        is_one = not self.no_pole or self.scene is None
+        require(is_one, "no_pole", "left out with --scene, which lists all obstacles", self.no_pole)
         for name in ("pos", "vel"):
             numbers = tuple(vars(self)[name])
             object.__setattr__(self, name, numbers)

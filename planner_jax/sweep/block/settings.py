@@ -31,6 +31,18 @@ def tip_option() -> Any:
     return option(None, "NAME", words)
 
 
+def scene_option() -> Any:
+    """Return the option `--scene`, obstacles and protected body from a file."""
+    words = "YAML file of obstacles and protected body, see docs/arms.md (default: the paper's)"
+    return option(None, "FILE", words)
+
+
+def shield_option() -> Any:
+    """Return the option `--shield`, the outline of the arm's shield."""
+    words = "WIDTHxHEIGHT or disc:RADIUS [m], or a YAML file (default: 0.3x0.3)"
+    return option(None, "TEXT", words)
+
+
 def require_own_limits(arm: str | None, tip: str | None, regime: str) -> None:
     """Raise `ArgumentError` for a tip without an arm, or a regime of the IRB 1600 with an arm."""
     require(arm is not None or tip is None, "tip", "left out without --arm", tip)
@@ -38,11 +50,16 @@ def require_own_limits(arm: str | None, tip: str | None, regime: str) -> None:
     require(is_usual, "regime", "left out with --arm, which has limits of its own", regime)
 
 
-def arm_options(path: str, tip: str | None) -> Options:
-    """Return the arguments of `case` and `draw` for an arm from a file."""
-    from planner_jax.robot.arm_file import read_shield_arm  # imports JAX
+def arm_options(settings: Any) -> Options:
+    """Return the arguments of `case` and `draw` for the options of arm, shield and scene."""
+    from planner_jax.task.block.scene_file import read_scene, shield_arm  # imports JAX
 
-    return {"arm": read_shield_arm(path, tip), "regime": None}
+    own: Options = {}
+    if settings.arm is not None or settings.shield is not None:
+        own["arm"] = shield_arm(settings.arm, settings.tip, settings.shield)
+    if settings.arm is not None:
+        own["regime"] = None
+    return own if settings.scene is None else own | {"scene": read_scene(settings.scene)}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,6 +80,8 @@ class BlockSettings(SweepSettings):
     effort: str = option(EFFORTS[0], "NAME", f"how long the planner searches: {', '.join(EFFORTS)}")
     arm: str | None = arm_option()
     tip: str | None = tip_option()
+    scene: str | None = scene_option()
+    shield: str | None = shield_option()
 
     RUN: ClassVar[str] = "planner_jax.sweep.block.sweep:BlockSweep"
     PLANNER: ClassVar[tuple[str, ...]] = ("effort",)
@@ -80,5 +99,4 @@ class BlockSettings(SweepSettings):
 
     def draw_options(self) -> Options:
         """Return the settings that are keyword arguments of the task's function `draw`."""
-        given = super().draw_options()
-        return given if self.arm is None else given | arm_options(self.arm, self.tip)
+        return super().draw_options() | arm_options(self)

@@ -14,4 +14,5 @@ from .replan import ReplanBlock as ReplanBlock
 from .scene import Scene as Scene
 from .scene import make_scene as make_scene
 from .scene import paper_scene as paper_scene
+from .scene_file import read_scene as read_scene
 from .suites import draw as draw

@@ -37,6 +37,7 @@ RULES: Table = (
     Field("ball.pos", (3,)),
     Field("ball.vel", (3,)),
     Field("gravity", (), rules.POSITIVE),
+    Field("ball_radius", (), rules.NOT_NEGATIVE),
     Field("delay", (), rules.NOT_NEGATIVE),
     Field("angles", ("J",), _IN_RANGE),
     Field("rates", ("J",)),
@@ -51,7 +52,7 @@ RULES: Table = (
     Field("ends_at_rest", (), kind=np.bool_),
     Field("offset", (), rules.POSITIVE),
     Field("tilt", (), rules.within(0.0, np.pi, "in [0, pi]")),
-    Field("scene.inner.lower", (3,), rules.below("scene.inner.upper")),
+    Field("scene.inner.lower", (3,), rules.at_most("scene.inner.upper")),
     Field("scene.inner.upper", (3,)),
     Field("scene.outer.lower", (3,), rules.below("scene.outer.upper")),
     Field("scene.outer.upper", (3,)),
@@ -78,6 +79,7 @@ class BlockCase:
 
     ball: BallState  # position and velocity at time 0; the ball flies without drag
     gravity: Array  # () [m/s^2], magnitude
+    ball_radius: Array  # () [m]; the shield meets the ball's nearest point
     delay: Array  # () [s], time at which the arm may start to move
     angles: Array  # (n,) [rad], joint angles at the time `delay`
     rates: Array  # (n,) [rad/s], joint rates at the time `delay`
@@ -113,6 +115,7 @@ def case(
     angles: ArrayLike | None = None,
     rates: ArrayLike = 0.0,
     gravity: ArrayLike = 9.81,
+    ball_radius: ArrayLike = 0.0,
     dtype: DTypeLike = jnp.float32,
 ) -> BlockCase:
     """Make one case of a ball to block, or a batch, by default in the scene of [Natarajan2024].
@@ -120,8 +123,8 @@ def case(
     Args:
         ball_pos: (3,) [m], position of the ball at time 0, or (B, 3) for a batch of B cases.
         ball_vel: (3,) or (B, 3) [m/s], velocity of the ball at time 0.
-        delay: () or (B,) [s], time at which the arm may start to move, >= 0. Delay, angles, rates
-            and gravity are one value for all cases, or one value for each case.
+        delay: () or (B,) [s], time at which the arm may start to move, >= 0. Delay, angles, rates,
+            gravity and radius are one value for all cases, or one value for each case.
         regime: joint limits of an IRB 1600, and whether the motion ends at rest; a key of
             `planner_jax.robot.arm.REGIMES`. "R1": limits in the code of [Natarajan2024], any
             velocity at the end. "R2", the default: speeds of the robot's data sheet and
@@ -139,6 +142,9 @@ def case(
         angles: (n,) [rad], joint angles at the start; by default those at which the arm waits.
         rates: (n,) [rad/s], joint rates at the start.
         gravity: [m/s^2], magnitude, > 0.
+        ball_radius: [m], >= 0. The shield's face meets the ball one radius before its centre, and
+            the ball must not come nearer to the protected body than its radius. The point of
+            contact must be within the shield's outline, which neither shrinks nor grows.
         dtype: type of every floating leaf.
 
     Raises:
@@ -168,7 +174,8 @@ def case(
     rates = np.full(num, rates) if shape_of("rates", rates) == () else rates
     vectors = {"ball_pos": (ball_pos, 3), "ball_vel": (ball_vel, 3), "angles": (angles, num)}
     shapes = [batch_of(name, *given) for name, given in vectors.items()]
-    shapes += [shape_of("delay", delay), shape_of("gravity", gravity)]
+    numbers = {"delay": delay, "gravity": gravity, "ball_radius": ball_radius}
+    shapes += [shape_of(*number) for number in numbers.items()]
     batch, dtype = max(shapes, key=len), floating(dtype)
 
     leaf = functools.partial(array_of, batch=batch, dtype=dtype)
@@ -179,8 +186,7 @@ def case(
         offset = max(offset, float(np.max(np.linalg.norm(arm.shield_corners, axis=1))))
     cases = BlockCase(
         ball=BallState(pos=leaf("ball_pos", ball_pos, 3), vel=leaf("ball_vel", ball_vel, 3)),
-        gravity=leaf("gravity", gravity),
-        delay=leaf("delay", delay),
+        **{name: leaf(name, number) for name, number in numbers.items()},
         angles=leaf("angles", angles, num),
         rates=leaf("rates", rates, num),
         arm=repeat(arm),

@@ -19,7 +19,7 @@ from planner_jax.robot.arm import (
 from planner_jax.robot.arm_ik import inverse_kinematics
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.motion import Weights, profiles, step_weights
-from planner_jax.task.block.scene import entry_time
+from planner_jax.task.block.scene import entry_time, rounded_entry_time
 
 _PLANE = 1e-3  # [m], greatest distance of the ball from the shield's plane at the contact
 # Tried offsets of the ball from the shield's middle along the two edges, divided by the greatest
@@ -57,10 +57,11 @@ class Flight:
 
 
 def flight_of(case: BlockCase) -> Flight:
-    """Compute when a ball enters the outer box, where it may be met, and the inner box."""
+    """Compute when a ball enters the outer box, where it may be met, and touches the inner box."""
     scene = case.scene
     earliest, enters = entry_time(scene.outer, case.ball, case.gravity)
-    latest, hits = entry_time(scene.inner, case.ball, case.gravity)
+    radius = scene.inner_radius + case.ball_radius
+    latest, hits = rounded_entry_time(scene.inner, radius, case.ball, case.gravity)
     return Flight(earliest=earliest, latest=latest, comes=enters & hits & (latest > earliest))
 
 
@@ -111,6 +112,7 @@ def end_poses(
         ball = drag_free_flight(case.ball, time, case.gravity)
         rotation = frame_of(face_ball(ball.vel))
         shift = offset[0] * rotation[:, 1] + offset[1] * rotation[:, 2]
+        shift -= case.ball_radius * rotation[:, 0]
         return inverse_kinematics(case.arm, rotation, ball.pos + shift, is_roll_free=True)
 
     angles, found = jax.vmap(solve_point)(time, offset)
@@ -250,12 +252,13 @@ def contact_terms(
     turns = jacobian[3:].T  # (n, 3), joint axes
     moves = jacobian[:3].T
     by_normal = jnp.cross(turns, normal)
-    # Distance of the ball from the plane of the shield.
-    off = jnp.sum(away * normal)
+    # Distances of the ball's centre and of its nearest point from the plane of the shield.
+    height = jnp.sum(away * normal)
+    off = height - case.ball_radius
     off_by_angles = product(by_normal, away) - product(moves, normal)
     off_slope = jnp.append(off_by_angles, jnp.sum(velocity * normal))
     # Offset of the ball from the shield's middle, within the plane of the shield.
-    beside = away - off * normal
+    beside = away - height * normal
     beside_slope = jnp.concatenate([-moves, velocity[None]])
     beside_slope -= jnp.sum(beside_slope * normal[None], axis=1)[:, None] * normal[None]
     distance = jnp.sqrt(jnp.maximum(jnp.sum(beside**2), 1e-12))

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jax import Array
+from jax import Array, lax
 from numpy.typing import ArrayLike
 
-from planner_jax.ball.flight import BallState, drag_free_fall_time
+from planner_jax.ball.flight import BallState, drag_free_fall_time, drag_free_flight
 from planner_jax.core import rules
 from planner_jax.core.arithmetic import host_leaf
 from planner_jax.core.choices import require
@@ -19,6 +19,8 @@ INNER_HALF, INNER_HEIGHT = 0.4, 1.35  # [m], half side and height of the protect
 OUTER_HALF, OUTER_HEIGHT = 1.0, 1.85  # [m], half side and height of the box where balls are met
 # [m], x and y of a vertical pole, the height of its top, and its radius
 POLE, POLE_TOP, POLE_RADIUS = (0.806, 0.0), 2.52, 0.05
+# See `rounded_entry_time`: number of advances, gain of speed [m/s] during one, and distance [m].
+_ADVANCES, _MORE_SPEED, _REACHED = 32, 1.0, 1e-4
 ABSENT = -10.0  # [m], radius of a capsule that does not exist
 FLOOR = -0.4826  # [m], height of the floor
 # Four horizontal beams form a square around the robot's pedestal. Each beam is modelled as a
@@ -29,6 +31,7 @@ RIG_HEIGHT, RIG_RADIUS = -0.08, 0.0401  # [m], height of the beams' axes, and ra
 
 # Shapes and ranges that `pj.require_sound` checks for the obstacles of a case's scene.
 RULES: Table = (
+    Field("scene.inner_radius", (), rules.NOT_NEGATIVE),
     Field("scene.capsule_ends", ("P", 2, 3)),
     Field("scene.capsule_radius", ("P",)),
     Field("scene.floor", ()),
@@ -54,7 +57,8 @@ class Box:
 class Scene:
     """Surroundings of the arm: box to protect, box in which balls may be blocked, obstacles."""
 
-    inner: Box  # protected box
+    inner: Box  # protected box; the points up to `inner_radius` from it are protected, too
+    inner_radius: Array  # () [m], > 0 for a capsule, whose axis is a box without width
     outer: Box  # box in which the shield may meet a ball
     # (P, 2, 3) [m], ends of the axes of capsules, such as poles. Spheres are capsules, too.
     capsule_ends: Array
@@ -95,6 +99,7 @@ def paper_scene(*, has_pole: bool = True, pole: Sequence[float] = POLE, size: fl
             ends.append(pair)
     return Scene(
         inner=box(INNER_HALF, INNER_HEIGHT),
+        inner_radius=leaf(0.0),
         outer=box(OUTER_HALF, OUTER_HEIGHT),
         capsule_ends=leaf([[[*pole, FLOOR], [*pole, POLE_TOP]]]),
         capsule_radius=leaf([POLE_RADIUS if has_pole else ABSENT]),
@@ -112,6 +117,9 @@ def make_scene(
     capsules: Sequence[tuple[ArrayLike, float]] = (),
     cylinders: Sequence[tuple[ArrayLike, float]] = (),
     floor: float = -100.0,
+    protected_box: ArrayLike | None = None,
+    protected_capsule: tuple[ArrayLike, float] | None = None,
+    outer: ArrayLike | None = None,
 ) -> Scene:
     """Return a scene of solid obstacles, without a rig, with NumPy float32 leaves.
 
@@ -124,15 +132,35 @@ def make_scene(
         capsules: for each capsule the ends of its axis (2, 3) [m] and its radius [m].
         cylinders: for each cylinder the different ends of its axis (2, 3) [m] and its radius [m].
         floor: [m], height of the floor.
+        protected_box: lowest and highest corner [m] of the box that blocks protect; by default the
+            box of [Natarajan2024].
+        protected_capsule: instead of a box, the ends of a capsule's axis (2, 3) [m], which is
+            parallel to a coordinate axis, and the radius [m].
+        outer: lowest and highest corner [m] of the box in which balls may be met; by default the
+            box of [Natarajan2024].
     """
     rounded = [(np.broadcast_to(middle, (2, 3)), radius) for middle, radius in spheres]
     rounded += [*capsules]
     for k, (_, radius) in enumerate(rounded):
         kind = f"spheres[{k}]" if k < len(spheres) else f"capsules[{k - len(spheres)}]"
-        require(radius >= 0.0, f"the radius of {kind}", ">= 0", radius)
-    paper = paper_scene()
+        require(bool(radius >= 0.0), f"the radius of {kind}", ">= 0", radius)
+    paper, capsule = paper_scene(), protected_capsule
+    body = protected_box
+    if capsule is not None:
+        body = np.sort(np.asarray(capsule[0], float), axis=0)
+        require(protected_box is None, "protected_box", "left out beside protected_capsule", body)
+        is_straight = np.sum(np.ptp(body, axis=0) > 0.0) <= 1
+        rule = "parallel to a coordinate axis; use protected_box for other bodies"
+        require(bool(is_straight), "the axis of protected_capsule", rule, body.tolist())
+
+    def box(corners: ArrayLike | None, usual: Box) -> Box:
+        return usual if corners is None else Box(*host_leaf(corners, np.float32))
+
     return dataclasses.replace(
         paper,
+        inner=box(body, paper.inner),
+        inner_radius=host_leaf(0.0 if capsule is None else capsule[1], np.float32),
+        outer=box(outer, paper.outer),
         capsule_ends=host_leaf([ends for ends, _ in rounded], np.float32).reshape(-1, 2, 3),
         capsule_radius=host_leaf([radius for _, radius in rounded], np.float32),
         floor=host_leaf(floor, np.float32),
@@ -180,3 +208,34 @@ def entry_time(box: Box, ball: BallState, gravity: Array) -> tuple[Array, Array]
 
     time = jnp.where(height(jnp.maximum(from_side, 0.0)) > box.upper[2], from_top, from_side)
     return time, (time > 0.0) & (time <= until) & (height(time) > box.lower[2])
+
+
+def rounded_entry_time(
+    box: Box, radius: Array, ball: BallState, gravity: Array
+) -> tuple[Array, Array]:
+    """Return the time at which a ball without drag gets to the distance `radius` from a box.
+
+    The ball first enters the box enlarged by the radius. From there it advances by its distance
+    divided by a bound of its speed, which never passes the rounded edges.
+
+    Returns:
+        time: () [s].
+        enters: () bool, as for `entry_time`.
+    """
+    time, enters = entry_time(Box(box.lower - radius, box.upper + radius), ball, gravity)
+
+    def gap(time: Array) -> Array:
+        pos = drag_free_flight(ball, time, gravity).pos
+        away = pos - jnp.clip(pos, box.lower, box.upper)
+        return jnp.sqrt(jnp.maximum(jnp.sum(away**2), 1e-12)) - radius
+
+    def advance(_: Array, time: Array) -> Array:
+        velocity = drag_free_flight(ball, time, gravity).vel
+        speed = jnp.sqrt(jnp.sum(velocity**2)) + _MORE_SPEED
+        return time + jnp.maximum(gap(time), 0.0) / speed
+
+    def search() -> tuple[Array, Array]:
+        there = lax.fori_loop(0, _ADVANCES, advance, time)
+        return there, enters & (gap(there) < _REACHED)
+
+    return lax.cond(radius > 0.0, search, lambda: (time, enters))

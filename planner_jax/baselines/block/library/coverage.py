@@ -139,6 +139,7 @@ def _throw_balls(
     return BlockCase(
         ball=before,
         gravity=constant(GRAVITY),
+        ball_radius=constant(0.0),
         delay=constant(0.0),
         angles=repeat(np.asarray(library.table.homes)[home]),
         rates=repeat(np.zeros(6, np.float32)),

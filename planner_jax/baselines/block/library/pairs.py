@@ -107,6 +107,7 @@ class PairPlanner(Planner):
         case = BlockCase(
             ball=drag_free_flight(ball, -entry, gravity),
             gravity=gravity,
+            ball_radius=jnp.zeros_like(span),
             delay=jnp.zeros_like(span),
             angles=self.home,
             rates=jnp.zeros_like(self.home),

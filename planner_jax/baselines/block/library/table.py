@@ -204,6 +204,8 @@ def library_of(
     has the cells, and `setting` the arm, limits and scene for which the motions were planned.
     """
     scene = setting.scene
+    radius = float(scene.inner_radius)
+    require(radius == 0.0, "scene.inner_radius", "0 for stored motions", radius)
     table = Table(rows=rows, homes=homes, inner=scene.inner, outer=scene.outer, layout=layout)
     return Library(table=table, setting=setting)
 

@@ -1,0 +1,79 @@
+"""Scenes and shields of blocks from YAML files and short texts."""
+
+import numpy as np
+import pytest
+
+from planner_jax.core.errors import ArgumentError
+from planner_jax.robot.arm_file import irb1600
+from planner_jax.task.block.scene_file import read_scene, read_shield, shield_arm
+
+SCENE = """
+boxes: [{middle: [0.7, -0.8, 1.0], size: [0.2, 0.1, 0.3]}]
+spheres: [{middle: [1, 2, 3], radius: 0.1}]
+capsules: [{ends: [[0.8, 0, -0.5], [0.8, 0, 2.5]], radius: 0.05}]
+cylinders: [{ends: [[0, 1, 0], [0, 1, 1]], radius: 0.2}]
+floor: -0.4
+outer: [[-1, -1, 0], [1, 1, 2]]
+protected_capsule: {ends: [[0, 0, 1.2], [0, 0, 0.3]], radius: 0.3}
+"""
+
+
+def test_a_scene_file_lists_obstacles_and_the_protected_body(tmp_path):
+    path = tmp_path / "scene.yaml"
+    path.write_text(SCENE)
+    scene = read_scene(path)
+    np.testing.assert_allclose(scene.box_half, [[0.1, 0.05, 0.15]])
+    np.testing.assert_allclose(scene.box_turn, [[1.0, 0.0, 0.0, 0.0]])
+    np.testing.assert_allclose(scene.capsule_radius, np.float32([0.1, 0.05]))
+    np.testing.assert_allclose(scene.cylinder_ends[0, 1], [0.0, 1.0, 1.0])
+    np.testing.assert_allclose([scene.inner.lower[2], scene.inner.upper[2]], np.float32([0.3, 1.2]))
+    assert scene.floor == np.float32(-0.4) and scene.inner_radius == np.float32(0.3)
+    assert scene.outer.upper[2] == 2.0 and scene.beam_radius.shape == (0,)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("poles: []", r"a.yaml must have fields of boxes, .*, got 'poles'"),
+        ("boxes: 3", r"a.yaml: boxes must be a list of obstacles, got 3"),
+        ("spheres: [{middle: [0, 0, 0]}]", r"a.yaml: spheres\[0\].radius must be a finite number"),
+        ("spheres: [{radius: 1, size: 2}]", r"a.yaml: spheres\[0\] must have the fields middle, r"),
+        ("boxes: [{middle: [0, 0], size: 1}]", r"a.yaml: boxes\[0\].middle must be 3 finite num"),
+        (
+            "capsules: [{ends: [[0, 0, 0], [0, 0, 1]], radius: 0}]",
+            r".*capsules\[0\].radius must",
+        ),
+        ("cylinders: [{ends: [[0, 0, 1], [0, 0, 1]], radius: 1}]", r".*ends must be two different"),
+        (
+            "protected_capsule: {ends: [[0, 0, 0], [1, 0, 1]], radius: 0.2}",
+            r"a.yaml: the axis of protected_capsule must be parallel to a coordinate axis; use",
+        ),
+        ("[1]", "a.yaml must be fields with values"),
+    ],
+)
+def test_a_wrong_element_of_a_scene_file_is_named(tmp_path, monkeypatch, text, message):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "a.yaml").write_text(text)
+    with pytest.raises(ArgumentError, match=f"^{message}"):
+        read_scene("a.yaml")
+
+
+def test_a_shield_is_described_by_its_size_or_by_a_file(tmp_path):
+    np.testing.assert_allclose(np.max(read_shield("0.2x0.4").outline, axis=0), [0.1, 0.2])
+    assert read_shield("disc:0.18").radius == 0.18
+    path = tmp_path / "shield.yaml"
+    path.write_text("corners: [[0.2, 0], [-0.1, 0.1], [-0.1, -0.1]]\nmass: 1.5")
+    shield = read_shield(str(path))
+    assert shield.mass == 1.5 and shield.outline.shape == (3, 2)
+    arm = shield_arm(None, None, str(path))
+    np.testing.assert_allclose(arm.shield_half, np.float32([0.2, 0.1]))
+    np.testing.assert_array_equal(arm.shield_centre, irb1600().shield_centre)
+    assert shield_arm(None, None, None) is irb1600()
+    path.write_text("corners: [[0.2, 0], [0.1, 0]]")
+    with pytest.raises(ArgumentError, match="shield.yaml: shield.corners must be at least three"):
+        read_shield(str(path))
+    path.write_text("width: 1")
+    with pytest.raises(ArgumentError, match="shield.yaml must have fields of corners, .*'width'"):
+        read_shield(str(path))
+    with pytest.raises(ArgumentError, match="shield must be WIDTHxHEIGHT, disc:RADIUS or a YAML"):
+        read_shield("round")
