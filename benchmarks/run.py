@@ -37,12 +37,13 @@ def argument_parser(name: str, doc: str | None, **counts: int) -> argparse.Argum
         name: name of the benchmark's module.
         doc: docstring of the module, whose first line describes the program.
         **counts: names of integer options with their defaults. Values must be at least 1, or at
-            least 0 for the option `seed`. The option --out for the run folder is added, too.
+            least 0 for the option `seed` and if the default is 0. The option --out for the run
+            folder is added, too.
     """
     head, _, _ = (doc or "").partition("\n")
     parser = argparse.ArgumentParser(f"python -m benchmarks.{name}", description=head)
     for count, default in counts.items():
-        kind = at_least(0 if count == "seed" else 1)
+        kind = at_least(0 if count == "seed" else min(default, 1))
         parser.add_argument(f"--{count}", type=kind, default=default, help=f"default: {default}")
     parser.add_argument("--out", type=Path, help=f"default: runs/bench-{name}-DATE-TIME")
     parser.set_defaults(benchmark=name)
