@@ -8,12 +8,13 @@ nrkumar93/pinsat, which are planned among the eight beams of its scene "hard". O
 repository KavrakiLab/vamp. The arm's bodies are the spheres of the URDF. Pairs of links that a
 scene's matrix of allowed collisions names are not tested, nor one pair of neighbours whose spheres
 always overlap. The URDF limits speeds to 0.5 rad/s; here they are the robot's 3.15 rad/s, with
-8 rad/s^2. A problem whose start or goal is in a collision has no solution, and is counted apart.
+8 rad/s^2. As in VAMP, cylinders are replaced by capsules that enclose them, and in the family
+box_ur5 by boxes that enclose them. A problem whose start or goal is in a collision has no solution,
+and is counted apart.
 
 If the package `vamp` (on PyPI: vamp-planner) is installed, its RRT-Connect and its simplification
 of paths plan the same problems of the UR5, and a second table compares both planners. The motion
-along a path of VAMP stops at the corners. The referee judges this motion, and VAMP's checker judges
-the motions of `pj.reach`. VAMP replaces cylinders by capsules, and by boxes in the family box_ur5.
+along a path of VAMP stops at the corners. The referee and VAMP's checker judge all motions.
 """
 
 import dataclasses
@@ -80,23 +81,25 @@ def pose_of(pose: dict) -> np.ndarray:
     return matrix
 
 
-def read_solids(scene: dict) -> tuple[list, list, list]:
-    """Return a scene's boxes, cylinders and spheres, as `pj.reach.make_scene` takes them."""
-    boxes, cylinders, spheres = [], [], []
+def read_solids(scene: dict, is_boxed: bool) -> tuple[list, list, list]:
+    """Return a scene's boxes, capsules and spheres, as `pj.reach.make_scene` takes them."""
+    boxes, capsules, spheres = [], [], []
     for solid in scene["world"]["collision_objects"]:
         frame = pose_of(solid["pose"]) if "pose" in solid else np.eye(4)
         for shape, pose in zip(solid["primitives"], solid["primitive_poses"], strict=True):
             matrix, size = frame @ pose_of(pose), shape["dimensions"]
             middle, turn = matrix[:3, 3], matrix[:3, :3]
+            upright = Rotation.from_matrix(turn).as_quat(scalar_first=True)
             if shape["type"] == "box":
-                turn = Rotation.from_matrix(turn).as_quat(scalar_first=True)
-                boxes.append((middle, size, turn))
-            elif shape["type"] == "cylinder":
-                ends = middle + np.outer([-0.5 * size[0], 0.5 * size[0]], turn[:, 2])
-                cylinders.append((ends, size[1]))
-            else:
+                boxes.append((middle, size, upright))
+            elif shape["type"] == "sphere":
                 spheres.append((middle, size[0]))
-    return boxes, cylinders, spheres
+            elif is_boxed:
+                boxes.append((middle, (2.0 * size[1], 2.0 * size[1], size[0]), upright))
+            else:
+                ends = middle + np.outer([-0.5 * size[0], 0.5 * size[0]], turn[:, 2])
+                capsules.append((ends, size[1]))
+    return boxes, capsules, spheres
 
 
 def read_problems(folder: Path, first: int, every: int) -> dict[str, list[ReachCase]]:
@@ -109,7 +112,9 @@ def read_problems(folder: Path, first: int, every: int) -> dict[str, list[ReachC
         goal = request["goal_constraints"][0]["joint_constraints"]
         goal = {each["joint_name"]: each["position"] for each in goal}
         ends = [[each[joint] for joint in JOINTS] for each in (start, goal)]
-        found.append((path.parent.name, scene, ends, read_solids(scene)))
+        found.append(
+            (path.parent.name, scene, ends, read_solids(scene, path.parent.name == "box_ur5"))
+        )
     most = [max(len(solids[k]) for *_, solids in found) for k in range(3)]
     far = np.array(_AWAY)
     padding = [
@@ -124,12 +129,12 @@ def read_problems(folder: Path, first: int, every: int) -> dict[str, list[ReachC
             [*each, *[filler] * (num - len(each))]
             for each, num, filler in zip(solids, most, padding, strict=True)
         ]
-        boxes, cylinders, spheres = padded
+        boxes, capsules, spheres = padded
         allowed = scene["allowed_collision_matrix"]
         key = str(allowed)
         if key not in arms:
             arms[key] = read_arm(folder / "ur5_spherized.urdf", allowed)
-        made = pj.reach.make_scene(boxes=boxes, cylinders=cylinders, spheres=spheres)
+        made = pj.reach.make_scene(boxes=boxes, capsules=capsules, spheres=spheres)
         case = pj.reach.case(goal, angles=start, arm=arms[key], scene=made)
         problems.setdefault(family, []).append(case)
     return problems
@@ -217,7 +222,7 @@ def compare_with_vamp(bench, problems: dict, plans: dict, merged: list[np.ndarra
     found = []
     for family, cases in problems.items():
         for case, plan in zip(cases, plans[family], strict=True):
-            scene = make_vamp_scene(vamp, case, family)
+            scene = make_vamp_scene(vamp, case)
             ends = [np.asarray(each, np.float32) for each in (case.angles, case.goals[0])]
             is_free = all(robot.validate(each, scene) for each in ends)
             rng = robot.halton()
@@ -253,24 +258,21 @@ def compare_with_vamp(bench, problems: dict, plans: dict, merged: list[np.ndarra
         )
 
 
-def make_vamp_scene(vamp, case: ReachCase, family: str):
+def make_vamp_scene(vamp, case: ReachCase):
     """Return a case's obstacles as an environment of VAMP."""
     scene, made = case.scene, vamp.Environment()
-    for (low, high), radius in zip(scene.beam_ends, scene.beam_radius, strict=True):
-        made.add_sphere(vamp.Sphere(np.asarray(0.5 * (low + high)), float(radius)))
     solids = zip(scene.box_middle, scene.box_turn, scene.box_half, strict=True)
     for middle, turn, half in solids:
         turn = Rotation.from_quat(np.asarray(turn), scalar_first=True).as_euler("xyz")
         made.add_cuboid(vamp.Cuboid(*(np.asarray(each).tolist() for each in (middle, turn, half))))
-    for (low, high), radius in zip(scene.cylinder_ends, scene.cylinder_radius, strict=True):
-        low, high, radius = np.asarray(low), np.asarray(high), float(radius)
-        length = float(np.linalg.norm(high - low))
-        turn = Rotation.align_vectors([high - low], [[0.0, 0.0, 1.0]])[0].as_euler("xyz").tolist()
-        middle = (0.5 * (low + high)).tolist()
-        if family == "box_ur5":
-            made.add_cuboid(vamp.Cuboid(middle, turn, [radius, radius, 0.5 * length]))
-        else:
-            made.add_capsule(vamp.Cylinder(middle, turn, radius, length))
+    for ends, radius in zip(scene.capsule_ends, scene.capsule_radius, strict=True):
+        low, high = np.asarray(ends)
+        middle, length = (0.5 * (low + high)).tolist(), float(np.linalg.norm(high - low))
+        if length == 0.0:
+            made.add_sphere(vamp.Sphere(middle, float(radius)))
+            continue
+        turn = Rotation.align_vectors([high - low], [[0.0, 0.0, 1.0]])[0].as_euler("xyz")
+        made.add_capsule(vamp.Cylinder(middle, turn.tolist(), float(radius), length))
     return made
 
 
