@@ -66,7 +66,8 @@ class LibraryBlock(Planner):
         own, other = fingerprint(self.library.setting), fingerprint(setting_of(first))
         shown = f"one of {own} for cases of {other}"
         require(own == other, "library", "of the cases' arm, limits and scene", shown=shown)
-        require(first.ball_radius == 0.0, "ball_radius", "0 for stored motions", first.ball_radius)
+        radius = float(first.ball_radius)
+        require(radius == 0.0, "ball_radius", "0 for stored motions", radius)
         homes = np.asarray(self.library.table.homes)
         off = np.abs(homes - first.angles).max(axis=1).min()
         rule, shown = f"a home of the library to {_SAME_START} rad", f"{off:.3g} rad off"
