@@ -101,13 +101,14 @@ class StraightSearch(Search):
 _LEAST_SQUARES = (
     Search(straight=0, tries=4, kept=2),
     Search(straight=0, tries=11, first=4, kept=5, in_turn=False),
-    # Plans that are at most some 6 cm inside an obstacle are often mended by longer searches.
-    Search(
-        straight=0,
-        detours=4,
-        within=6.0,
-        solver=dataclasses.replace(Search.solver, max_steps=40, fade=0.85),
-    ),
+)
+# Plans that are at most some 6 cm inside an obstacle are often mended by a longer search. It takes
+# 0.1 s, so that only planners of higher effort make it.
+LAST = Search(
+    straight=0,
+    detours=4,
+    within=6.0,
+    solver=dataclasses.replace(Search.solver, max_steps=40, fade=0.85),
 )
 _SEARCHES = (Search(straight=12, tries=0), Search(tries=0), *_LEAST_SQUARES)
 
@@ -197,7 +198,8 @@ class OnlineBlock(Planner):
             effort: "good" compares 48 straight motions, or starting points of least squares if none
                 is solved, and lowers the cost of the best plan by up to 24 steps. "best" compares
                 straight motions and all starting points, with up to 48 steps for each starting
-                point. "feasible" returns the planner itself, which ends with the first plan.
+                point. Both make a last search for balls that are nearly blocked. "feasible" returns
+                the planner itself, which ends with the first plan.
         """
         require_one_of(EFFORTS, "effort", effort)
         if effort not in _SETTLING:
@@ -210,7 +212,8 @@ class OnlineBlock(Planner):
             solver = dataclasses.replace(self.searches[0].solver, **_settle_by(_SETTLING[effort]))
             tries = max(_count_starts(bent), 1)
             searches = (Search(straight=straight, tries=tries, solver=solver),)
-        return dataclasses.replace(self, searches=searches, settling=_SETTLING[effort])
+        settling = _SETTLING[effort]
+        return dataclasses.replace(self, searches=(*searches, LAST), settling=settling)
 
     @property
     def attempts(self) -> tuple[Search, ...]:
