@@ -45,7 +45,8 @@ def test_more_effort_compares_more_motions_of_blocks_for_longer():
     assert pj.block.planner(effort="feasible") == own == own.with_effort("feasible")
     good, best = (own.with_effort(effort) for effort in ("good", "best"))
     assert own.settling == 0 < good.settling < best.settling
-    (search,) = best.searches
+    search, last = best.searches
+    assert last == good.searches[-1] and last not in own.searches
     assert search.tries == max(each.first + each.tries for each in own.searches)
     assert search.solver.max_steps == best.settling
     assert pj.block.planner("brisk", effort="best") == pj.block.planner(effort="best", brisk=True)

@@ -9,6 +9,7 @@ import pytest
 import planner_jax as pj
 from planner_jax.benchmarks.poisoned_batches import compare, poison, poisons
 from planner_jax.core.rules import is_sound, part_at
+from planner_jax.task.block.scene import paper_scene
 from planner_jax.task.catch.decide import MOST_SEARCHED
 
 TASKS = ("hit", "catch", "intercept", "block")
@@ -25,6 +26,12 @@ def with_all_limits(robot):
 def test_a_table_names_arrays_of_its_case_and_every_rule_can_be_broken(name):
     robots = {"hit": "x500", "catch": "x500-net"}
     options = {"robot": with_all_limits(pj.robot_named(robots[name]))} if name in robots else {}
+    if name == "block":
+        rod = [[0.0, 0.0, -9.0], [0.0, 0.0, -8.0]], 0.1
+        box = (0.0, 0.0, -9.0), (0.1, 0.1, 0.1), (1.0, 0.0, 0.0, 0.0)
+        far = vars(pj.reach.make_scene(boxes=[box], cylinders=[rod]))
+        solid = {key: far[key] for key in far if key.startswith(("box_", "cylinder_"))}
+        options = {"scene": dataclasses.replace(paper_scene(), **solid)}
     drawn = pj.task_named(name).draw(1, **options) if options else CASES[name]
     case = pj.take(jax.tree.map(np.asarray, drawn), 0)
     present = [field for field in type(case).rules if part_at(case, field.name) is not None]
