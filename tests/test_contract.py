@@ -150,7 +150,7 @@ def test_a_second_batch_of_the_same_bucket_is_not_traced_again(entry, traces):
         # other variables or keep another margin from the limits.
         (pj.hit.planner("exact"), pj.hit.draw(1), 3),
         (pj.catch.planner("exact").planner, pj.catch.draw(1), 2),
-        (pj.intercept.planner("spacetime"), pj.intercept.draw(1), 1),
+        (pj.intercept.planner("spacetime"), pj.intercept.draw(1), 2),
         (pj.intercept.planner("quick"), pj.intercept.draw(1), 1),
         (pj.block.planner("online"), pj.block.draw(1), 1),
         (pj.block.planner("brisk"), pj.block.draw(1), 1),

@@ -220,13 +220,20 @@ class OnlineBlock(Planner):
         """The searches for a plan, in the order in which they are tried."""
         return self.searches
 
+    @property
+    def _mixes(self) -> bool:
+        """True if a search checks straight motions and then runs least squares."""
+        return any(search.straight for search in self.searches if search.tries)
+
     def load_attempt(self, attempt: Search, cases: BlockCase) -> Search:
         """Return a search whose numbers are arrays, so that all searches use one compiled program.
 
-        Searches without least squares use a smaller program. It is compiled sooner, so that the
-        first plan comes early.
+        Searches without least squares use a smaller program for a single case, so that the first
+        plan comes early, and for batches on a GPU.
         """
-        return place_numbers(attempt if attempt.tries else StraightSearch(**vars(attempt)))
+        is_small = cases.batch_shape == () or jax.default_backend() != "cpu"
+        is_straight = is_small and not attempt.tries
+        return place_numbers(StraightSearch(**vars(attempt)) if is_straight else attempt)
 
     def compiles_quickly(self, attempt: Search) -> bool:
         """Return whether a search's program is compiled in less time, though it then runs slower.
@@ -378,9 +385,7 @@ class OnlineBlock(Planner):
         """
         flight = flight_of(case)
         poses = end_poses(case, flight, self.points, self.pieces, every=_EVERY)
-        if not isinstance(attempt, StraightSearch) and not any(
-            search.straight for search in self.searches if search.tries
-        ):
+        if not (isinstance(attempt, StraightSearch) or self._mixes):
             return make_empty_plan(case, self.pieces), poses
         poses, order, num = self._rank_straight(case, poses, 1, attempt)
         shares, coarse = self._shares(), min(_COARSE, self.checked)
