@@ -220,10 +220,12 @@ class OnlineBlock(Planner):
         """The searches for a plan, in the order in which they are tried."""
         return self.searches
 
-    @property
-    def _mixes(self) -> bool:
-        """True if a search checks straight motions and then runs least squares."""
-        return any(search.straight for search in self.searches if search.tries)
+    def _checks_straight(self, attempt: Search) -> bool:
+        """Return whether the program of an attempt from `load_attempt` checks straight motions."""
+        is_shared = jax.default_backend() == "cpu" or any(
+            search.straight for search in self.searches if search.tries
+        )
+        return is_shared or isinstance(attempt, StraightSearch)
 
     def load_attempt(self, attempt: Search, cases: BlockCase) -> Search:
         """Return a search whose numbers are arrays, so that all searches use one compiled program.
@@ -385,7 +387,7 @@ class OnlineBlock(Planner):
         """
         flight = flight_of(case)
         poses = end_poses(case, flight, self.points, self.pieces, every=_EVERY)
-        if not (isinstance(attempt, StraightSearch) or self._mixes):
+        if not self._checks_straight(attempt):
             return make_empty_plan(case, self.pieces), poses
         poses, order, num = self._rank_straight(case, poses, 1, attempt)
         shares, coarse = self._shares(), min(_COARSE, self.checked)
