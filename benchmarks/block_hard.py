@@ -10,7 +10,8 @@ Hard balls need a search by least squares, or cannot be blocked at all. All hard
 in one call of a compiled program, and the fastest of --repeat calls is reported.
 
 The program also prints the share of balls that the referee, an independent check in float64,
-accepts as blocked. It compares the costs of the motions with those of the effort "best".
+accepts as blocked. The motions' costs are compared with the costs of motions that the planner finds
+with the effort "best".
 """
 
 import jax

@@ -108,13 +108,13 @@ def continue_search(
 
 def is_open(state: LevenbergState, config: LevenbergConfig, most: Array | int) -> Array:
     """Return whether a search goes on, with at most `most` steps in total."""
-    is_open = (state.steps < most) & (state.stalled < config.settled)
+    is_left = (state.steps < most) & (state.stalled < config.settled)
     if config.hope is None:
-        return is_open
+        return is_left
     behind = state.steps - config.trial
     fade = jnp.asarray(config.fade, state.model.cost.dtype)
     bound = config.hope * lax.pow(fade, jnp.maximum(behind, 0))
-    return is_open & ((behind < 0) | (state.model.cost <= bound))
+    return is_left & ((behind < 0) | (state.model.cost <= bound))
 
 
 def _step(

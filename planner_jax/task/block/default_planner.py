@@ -104,7 +104,7 @@ _LEAST_SQUARES = (
 )
 # Plans that are at most some 6 cm inside an obstacle are often mended by a longer search. It takes
 # 0.1 s, so that only planners of higher effort make it.
-LAST = Search(
+_LAST = Search(
     straight=0,
     detours=4,
     within=6.0,
@@ -213,7 +213,7 @@ class OnlineBlock(Planner):
             tries = max(_count_starts(bent), 1)
             searches = (Search(straight=straight, tries=tries, solver=solver),)
         settling = _SETTLING[effort]
-        return dataclasses.replace(self, searches=(*searches, LAST), settling=settling)
+        return dataclasses.replace(self, searches=(*searches, _LAST), settling=settling)
 
     @property
     def attempts(self) -> tuple[Search, ...]:

@@ -157,7 +157,8 @@ def rank_straight(
     Args:
         case: the case.
         poses: poses at each of `points` points of the ball's path, from `end_poses`.
-        points: number of points, of which only those that `thin_points` selects are ranked.
+        points: number of points. The function ranks the poses at the points that `thin_points`
+            selects.
         every: argument of `thin_points`.
         pieces: number of pieces of each motion.
         most: greatest allowed ratio of a rate or acceleration to its limit.
@@ -183,8 +184,8 @@ def _shares_of_limits(
 ) -> tuple[Array, Array, Array]:
     """Return shares of limits in straight motions to C poses at `angles` (C, n) and `time` (C,).
 
-    The P speed profiles are those of `all_profiles`; profiles that the case does not allow have
-    infinite shares.
+    `all_profiles` returns the P speed profiles. If the case does not allow a profile, the shares of
+    its motions are infinite.
 
     Returns:
         load: (C,), root mean square of the joints' angles turned, divided by the limits of
