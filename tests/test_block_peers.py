@@ -12,7 +12,7 @@ import pytest
 import planner_jax as pj
 from planner_jax.baselines.block.free_space import FreeSpace
 from planner_jax.baselines.block.path_timing import PIECES, time_path
-from planner_jax.baselines.parts.bang_bang import bang_bang, least_times
+from planner_jax.baselines.parts.bang_bang import bang_bang
 from planner_jax.benchmarks.block_peers import motion_torques
 from planner_jax.core.errors import MissingExtra, install_line
 from planner_jax.robot.arm import REGIMES
@@ -20,6 +20,7 @@ from planner_jax.robot.arm_file import irb1600
 from planner_jax.sims.robots.arm.dynamics import inverse_dynamics
 from planner_jax.sweep.block.settings import BlockSettings
 from planner_jax.sweep.block.sweep import BlockSweep
+from planner_jax.task.block.motion import least_times
 from planner_jax.task.block.spec import TASK
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
 
@@ -35,7 +36,7 @@ def require_peers(*packages):
 
 @jax.jit
 def quickest(turn, rate, stretch):
-    times = least_times(turn, rate, LIMITS.velocity, LIMITS.acceleration)
+    times = least_times(turn, rate, LIMITS.velocity, LIMITS.acceleration, True)[0]
     duration = stretch * jnp.max(times)
     motion = bang_bang(jnp.zeros(6), rate, turn, duration, jnp.asarray(LIMITS.acceleration))
     at = jax.vmap(lambda time: jnp.stack([evaluate(motion, time, k) for k in range(3)]))

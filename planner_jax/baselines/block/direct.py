@@ -13,12 +13,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from planner_jax.baselines.parts.bang_bang import bang_bang, least_times
+from planner_jax.baselines.parts.bang_bang import bang_bang
 from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import Attempt, require_settings, select_first_solved, status_of
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.clearance import least_clearances
 from planner_jax.task.block.end_poses import EndPoses, end_poses, flight_of
+from planner_jax.task.block.motion import least_times
 from planner_jax.task.block.plan import BlockPlan, explain_status, make_empty_plan, mark_blocked
 from planner_jax.trajectory.polynomial import evaluate
 
@@ -38,8 +39,10 @@ def poses_in_time(case: BlockCase, points: int) -> tuple[EndPoses, Array]:
     """
     poses = end_poses(case, flight_of(case), points, _PIECES)
     limits = case.limits
-    take = jax.vmap(lambda q: least_times(q, case.rates, limits.velocity, limits.acceleration))
-    times = jnp.max(take(poses.angles - case.angles), axis=1)
+    given = case.rates, limits.velocity, limits.acceleration, True
+    times = jnp.max(
+        jax.vmap(lambda turn: least_times(turn, *given)[0])(poses.angles - case.angles), axis=1
+    )
     is_in_time = jnp.isfinite(poses.effort) & (times <= poses.time - case.delay)
     return poses, jnp.where(is_in_time, times, jnp.inf)
 

@@ -35,23 +35,6 @@ def _root(square: Array) -> Array:
     return jnp.where(square > 0.0, jnp.sqrt(jnp.where(square > 0.0, square, 1.0)), 0.0)
 
 
-def least_times(turn: Array, rate: Array, velocity: Array, acceleration: Array) -> Array:
-    """Return the shortest time (J,) [s] in which each joint turns by an angle and stops.
-
-    Args:
-        turn: (J,) [rad], angle by which each of J joints turns.
-        rate: (J,) [rad/s], rates at the start, within the limits.
-        velocity: (J,) [rad/s], > 0, limits of the rates.
-        acceleration: (J,) [rad/s^2], > 0, limits of the accelerations.
-    """
-    joints = _mirror(turn, rate, acceleration)
-    peak = _root(acceleration * joints.turn + 0.5 * joints.rate**2)
-    fast = jnp.minimum(peak, velocity)
-    ramps = (fast**2 - 0.5 * joints.rate**2) / acceleration
-    coasting = jnp.where(peak > velocity, (joints.turn - ramps) / velocity, 0.0)
-    return (2.0 * fast - joints.rate) / acceleration + coasting
-
-
 def bang_bang(
     start: Array, rate: Array, turn: Array, duration: Array, acceleration: Array
 ) -> PiecewisePolynomial:
@@ -61,7 +44,8 @@ def bang_bang(
         start: (J,) [rad], angles of J joints at the start.
         rate: (J,) [rad/s], rates at the start.
         turn: (J,) [rad], angle by which each joint turns.
-        duration: () [s], at least the greatest of `least_times`, so that rates keep their limits.
+        duration: () [s], at least the greatest of the joints' least times (`motion.least_times`),
+            so that rates keep their limits.
         acceleration: (J,) [rad/s^2], > 0, with which the joints accelerate and brake.
 
     Returns:

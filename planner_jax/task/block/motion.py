@@ -198,8 +198,9 @@ def least_times(
     away, rate = sign * away, sign * rate
     halves = jnp.where(ends_at_rest, 2.0, 1.0)
     # Rate at which the joint stops to accelerate: it reaches `away` at rest, or with this rate.
-    peak = jnp.sqrt(jnp.maximum((2.0 * acceleration * away + rate**2) / halves, 0.0))
-    peak = jnp.minimum(peak, velocity)
+    square = (2.0 * acceleration * away + rate**2) / halves
+    moves = square > 0.0  # the root has a finite slope at standstill
+    peak = jnp.minimum(jnp.where(moves, jnp.sqrt(jnp.where(moves, square, 1.0)), 0.0), velocity)
     turned = (halves * peak**2 - rate**2) / (2.0 * acceleration)
     cruise = jnp.maximum(away - turned, 0.0) / jnp.maximum(peak, 1e-9)
     return (halves * peak - rate) / acceleration + cruise, (peak - rate) / acceleration
