@@ -9,7 +9,6 @@ from planner_jax.cli.plan.answer import Answer, Margin, Single, closest_to
 from planner_jax.cli.plan.settings import SingleBlockSettings
 from planner_jax.runs.manifest import Entries
 from planner_jax.runs.style import draw
-from planner_jax.sweep.block.settings import arm_options
 from planner_jax.task.block.case import case
 from planner_jax.task.block.drawing import SIZE, draw_plan
 from planner_jax.task.block.explain import prospects
@@ -26,7 +25,7 @@ class SingleBlock(Single[SingleBlockSettings]):
     def case(self) -> PyTree:
         """Make the case of the specified ball."""
         given = self.settings
-        own: Entries = {"regime": given.regime} | arm_options(given)
+        own: Entries = {"regime": given.regime} | given.arm_options()
         own.setdefault("scene", scene_for(own.get("arm"), has_pole=not given.no_pole))
         return case(given.pos, given.vel, delay=given.delay, wide=given.wide, **own)
 

@@ -9,14 +9,7 @@ from planner_jax.core.choices import CHOICES, require, require_one_of
 from planner_jax.core.registry import Task, split_name
 from planner_jax.runs.manifest import Entries
 from planner_jax.runs.settings import option, recovery_option, recovery_options
-from planner_jax.sweep.block.settings import (
-    REGIMES,
-    arm_option,
-    require_own_limits,
-    scene_option,
-    shield_option,
-    tip_option,
-)
+from planner_jax.sweep.block.settings import REGIMES, ArmSettings
 from planner_jax.sweep.quadrotor_settings import resolve_robot, robot_option
 from planner_jax.task.catch.spec import DECISIONS, TRAINED
 from planner_jax.task.hit.spec import DRAG
@@ -59,7 +52,7 @@ class SingleInterceptSettings(PlanSettings):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class SingleBlockSettings(PlanSettings):
+class SingleBlockSettings(ArmSettings, PlanSettings):
     """Options of `planner-jax plan block`: ball, limits of the joints, and tolerances."""
 
     pos: tuple[float, ...] = option(MISSING, "X Y Z", "initial position of the ball [m]")
@@ -68,16 +61,12 @@ class SingleBlockSettings(PlanSettings):
     regime: str = option("R2", "NAME", f"limits of the joints: {', '.join(REGIMES)}")
     wide: bool = option(False, "", "accept a ball 0.1 m from the shield's middle, at 30 degrees")
     no_pole: bool = option(False, "", "leave out the pole before the arm")
-    arm: str | None = arm_option()
-    tip: str | None = tip_option()
-    scene: str | None = scene_option()
-    shield: str | None = shield_option()
 
     RUN: ClassVar[str] = "planner_jax.cli.plan.block:SingleBlock"
 
     def __post_init__(self) -> None:
         require_one_of(REGIMES, "regime", self.regime)
-        require_own_limits(self.arm, self.tip, self.regime)
+        self.require_own_limits(self.regime)
         is_one = not self.no_pole or self.scene is None
         require(is_one, "no_pole", "left out with --scene, which lists all obstacles", self.no_pole)
         for name in ("pos", "vel"):

@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from typing import Any, ClassVar
+from typing import ClassVar
 
 from planner_jax.core.choices import EFFORTS, require, require_one_of
 from planner_jax.runs.settings import Options, SweepSettings, option
@@ -19,51 +19,46 @@ def require_moderate(name: str, value: float | None, most: float = _LONGEST) -> 
         require(value <= most, name, f"<= {most:g}", value)
 
 
-def arm_option() -> Any:
-    """Return the option `--arm`, an arm from a file."""
-    words = "an arm in MJCF or URDF, with its own limits (default: the IRB 1600)"
-    return option(None, "FILE", words)
+@dataclasses.dataclass(frozen=True)
+class ArmSettings:
+    """The options of arm, shield and scene, which the commands on blocks share."""
 
+    arm: str | None = option(
+        None, "FILE", "an arm in MJCF or URDF, with its own limits (default: the IRB 1600)"
+    )
+    tip: str | None = option(
+        None, "NAME", "body or site of this arm that carries a shield of 0.30 m, if it has none"
+    )
+    scene: str | None = option(
+        None,
+        "FILE",
+        "YAML file of obstacles and protected body, see docs/arms.md (default: the paper's)",
+    )
+    shield: str | None = option(
+        None, "TEXT", "WIDTHxHEIGHT or disc:RADIUS [m], or a YAML file (default: 0.3x0.3)"
+    )
 
-def tip_option() -> Any:
-    """Return the option `--tip`, the end of the arm of `--arm`."""
-    words = "body or site of this arm that carries a shield of 0.30 m, if it has none"
-    return option(None, "NAME", words)
+    def require_own_limits(self, regime: str) -> None:
+        """Raise `ArgumentError` for a tip without an arm, or an IRB 1600's regime with an arm."""
+        own = self.arm is not None
+        require(own or self.tip is None, "tip", "left out without --arm", self.tip)
+        rule = "left out with --arm, which has limits of its own"
+        require(not own or regime == REGIMES[1], "regime", rule, regime)
 
+    def arm_options(self) -> Options:
+        """Return the arguments of `case` and `draw` that these options specify."""
+        from planner_jax.task.block.scene_file import read_scene, shield_arm  # imports JAX
 
-def scene_option() -> Any:
-    """Return the option `--scene`, obstacles and protected body from a file."""
-    words = "YAML file of obstacles and protected body, see docs/arms.md (default: the paper's)"
-    return option(None, "FILE", words)
-
-
-def shield_option() -> Any:
-    """Return the option `--shield`, the outline of the arm's shield."""
-    words = "WIDTHxHEIGHT or disc:RADIUS [m], or a YAML file (default: 0.3x0.3)"
-    return option(None, "TEXT", words)
-
-
-def require_own_limits(arm: str | None, tip: str | None, regime: str) -> None:
-    """Raise `ArgumentError` for a tip without an arm, or a regime of the IRB 1600 with an arm."""
-    require(arm is not None or tip is None, "tip", "left out without --arm", tip)
-    is_usual = arm is None or regime == REGIMES[1]
-    require(is_usual, "regime", "left out with --arm, which has limits of its own", regime)
-
-
-def arm_options(settings: Any) -> Options:
-    """Return the arguments of `case` and `draw` for the options of arm, shield and scene."""
-    from planner_jax.task.block.scene_file import read_scene, shield_arm  # imports JAX
-
-    own: Options = {}
-    if settings.arm is not None or settings.shield is not None:
-        own["arm"] = shield_arm(settings.arm, settings.tip, settings.shield)
-    if settings.arm is not None:
-        own["regime"] = None
-    return own if settings.scene is None else own | {"scene": read_scene(settings.scene)}
+        own: Options = {}
+        if self.arm is not None or self.shield is not None:
+            own["arm"] = shield_arm(self.arm, self.tip, self.shield)
+        if self.arm is not None:
+            own["regime"] = None
+        return own if self.scene is None else own | {"scene": read_scene(self.scene)}
 
 
 @dataclasses.dataclass(frozen=True)
-class BlockSettings(SweepSettings):
+class BlockSettings(ArmSettings, SweepSettings):
     """Settings and command-line options of a run over many cases of an arm that blocks a ball."""
 
     regime: str = option(
@@ -78,10 +73,6 @@ class BlockSettings(SweepSettings):
     anywhere: bool = option(False, "", "accept a ball anywhere on the shield, at any angle")
     delay: float = option(0.0, "S", "seconds until the arm may start")
     effort: str = option(EFFORTS[0], "NAME", f"how long the planner searches: {', '.join(EFFORTS)}")
-    arm: str | None = arm_option()
-    tip: str | None = tip_option()
-    scene: str | None = scene_option()
-    shield: str | None = shield_option()
 
     RUN: ClassVar[str] = "planner_jax.sweep.block.sweep:BlockSweep"
     PLANNER: ClassVar[tuple[str, ...]] = ("effort",)
@@ -95,8 +86,8 @@ class BlockSettings(SweepSettings):
         require_one_of(REGIMES, "regime", self.regime)
         require_one_of(EFFORTS, "effort", self.effort)
         require_moderate("delay", self.delay)
-        require_own_limits(self.arm, self.tip, self.regime)
+        self.require_own_limits(self.regime)
 
     def draw_options(self) -> Options:
         """Return the settings that are keyword arguments of the task's function `draw`."""
-        return super().draw_options() | arm_options(self)
+        return super().draw_options() | self.arm_options()
