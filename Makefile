@@ -59,8 +59,8 @@ format: $(VENV)/.installed-dev  ## rewrite the code as `make lint` wants it
 docs: $(VENV)/.installed-docs  ## the documentation site, into build/site
 	$(VENV)/bin/python docs/build_site.py
 
-bench: $(VENV)/.installed-test $(VENV)/.installed-oracle  ## every module of benchmarks/ but policy_peer
-	@set -e; for file in $$(grep -l __main__ benchmarks/*.py | grep -v policy_peer); do \
+bench: $(VENV)/.installed-test $(VENV)/.installed-oracle  ## every program of benchmarks/
+	@set -e; for file in $$(grep -l __main__ benchmarks/*.py | grep -v path_peers); do \
 	    name=benchmarks.$$(basename $$file .py); \
 	    echo "$(VENV)/bin/python -m $$name"; $(VENV)/bin/python -m $$name; \
 	done

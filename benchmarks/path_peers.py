@@ -1,4 +1,4 @@
-"""Run the published Hybrid A* of fastsim-navigation, for comparison in `intercept_paths`.
+"""Run the published Hybrid A* of fastsim-navigation, for comparison in `trip_peers`.
 
 The package fastsim-navigation is installed with the extra `peers`. Its C++ code sometimes aborts
 the process, so it runs in a separate process. The command `python -m benchmarks.path_peers

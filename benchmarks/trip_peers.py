@@ -48,9 +48,9 @@ from scipy.sparse.csgraph import dijkstra
 
 import planner_jax as pj
 from planner_jax.baselines.intercept.hybrid_astar import HybridAstar, hybrid_astar
-from planner_jax.benchmarks.intercept_paths import body_of, describe_search, measure_cells
-from planner_jax.benchmarks.path_peers import CELL, INSTALL, is_installed, run_searches
+from planner_jax.benchmarks.path_peers import CELL, INSTALL, PAD, is_installed, run_searches
 from planner_jax.benchmarks.run import Bench, argument_parser, at_least, begin
+from planner_jax.plane.obstacles import distances
 from planner_jax.referee.clearance import clearances, edges, separation
 from planner_jax.referee.intercept import CONTACT_SHARE
 from planner_jax.runs.table import rate_cells
@@ -72,6 +72,31 @@ _SECONDS = 5.0  # [s], time limit of one search of OMPL
 _CELLS = 0.05  # [m], cell of the generated maps
 OMPL = "ompl not installed: pip install 'planner-jax[arm-peers]' for RRT-Connect"
 NUMBA = "numba not installed: pip install 'planner-jax[baselines]' for Hybrid A*"
+
+
+def body_of(case: Any) -> tuple[float, float, float]:
+    """Return the coordinates of the body's rear and front end, and half its width [m].
+
+    The coordinates are along the car, and zero at the rear axle.
+    """
+    behind = -float(case.body.rear_overhang)
+    return behind, behind + float(case.body.length), 0.5 * float(case.body.width)
+
+
+def measure_cells(case: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Compute the distances [m] of square cells of the side `CELL` from the walls of one case.
+
+    Returns:
+        corner: (2,) [m], the lower corner of the grid, `PAD` beyond the case's map.
+        distance: (Y, X) [m], of the cells' centres, negative in a wall.
+    """
+    corner = case.lower.astype(float) - PAD
+    size = np.ceil((case.upper + PAD - corner) / CELL - 1e-6).astype(int)
+    x, y = (corner[k] + CELL * (np.arange(size[k]) + 0.5) for k in range(2))
+    east, north = (jnp.asarray(each, jnp.float32).reshape(1, -1) for each in np.meshgrid(x, y))
+    far = distances(case.walls.vertices(np.float32(0.0)), case.walls.present, east, north)[0]
+    far = np.asarray(far) - case.walls.radius[:, None]
+    return corner, far.min(axis=0).reshape(size[::-1])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -376,6 +401,26 @@ def search_astar(trip: Trip) -> list[Drive]:
     )
     seconds = time.perf_counter() - began
     return [trip.judge_path(path.poses, seconds) if path.found else Drive(False, seconds=seconds)]
+
+
+def describe_search(
+    case: Any, meeting: np.ndarray, heading: float, margin: float
+) -> dict[str, Any]:
+    """Return a path problem of `run_searches`; the body is enlarged by `margin` [m] on all sides.
+
+    `heading` [rad] is prescribed at the meeting point (2,) [m] of the body's middle.
+    """
+    (behind, ahead, half), (corner, distance) = body_of(case), measure_cells(case)
+    direction = np.array([np.cos(heading), np.sin(heading)])
+    rear, front, side = behind - margin, ahead + margin, half + margin
+    return {
+        "start": case.start.tolist(),
+        "goal": [*(meeting - 0.5 * (behind + ahead) * direction), heading],
+        "distance": distance.tolist(),
+        "corner": corner.tolist(),
+        "curvature": float(case.limits.curvature),
+        "body": [[rear, -side], [front, -side], [front, side], [rear, side]],
+    }
 
 
 def search_fastsim(trips: list[Trip]) -> list[list[Drive]]:

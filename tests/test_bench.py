@@ -21,7 +21,7 @@ from planner_jax.benchmarks.throughput import report
 from planner_jax.core import registry
 from planner_jax.core.errors import ArgumentError
 
-NEEDS = {"oracle_hit": "casadi", "policy_peer": "stable_baselines3"}  # not installed for the tests
+NEEDS = {"oracle_hit": "casadi"}  # not installed for the tests
 BENCHMARKS = sorted(Path(benchmarks.__path__[0]).glob("*.py"))
 
 

@@ -3,18 +3,83 @@
 import dataclasses
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import planner_jax as pj
-from planner_jax.benchmarks.poisoned_batches import compare, poison, poisons
-from planner_jax.core.rules import is_sound, part_at
+from planner_jax.core.rules import all_ruled, is_sound, part_at
+from planner_jax.planning.decided import DecidedPlanner
 from planner_jax.task.block.scene import paper_scene
 from planner_jax.task.catch.decide import MOST_SEARCHED
 
 TASKS = ("hit", "catch", "intercept", "block")
 CASES = {name: jax.tree.map(np.asarray, pj.task_named(name).draw(3)) for name in TASKS}
 SOUND = jax.jit(is_sound)
+# Planners that decide the order and times of catches replace these arrays without reading them, so
+# bad values in them have no effect.
+REPLACED = ("order", "times")
+BAD = (np.nan, np.inf, -np.inf, -1.0, 0.0, 1e6)
+
+
+def poisons(case):
+    """Return the names of a case's arrays, each with a value that is invalid for the array."""
+    found = []
+    for ruled in all_ruled(jax.tree.map(np.asarray, case)):
+        for value in BAD:
+            if ruled.value.dtype.kind == "f" or np.isfinite(value):
+                bad = np.full_like(ruled.value, value)
+                if bad.size and not ruled.rule.holds(bad, ruled.part).all():
+                    found.append((ruled.name, value))
+    return list(dict.fromkeys(found))
+
+
+def poison(cases, lanes, spared=()):
+    """Return a copy of a batch with an invalid number in some cases, in NumPy arrays.
+
+    Args:
+        cases: a batch.
+        lanes: indices of the cases to change. Each gets the next of the values from `poisons`.
+        spared: names of arrays that are not changed.
+    """
+    paths, tree = jax.tree_util.tree_flatten_with_path(cases)
+    leaves = {
+        jax.tree_util.keystr(path, simple=True, separator="."): np.array(leaf)
+        for path, leaf in paths
+    }
+    bad = [(name, value) for name, value in poisons(pj.take(cases, 0)) if name not in spared]
+    for k, lane in enumerate(lanes):
+        name, value = bad[k % len(bad)]
+        leaves[name][lane] = value
+    return jax.tree.unflatten(tree, list(leaves.values()))
+
+
+def compare(task, num, every, seed):
+    """Plan a valid batch and a batch with invalid cases; count marked cases and changed plans.
+
+    Args:
+        task: specification of the task.
+        num: number of cases.
+        every: number N; one of every N cases is made invalid.
+        seed: seed of the cases.
+    """
+    cases, planner = task.draw(num, seed=seed), task.planner(**task.bench)
+    lanes = np.arange(every // 2, num, every)
+    others = np.setdiff1d(np.arange(num), lanes)
+    spared = REPLACED if isinstance(planner, DecidedPlanner) else ()
+    broken = jax.tree.map(jnp.asarray, poison(cases, lanes, spared))
+    sound, found = jax.device_get((pj.plan(planner, cases), pj.plan(planner, broken)))
+    same = np.ones(num, bool)
+    for ours, theirs in zip(jax.tree.leaves(sound), jax.tree.leaves(found), strict=True):
+        alike = (ours == theirs) | ((ours != ours) & (theirs != theirs))
+        same &= alike.reshape(num, -1).all(axis=1)
+    return {
+        "poisoned": lanes.size,
+        "marked": int((found.status[lanes] == pj.Status.BAD_INPUT).sum()),
+        "others": others.size,
+        "unchanged": int(same[others].sum()),
+        "marked_others": int((found.status[others] == pj.Status.BAD_INPUT).sum()),
+    }
 
 
 def with_all_limits(robot):
