@@ -123,7 +123,7 @@ def test_a_shield_as_large_as_the_farthest_crossing_blocks_the_tunnel():
     far = float(cells.farthest_crossing(outer, inner, there.pos, rotation))
     begin, end = (
         corners[0] + rng.uniform(size=(20000, 3)).round() * (corners[1] - corners[0])
-        for corners in (outer, inner)
+        for corners in (np.asarray(outer), np.asarray(inner))
     )
     share = np.linspace(0.0, 1.0, 2001)[:, None]
     reached = []
