@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 
 from planner_jax.core.choices import SCALES, require, require_memory, require_one_of, require_seed
 from planner_jax.core.registry import Task, all_tasks, split_name
-from planner_jax.runs.settings import option, require_count
+from planner_jax.runs.settings import Options, option, require_count
 from planner_jax.sims.noise import NOISES, PLANE_NOISES, PlaneSensing, Sensing, require_whole
 from planner_jax.sims.robots.arm.drives import ENCODERS, TORQUES, Drives
 from planner_jax.sweep.block.settings import REGIMES, require_moderate
@@ -273,18 +273,27 @@ class InterceptFly(FlySettings):
 
 @dataclasses.dataclass(frozen=True)
 class BlockFly(FlySettings):
-    """Settings of flights of thrown balls, which an arm with a shield is to block."""
+    """Settings of flights of thrown balls, which an arm with a shield is to block.
+
+    The defaults with `perception` are settings under which the arm blocks most of the balls.
+    """
 
     replan: float | None = option(
         None, "HZ", "with --perception: rate of replanning (default: 0, the arm plans once)"
     )
     planner: str = option("online", "NAME", "planner of all plans, which are made one at a time")
-    suite: str = option("pole", "NAME", "suite of throws")
-    regime: str = option("R2", "NAME", f"joint limits of plans: {', '.join(REGIMES)}")
-    wide: bool = option(
-        False,
+    suite: str | None = option(None, "NAME", "(default: pole, with --perception short)")
+    regime: str | None = option(
+        None,
+        "NAME",
+        f"joint limits of plans: {', '.join(REGIMES)} (default: R2, with --perception R1: the "
+        "slower arm of R2 blocks far fewer of the balls that it observes)",
+    )
+    wide: bool | None = option(
+        None,
         "",
-        "allow contacts up to 0.1 m from the shield's centre and 30 degrees from its normal",
+        "allow contacts up to 0.1 m from the shield's centre and 30 degrees from its normal "
+        "(default: with --perception)",
     )
     perception: bool = option(
         False, "", "plan with a camera's observations of the ball instead of its true flight"
@@ -319,6 +328,11 @@ class BlockFly(FlySettings):
     RATE: ClassVar[float] = 0.0
 
     def __post_init__(self) -> None:
+        seen = self.perception
+        usual = {"suite": "short" if seen else "pole", "regime": "R1" if seen else "R2"}
+        for name, value in {**usual, "wide": seen}.items():
+            if vars(self)[name] is None:
+                object.__setattr__(self, name, value)
         require_one_of(ENCODERS, "encoders", self.encoders)
         require_one_of(REGIMES, "regime", self.regime)
         require_one_of(BLOCK.suites, "suite", self.suite)
@@ -383,8 +397,12 @@ class BlockFly(FlySettings):
             from planner_jax.task.block import draw
 
             planner = BLOCK.make_planner(self.planner, {})
-            planner.check(draw(1, self.suite, regime=self.regime))  # type: ignore[attr-defined]
+            planner.check(draw(1, self.suite, **self.draw_options()))  # type: ignore[attr-defined]
         return super().flight()
+
+    def draw_options(self) -> Options:
+        """Return the arguments of `pj.block.draw` that these settings specify."""
+        return {"regime": self.regime, "wide": self.wide}
 
     def check_rate(self) -> None:
         """Raise `ValueError` for invalid drives of the arm, or for replanning without a camera.

@@ -24,7 +24,7 @@ from planner_jax.sims.loop_state import collect_flights
 from planner_jax.sims.recording import Launches
 from planner_jax.sims.run import start_flights
 from planner_jax.sims.scoring import passage
-from planner_jax.sims.settings import BallFly, CatchFly, HitFly, fly_settings
+from planner_jax.sims.settings import BallFly, BlockFly, CatchFly, HitFly, fly_settings
 from planner_jax.sims.task import BallFlightTask, FlightCases, Flights
 from planner_jax.sims.tasks.catch import CATCH_WORLD
 from tests.recordings import recording
@@ -50,6 +50,16 @@ BlockFly(encoders="no") | encoders must be one of none, fine, coarse, got 'no'
 BlockFly(observe=-0.1) | observe must be finite and >= 0, got -0.1
 BlockFly(mass_error=-1.0) | mass_error must be > -1 and < 1, got -1
 """.strip().splitlines()
+
+
+def test_blocks_with_a_camera_have_defaults_of_their_own():
+    def of(**given):
+        found = BlockFly(**given)
+        return found.suite, found.regime, found.wide
+
+    assert of() == ("pole", "R2", False)
+    assert of(perception=True) == ("short", "R1", True)
+    assert of(perception=True, wide=False, suite="open", regime="R3") == ("open", "R3", False)
 
 
 @pytest.mark.parametrize("row", BAD)

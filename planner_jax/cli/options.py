@@ -111,10 +111,12 @@ def add_settings(parser: Parser, kind: Any, task: Task | None = None) -> None:
     for field in dataclasses.fields(kind):
         words, default = field.metadata["help"], field.default
         if field.name in names:
-            words = ", ".join(names[field.name])
+            words = " ".join([", ".join(names[field.name]), *re.findall(r"\(default:.*", words)])
         default = defaults.get(field.name) if default is None else default
         how: Options = {"action": "store_true"}
-        if not isinstance(default, bool):
+        if default is None and bool in typing.get_args(hints[field.name]):
+            how = {"action": argparse.BooleanOptionalAction}
+        elif not isinstance(default, bool):
             how = {"type": _type_of(hints[field.name]), **_form_of(field)}
             shown = default
             if isinstance(default, tuple):

@@ -117,14 +117,9 @@ class BlockFlight(FlightTask):
     def cases(self) -> Throws:
         """Draw all throws of the run from its suite (family of random throws) and seed."""
         settings = self.settings
-        return throws(
-            settings.suite,
-            settings.num,
-            settings.seed,
-            regime=settings.regime,
-            wide=settings.wide,
-            delay=settings.until_known + settings.until_set,
-        )
+        delay = settings.until_known + settings.until_set
+        given = settings.draw_options()
+        return throws(self.suite, settings.num, settings.seed, delay=delay, **given)
 
     def fly(self, cases: Throws, record: bool) -> BlockFlights:
         """Plan and simulate blocks of balls; motions are stored even if `record` is false."""
@@ -189,7 +184,7 @@ class BlockFlight(FlightTask):
     @property
     def suite(self) -> str:
         """The name of the suite, the family of random throws, for the report."""
-        return self.settings.suite
+        return str(self.settings.suite)
 
     @property
     def conditions(self) -> str:
@@ -272,6 +267,12 @@ class BlockFlight(FlightTask):
                 f"Midway between the boxes, the first fit of the flight was {first:.1f} cm off in "
                 f"the median, the last fit {last:.1f} cm; arms started "
                 f"{summary['motions'] / number:.1f} motions each."
+            )
+        if self.settings.perception:
+            lines.append(
+                "Hard for an arm that observes its balls are the joint limits R2: it starts late, "
+                "and misses some half of the balls of the suite short and a third of pole, where "
+                "it misses a tenth with R1 (docs/lab/block.md)."
             )
         worst, share = summary["torque_worst"], summary["saturated"]
         lines.append(

@@ -109,22 +109,13 @@ class BlockFlights(Flights):
         return self.blocked & ~self.touched
 
 
-def throws(
-    suite: str,
-    num: int,
-    seed: int = 0,
-    *,
-    regime: str = "R2",
-    wide: bool = False,
-    delay: float = 0.0,
-) -> Throws:
+def throws(suite: str, num: int, seed: int = 0, **options: Any) -> Throws:
     """Draw random throws: "pole" (a pole before the arm), "open" (no pole) or "short" (6 to 8 m).
 
-    `regime` names joint limits of plans in `robot.arm.REGIMES`, for example "R2". `wide` allows
-    contacts up to 0.1 m from the shield's centre. `delay` [s] is the time from the first sight of a
-    ball until the arm starts.
+    `options` are further arguments of `pj.block.draw`. Its `delay` [s] is the time from the first
+    sight of a ball until the arm starts.
     """
-    cases = draw_throws(num, suite, seed, regime=regime, wide=wide, delay=delay)
+    cases = draw_throws(num, suite, seed, **options)
     return Throws(index=np.arange(num), cases=jax.tree.map(np.asarray, cases))
 
 
