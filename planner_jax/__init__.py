@@ -16,7 +16,7 @@ other installed packages register. Every task has the functions `case`, `draw`, 
 * `gradient`: differentiates one number of every plan by parts of its case; `optimal_plan`: a plan
   that `jax.grad` can differentiate, for use inside a loss function
 * `take`, `are_solved`, `Status`: read plans; a plan has `sample`, `save` and `load`
-* `export`: writes one plan to a file for a controller
+* `export`: writes one plan to a file for a controller; `show`: draws one plan
 
 Classes for parts of cases and plans:
 

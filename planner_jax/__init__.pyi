@@ -55,6 +55,7 @@ from .robot.quadrotor_model import QuadrotorModel as QuadrotorModel
 from .robot.quadrotor_model import Rotors as Rotors
 from .robot.quadrotor_model import Tool as Tool
 from .robot.quadrotor_models import robot_named as robot_named
+from .sweep.show import show as show
 from .task import block as block
 from .task import catch as catch
 from .task import group as group

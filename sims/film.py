@@ -13,7 +13,18 @@ from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 from planner_jax.core.errors import ArgumentError
 from planner_jax.host.files import replacing
-from planner_jax.runs.style import BLUE, GREEN, GREY, INK, ORANGE, PALE, PURPLE, RED, SKY
+from planner_jax.runs.style import (
+    BLUE,
+    GREEN,
+    GREY,
+    INK,
+    ORANGE,
+    PALE,
+    PURPLE,
+    RED,
+    SKY,
+    Look,
+)
 from planner_jax.sims.recording import Recording, frame
 from planner_jax.sims.robot import Solid, rotation
 from planner_jax.sims.scenery import FLAT, Part, Prism, machine_parts, outlines, part_solid
@@ -22,6 +33,7 @@ from planner_jax.sims.task import FlightTask
 BALL_COLOURS = (ORANGE, PURPLE, GREEN)
 FORMATS = (".gif", ".mp4")
 _FRAME = 2  # number of recorded samples from one frame of a film to the next
+_STAR: Look = {"marker": "*", "ls": "", "ms": 13, "color": RED, "mec": "white", "zorder": 9}
 _GHOSTS, _APART = 7, 0.45  # greatest number of ghost images, and their spacing on the path [m]
 
 
@@ -93,7 +105,8 @@ class Scene:
         edges = [line for part in solid for line in outlines(part)]
         edges += [line for prism in standing for line in prism.outlines(0.0)]
         if task.BOUNDS is None:
-            points = np.concatenate([wanted, balls.reshape(-1, 3), *edges, *patches])
+            moved = world.robot.place(recording.robot[flight, : self.num_samples])
+            points = np.concatenate([wanted, moved, balls.reshape(-1, 3), *edges, *patches])
             low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
             thin = np.maximum(1.6 - (high - low), 0.0)  # [m], padding of axes with a short range
             low, high = low - 0.2 - 0.5 * thin, high + 0.2 + 0.5 * thin
@@ -105,8 +118,11 @@ class Scene:
         self.axes.set_box_aspect(high - low, zoom=1.15)
         title = title or task.title(recording, flight)
         self.axes.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]", title=title)
-        for axis in (self.axes.xaxis, self.axes.yaxis, self.axes.zaxis):
-            axis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10], prune="both"))
+        ticks = np.ceil(5.0 * (high - low) / (high - low).max()).astype(int)
+        for axis, most in zip(
+            (self.axes.xaxis, self.axes.yaxis, self.axes.zaxis), ticks, strict=True
+        ):
+            axis.set_major_locator(MaxNLocator(most, steps=[1, 2, 5, 10], prune="both"))
             axis.pane.set_facecolor("white")
             axis.labelpad = 6.0
         for path in (wanted, *np.moveaxis(balls, 1, 0)):
@@ -122,7 +138,7 @@ class Scene:
             if part.opacity < 1.0:
                 self._add_solid(part_solid(part), part.colour, part.opacity)
         self.axes.view_init(*(view or task.VIEW))
-        self.axes.legend(loc="upper left", fontsize=9, frameon=False)
+        figure.legend(loc="upper left", fontsize=9, frameon=False)
 
     def _within(self, low: np.ndarray, high: np.ndarray) -> np.ndarray:
         balls = self.recording.balls[self.flight]
@@ -203,13 +219,13 @@ class Scene:
             self.axes.plot(*target[:, None], "X", ms=10, color=INK, label="target")
         for place in self.recording.contact[self.flight]:
             if np.isfinite(place).all():
-                place = place[:, None]
-                self.axes.plot(*place, "*", ms=13, color=RED, mec="white", label=label, zorder=9)
+                self.axes.plot(*place[:, None], label=label, **_STAR)
                 label = "_"
-        self.axes.legend(loc="upper left", fontsize=9, frameon=False)
+        self.axes.figure.legends.clear()
+        self.axes.figure.legend(loc="upper left", fontsize=9, frameon=False)
 
     def show(self, at: int, back: int | None = None) -> None:
-        """Draw robot, balls and moving obstacles at the sample with index `at`.
+        """Draw robot, balls, moving obstacles and earlier contacts at the sample with index `at`.
 
         The drawn path of a ball that the racket has returned ends at the sample `back`, by default
         at `at`; a picture shows the whole path up to the ground.
@@ -226,6 +242,8 @@ class Scene:
         self.moving = self.robot(at)
         for prism in self.movers:
             self.moving += self._fill(prism, float(self.times[at]))
+        for place in self.recording.contact[self.flight][self.met <= self.times[at]]:
+            self.moving += self.axes.plot(*place[:, None], **_STAR)
         for line in self.predictions:
             line.set_data_3d(*self.recording.expected[self.flight, at].T)
 
@@ -285,7 +303,10 @@ def film_flights(path: Path, task: FlightTask, recording: Recording, num: int) -
             for flight in range(num):
                 figure.clear()
                 scene = Scene(figure, task, recording, flight)
+                outcome, last = scene.axes.get_title(), scene.find_last_contact()
+                name, _, _ = outcome.partition(",")
                 for at in range(0, scene.num_samples, _FRAME):
+                    scene.axes.set_title(outcome if at >= last else name)
                     scene.show(at)
                     writer.grab_frame()
 

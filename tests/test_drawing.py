@@ -113,3 +113,17 @@ def test_a_missing_or_wrong_index_and_other_objects_are_rejected(drive):
         pj.intercept.draw_plan(case, plan, index=0)
     with pytest.raises(TypeError, match="plans must be a InterceptPlan"):
         pj.intercept.draw_plan(case, case)
+
+
+def test_a_notebook_shows_the_plan_with_the_verdict(drive):
+    figure = pj.show(*drive)
+    assert figure.axes[0].get_title(loc="left") == pj.intercept.judge(*drive).sentence()
+    assert figure._repr_png_()[1:4] == b"PNG"
+
+
+def test_only_one_case_of_a_task_with_pictures_is_shown(drive):
+    batch = stack(drive[0], drive[0])
+    with pytest.raises(ArgumentError, match=r"got a InterceptCase of batch shape \(2,\)"):
+        pj.show(batch, drive[1])
+    with pytest.raises(ArgumentError, match="got a InterceptPlan$"):
+        pj.show(drive[1], drive[1])

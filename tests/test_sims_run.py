@@ -93,6 +93,29 @@ def test_a_picture_shows_the_whole_path_of_the_returned_ball():
         assert np.isfinite(np.array(scene.returned.get_data_3d())).all(axis=0).sum() == num
 
 
+def test_a_film_tells_the_outcome_and_marks_the_contact_only_after_it(tmp_path, monkeypatch):
+    kept = recording(met=0.02, target=(1.75, 0.0, 0.0))
+    titles, stars = [], []
+
+    def look(scene, at, back=None):
+        show(scene, at, back)
+        titles.append(scene.axes.get_title())
+        stars.append(sum(line.get_marker() == "*" for line in scene.axes.lines))
+
+    show = Scene.show
+    monkeypatch.setattr(Scene, "show", look)
+    film_flights(tmp_path / "flights.gif", HitFly().flight(), kept, 1)
+    assert (titles[0], stars[0]) == ("hit 3", 0)
+    assert (titles[-1], stars[-1]) == ("hit 3, success", 1)
+
+
+def test_a_picture_contains_the_robot_s_whole_path():
+    kept = recording(target=(1.75, 0.0, 0.0))
+    kept.robot[0, -1, :3] = (0.0, 0.0, 9.0)
+    scene = Scene(Figure(), CatchFly().flight(), kept, 0)
+    assert scene.axes.get_zlim()[1] > 9.0
+
+
 def test_a_film_that_fails_leaves_nothing_behind(tmp_path, monkeypatch):
     monkeypatch.setattr(Figure, "clear", lambda self: 1 / 0)
     with pytest.raises(ZeroDivisionError):

@@ -52,6 +52,18 @@ def test_a_catch_is_told_with_its_time_and_place(catch):
 
 
 @pytest.mark.parametrize("which", ["hit", "catch"])
+def test_a_notebook_shows_the_plan_in_space(which, request):
+    _, answer = request.getfixturevalue(which)
+    figure = pj.show(answer.case, answer.plan)
+    sides = [axes.get_title(loc="left") for axes in figure.axes]
+    assert any("rom above" in title for title in sides)
+    assert any("success" in title for title in sides)
+    drawn = [line.get_xydata() for axes in figure.axes for line in axes.lines]
+    start = np.asarray(answer.plan.whole.coeffs)[0, 0]
+    assert any(np.allclose(points[0], start[[0, 2]], atol=1e-4) for points in drawn)
+
+
+@pytest.mark.parametrize("which", ["hit", "catch"])
 def test_the_table_agrees_with_the_referee_and_says_when(which, request):
     single, answer = request.getfixturevalue(which)
     found = {margin.limit.split(" [")[0]: margin for margin in single.margins(answer)}

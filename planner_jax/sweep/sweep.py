@@ -4,8 +4,10 @@ import contextlib
 import dataclasses
 import pkgutil
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import ClassVar, Generic
 
+import jax
 import numpy as np
 from jaxtyping import PyTree
 from matplotlib.figure import Figure
@@ -16,14 +18,23 @@ from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import Plan
 from planner_jax.core.registry import Task, task_named
 from planner_jax.planning.plan import plan
-from planner_jax.runs.columns import Column, RefereedBatch, leaf_columns
+from planner_jax.runs.columns import Column, RefereedBatch, leaf_columns, rows_of
 from planner_jax.runs.manifest import Entries, Row
-from planner_jax.runs.run_folder import RunRows
+from planner_jax.runs.run_folder import RunFolder, RunRows
 from planner_jax.runs.settings import AnySettings, SweepSettings
-from planner_jax.runs.source import DrawnSource, Source, fill_in
+from planner_jax.runs.source import Chunk, DrawnSource, Source, fill_in
 from planner_jax.runs.summary import Tally
 from planner_jax.runs.table import RateTable, rate_cells
 from planner_jax.sweep.figures import outcomes_figure
+
+
+@dataclasses.dataclass(frozen=True)
+class Picture:
+    """One picture of one plan."""
+
+    name: str  # file name
+    size: tuple[float, float]  # width and height [inch]
+    draw: Callable[[Figure], object]  # function that draws into an empty figure
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,6 +46,21 @@ class RunFigure:
     size: tuple[float, float]  # width and height [inch]
     draw: Callable[[Figure, RunRows], None]  # function that draws a run into an empty figure
 
+    def picture(self, run: RunRows) -> Picture:
+        """Return the picture that the figure of one run is."""
+        return Picture(self.name, self.size, lambda figure: self.draw(figure, run))
+
+
+@dataclasses.dataclass(frozen=True)
+class _OneRow(RunRows):
+    """One planned case in the form of a finished run of many cases, to draw the same figures."""
+
+    row: Row
+
+    def same_case(self) -> list[tuple[str, Row]]:
+        """Return the name of the planner and the planned case, as a list with one pair."""
+        return [(self.manifest["parameters"]["planner"], self.row)]
+
 
 class Sweep(Generic[AnySettings]):
     """Base class for a task's runs over many cases: it makes, plans, judges and reports them."""
@@ -42,12 +68,12 @@ class Sweep(Generic[AnySettings]):
     frame: ClassVar[str] = ""  # text on the coordinate frame and time origin of the columns
     # Columns of the rows; () stands for a column for each array of cases, plans and verdicts.
     own_columns: ClassVar[Sequence[Column]] = ()
-    single_columns: ClassVar[Sequence[Column]] = ()  # columns for `planner-jax plan` of one case
+    single_columns: ClassVar[Sequence[Column]] = ()  # columns that `single_figures` read
     figures: ClassVar[tuple[RunFigure, ...]] = (
         RunFigure("outcomes.png", "Number of plans by iterations.", (9.0, 4.4), outcomes_figure),
     )
     counts: ClassVar[type[Tally]] = Tally  # class that counts the rows for the summary
-    single_figures: ClassVar[Sequence[RunFigure]] = ()  # figures of `planner-jax plan` of one case
+    single_figures: ClassVar[Sequence[RunFigure]] = ()  # figures of one case, the clearest first
     # A function that restores a plan from a row. Its arguments are the row and the manifest's entry
     # `setting`, which holds the physics of all cases.
     plan_of_row: Callable[[Row, Entries], Plan] | None = None
@@ -105,6 +131,24 @@ class Sweep(Generic[AnySettings]):
     def setting(self, cases: PyTree) -> Entries:
         """Return physics and limits that all cases share, for the entry `setting` of manifests."""
         return {}
+
+    def pictures(self, case: PyTree, plan: PyTree, verdict: PyTree, planner: str) -> list[Picture]:
+        """Return pictures of one case and its plan, the clearest first.
+
+        Args:
+            case: one case.
+            plan: its plan, solved or not.
+            verdict: the referee's verdict on the plan.
+            planner: name of the planner in legends.
+        """
+        case, plan = jax.tree.map(lambda leaf: np.asarray(leaf)[None], (case, plan))
+        fields = {name: np.asarray(value)[None] for name, value in vars(verdict).items()}
+        verdict = dataclasses.replace(verdict, **fields)
+        batch = RefereedBatch(Chunk(np.zeros(1, int), case), plan, verdict)
+        (row,) = rows_of(self.single_columns, batch, self.frame).to_pylist()
+        manifest = {"parameters": {"planner": planner}, "setting": self.setting(case)}
+        run = _OneRow(RunFolder(Path()), manifest, [], row)
+        return [each.picture(run) for each in self.single_figures]
 
     def tally(self, settings: AnySettings) -> Tally:
         """Return a new counter of rows, from which the summary of a run is made."""

@@ -19,10 +19,6 @@ from planner_jax.core.registry import Task
 from planner_jax.planning.plan import plan
 from planner_jax.referee.rotors import rotor_thrusts
 from planner_jax.robot.quadrotor import QuadrotorPlan
-from planner_jax.runs.columns import RefereedBatch, rows_of
-from planner_jax.runs.manifest import Row
-from planner_jax.runs.run_folder import RunFolder, RunRows
-from planner_jax.runs.source import Chunk
 from planner_jax.runs.style import draw
 from planner_jax.runs.table import align
 from planner_jax.sweep.figures import PANELS
@@ -69,17 +65,6 @@ class Answer:
     def success(self) -> bool:
         """Whether the referee accepts the plan."""
         return bool(self.verdict.success)
-
-
-@dataclasses.dataclass(frozen=True)
-class OneRow(RunRows):
-    """One planned case in the form of a finished run of many cases, to draw the same figures."""
-
-    row: Row
-
-    def same_case(self) -> list[tuple[str, Row]]:
-        """Return the name of the planner and the planned case, as a list with one pair."""
-        return [(self.manifest["parameters"]["planner"], self.row)]
 
 
 class Single(abc.ABC, Generic[SingleT]):
@@ -137,20 +122,11 @@ class Single(abc.ABC, Generic[SingleT]):
 
     def write_pictures(self, answer: Answer, out: Path) -> list[Path]:
         """Draw the case and its plan into the folder `out`, and return the pictures' paths."""
-        sweep = sweep_of(self.task)
-        case, plan = jax.tree.map(lambda leaf: np.asarray(leaf)[None], (answer.case, answer.plan))
-        fields = {name: np.asarray(value)[None] for name, value in vars(answer.verdict).items()}
-        verdict = dataclasses.replace(answer.verdict, **fields)
-        batch = RefereedBatch(Chunk(np.zeros(1, int), case), plan, verdict)
-        (row,) = rows_of(sweep.single_columns, batch, sweep.frame).to_pylist()
-        manifest = {
-            "parameters": {"planner": self.settings.planner},
-            "setting": sweep.setting(case),
-        }
-        run = OneRow(RunFolder(out), manifest, [], row)
-        for figure in sweep.single_figures:
-            draw(out / figure.name, figure.draw, figure.size, run)
-        return [out / figure.name for figure in sweep.single_figures]
+        parts = answer.case, answer.plan, answer.verdict
+        drawn = sweep_of(self.task).pictures(*parts, str(self.settings.planner))
+        for picture in drawn:
+            draw(out / picture.name, picture.draw, picture.size)
+        return [out / picture.name for picture in drawn]
 
 
 def sample_plan(found: QuadrotorPlan) -> SampledMotion:

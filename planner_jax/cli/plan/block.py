@@ -1,16 +1,12 @@
 """The command `planner-jax plan block`: one thrown ball that an arm blocks with its shield."""
 
-from pathlib import Path
-
 import numpy as np
 from jaxtyping import PyTree
 
 from planner_jax.cli.plan.answer import Answer, Margin, Single, closest_to
 from planner_jax.cli.plan.settings import SingleBlockSettings
 from planner_jax.runs.manifest import Entries
-from planner_jax.runs.style import draw
 from planner_jax.task.block.case import case
-from planner_jax.task.block.drawing import SIZE, draw_plan
 from planner_jax.task.block.explain import prospects
 from planner_jax.task.block.suites import scene_for
 
@@ -65,9 +61,3 @@ class SingleBlock(Single[SingleBlockSettings]):
     def margins(self, answer: Answer) -> list[Margin]:
         """Return how close the plan comes to each limit of the arm."""
         return self.task_margins(answer)
-
-    def write_pictures(self, answer: Answer, out: Path) -> list[Path]:
-        """Draw the arm and its rates into the folder `out`, and return the picture's path."""
-        path = out / "block.png"
-        draw(path, lambda figure: draw_plan(answer.case, answer.plan, figure), SIZE)
-        return [path]

@@ -16,7 +16,6 @@ from planner_jax.core.protocol import is_unsolved
 from planner_jax.host.yaml_files import read_fields
 from planner_jax.plane.maps import MapError, read_map
 from planner_jax.plane.target import TurningPath
-from planner_jax.runs.style import draw
 from planner_jax.task.intercept import drawing
 from planner_jax.task.intercept.case import InterceptCase, case
 from planner_jax.task.intercept.explain import relaxation
@@ -153,10 +152,3 @@ class SingleIntercept(Single[SingleInterceptSettings]):
     def margins(self, answer: Answer) -> list[Margin]:
         """Return how close the plan comes to each limit of the car, and to its target."""
         return self.task_margins(answer)
-
-    def write_pictures(self, answer: Answer, out: Path) -> list[Path]:
-        """Draw the plan from above into the folder `out`, and return the picture's path."""
-        path = out / "plane.png"
-        figure = lambda canvas: drawing.draw_plan(answer.case, answer.plan, canvas.subplots())  # noqa: E731
-        draw(path, figure, drawing.figure_size(answer.case, answer.plan))
-        return [path]

@@ -10,7 +10,8 @@ from planner_jax.runs.summary import COUNTED, Tally
 from planner_jax.sweep.block.columns import COLUMNS, FRAME
 from planner_jax.sweep.block.settings import BlockSettings
 from planner_jax.sweep.rows import arm_plan
-from planner_jax.sweep.sweep import Sweep
+from planner_jax.sweep.sweep import Picture, Sweep
+from planner_jax.task.block.drawing import SIZE, draw_plan
 
 
 class BlockTally(Tally):
@@ -42,3 +43,7 @@ class BlockSweep(Sweep[BlockSettings]):
         if (mean := manifest["summary"]["mean_execution_time"]) is None:
             return []
         return [f"The arm moves for {mean:.3f} s, in the mean of the successes."]
+
+    def pictures(self, case: PyTree, plan: PyTree, verdict: PyTree, planner: str) -> list[Picture]:
+        """Return one picture: the arm from above and from the side, and the rates of its joints."""
+        return [Picture("block.png", SIZE, lambda figure: draw_plan(case, plan, figure))]

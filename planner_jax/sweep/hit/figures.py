@@ -120,6 +120,8 @@ def path_figure(figure: Figure, run: RunRows) -> None:
     above, side = figure.subplots(2, 1, sharex=True)
     for axes, second in ((above, 1), (side, 2)):
         draw_case(axes, row, second, setting, drag_after)
+        for line in axes.lines:
+            line.set(linewidth=2.0, alpha=1.0)
         axes.plot(row["start"][0], row["start"][second], "s", color=style.BLUE, markersize=5)
         axes.plot(row["target"][0], row["target"][second], zorder=6, markersize=11, **_TARGET)
         low, high = axes.get_ylim()
@@ -130,8 +132,13 @@ def path_figure(figure: Figure, run: RunRows) -> None:
     side.axhline(0.0, color=style.GREY, linewidth=1.5)
     end = "success" if row["success"] else row["sentence"]
     style.label(above, "", "y [m]", f"From above ({end})")
-    words = "orange: ball, blue: quadrotor, green: returned ball, ring: target; red: what fails"
-    style.label(side, "x [m]", "z [m]", f"From the side ({words})")
+    style.label(side, "x [m]", "z [m]", "From the side")
+    colours = {"ball": style.ORANGE, "quadrotor": style.BLUE, "returned ball": style.GREEN}
+    if not row["success"]:
+        colours = {"ball, quadrotor": style.RED}
+    entries = [Line2D([], [], color=colour, label=name) for name, colour in colours.items()]
+    entries.append(Line2D([], [], linestyle="", label="target", **_TARGET))
+    figure.legend(handles=entries, loc="outside upper center", ncols=len(entries))
 
 
 _PANELS = ("speed", "acceleration", "body_rate", "thrust")

@@ -13,7 +13,8 @@ from planner_jax.sweep.intercept.columns import COLUMNS, FRAME
 from planner_jax.sweep.intercept.figures import motion_figure, plane_figure
 from planner_jax.sweep.intercept.settings import InterceptSettings
 from planner_jax.sweep.rows import car_plan
-from planner_jax.sweep.sweep import RunFigure, Sweep, first_values
+from planner_jax.sweep.sweep import Picture, RunFigure, Sweep, first_values
+from planner_jax.task.intercept.drawing import draw_plan, figure_size
 
 # Planners whose plans for one case of a run are drawn beside the plan of the run's own planner.
 COMPARED = ("lattice", "spacetime")
@@ -89,3 +90,8 @@ class InterceptSweep(Sweep[InterceptSettings]):
             f"obstacle more than {2.5 * limits['body_length']:g} mm inside the body or its margin, "
             "and at the end the middle of the body within the case's tolerance of the target.",
         ]
+
+    def pictures(self, case: PyTree, plan: PyTree, verdict: PyTree, planner: str) -> list[Picture]:
+        """Return one picture: walls, moving obstacles, target and car from above."""
+        size = figure_size(case, plan)
+        return [Picture("plane.png", size, lambda figure: draw_plan(case, plan, figure.subplots()))]
