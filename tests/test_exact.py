@@ -16,6 +16,7 @@ from planner_jax.referee.hit import referee_hits
 from planner_jax.task.hit.default_planner import ExactHit
 from planner_jax.task.hit.suites import generate_serves, to_cases
 from planner_jax.trajectory.polynomial import evaluate, total_duration
+from tests.trees import assert_same
 
 PLANNER = ExactHit()
 FIRST_ROUND = ExactHit(rounds=PLANNER.rounds[:1])
@@ -44,6 +45,17 @@ def test_every_easy_serve_is_solved_and_confirmed_by_the_referee(cases, plans):
     assert is_solved(plans.status).all()
     verdict = referee_hits(cases, plans)
     assert verdict.success.all(), [verdict.sentence(k) for k in np.flatnonzero(~verdict.success)]
+
+
+def test_hits_at_utm_coordinates_have_the_same_plans(cases, plans):
+    away = np.array([5e5, 4e6, 0.0])
+    given = (cases.ball.pos + away, cases.ball.vel, cases.target + away)
+    far = pj.hit.case(*given, start=cases.head_state[:, 0] + away)
+    found = plan(PLANNER, far)
+    assert_same(found.replace(origin=None), plans)
+    verdict, usual = pj.hit.judge(far, found), pj.hit.judge(cases, plans)
+    assert verdict.success.all()
+    np.testing.assert_array_equal(verdict.landing_point, usual.landing_point + away)
 
 
 def test_any_decision_vector_meets_the_ball_and_reaches_the_target(cases):

@@ -106,6 +106,29 @@ def test_a_ball_that_is_not_seen_at_two_times_has_a_status_and_a_sentence():
     assert fit_one(same_time, places, 1.0, GRAVITY).status == flight_fit.Sight.SEEN_ONCE
 
 
+@pytest.mark.parametrize("away", [0.0, np.array([5e5, 4e6, 0.0])], ids=["here", "UTM"])
+@pytest.mark.parametrize("begin", [0.0, 1e6, 1.7e9])
+def test_a_flight_at_any_time_and_place_has_the_same_fit(begin, away):
+    places = draw_positions(1, np.random.default_rng(7))[0].astype(float)
+    places[:2] = np.nan
+    times = np.arange(NUM) / 64.0
+    usual = flight_fit.fit_flight(times, places, STD**-2, GRAVITY)
+    fit = flight_fit.fit_flight(times + begin, places + away, STD**-2, GRAVITY)
+    assert fit.status == flight_fit.Sight.SEEN
+    np.testing.assert_allclose(fit.belief.mean[3:], usual.belief.mean[3:], atol=2e-5)
+    there = flight_fit.belief_at(fit, begin + AHEAD, GRAVITY).mean[:3]
+    np.testing.assert_allclose(there - away, believed(usual, AHEAD, GRAVITY).mean[:3], atol=2e-5)
+    np.testing.assert_allclose(fit.misfit, usual.misfit, rtol=1e-3)
+
+
+@pytest.mark.parametrize("begin, away", [(1e6, 0.0), (1.7e9, 0.0), (0.0, 4e6)])
+def test_a_fit_that_float32_makes_wrong_is_not_called_seen(begin, away):
+    places = draw_positions(1, np.random.default_rng(7))[0]
+    fit = fit_one(TIMES + np.float32(begin), places + np.float32(away), STD**-2, GRAVITY)
+    assert fit.status != flight_fit.Sight.SEEN
+    assert "float64" in flight_fit.Sight.IMPRECISE.message
+
+
 def test_the_fit_is_what_a_kalman_filter_with_a_wide_prior_comes_to(float64):
     places = jnp.asarray(draw_positions(1, np.random.default_rng(5))[0], jnp.float64)
     model = EkfModel(jnp.zeros(3), jnp.asarray(GRAVITY), jnp.asarray(0.0), jnp.asarray(STD))

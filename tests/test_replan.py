@@ -72,6 +72,21 @@ def test_later_plans_begin_where_the_robot_is_and_the_case_says_so(task, request
     np.testing.assert_array_equal(moved.case.head_state, given)
 
 
+def test_plans_again_at_utm_coordinates_are_the_same(catches):
+    cases, plans, news = catches
+    away = np.array([5e5, 4e6, 0.0])
+    ball = news["targets"].ball
+    moved = news["targets"].replace(ball=ball.replace(pos=ball.pos.astype(float) + away))
+    origin = np.tile(np.float32(away[:2]), (NUM, 1))
+    far = [each.replace(origin=origin) for each in (cases, plans)]
+    planner = pj.catch.ReplanCatch(CATCH.planner, rounds=NONE)
+    found = pj.replan(planner, *far, 0.0, targets=moved)
+    near = pj.replan(planner, cases, plans, 0.0, **news)
+    np.testing.assert_array_equal(found.origin, origin)
+    np.testing.assert_allclose(found.trajectory.coeffs, near.trajectory.coeffs, atol=1e-4)
+    np.testing.assert_allclose(found.sample(9.0).pos, near.sample(9.0).pos + away, atol=1e-5)
+
+
 @pytest.mark.parametrize("task", ["hits", "catches"])
 def test_one_case_is_its_lane(task, request):
     cases, plans, news = request.getfixturevalue(task)

@@ -6,7 +6,7 @@ is K_D () [1/m] if quadratic, or K_i (3,) [1/s] if linear, both >= 0.
 """
 
 import math
-from typing import TypeVar
+from typing import ClassVar, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -25,6 +25,8 @@ Vector = TypeVar("Vector", Array, tuple[Array, Array, Array])
 @struct.dataclass
 class BallState:
     """Position and velocity of a ball at one instant, in the world frame with z up."""
+
+    positions: ClassVar[dict] = {"pos": ()}
 
     pos: Array  # (3,) [m]
     vel: Array  # (3,) [m/s]

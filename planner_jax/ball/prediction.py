@@ -19,6 +19,7 @@ from planner_jax.ball.flight import BallState, require_ball, rk4_step
 from planner_jax.core.arithmetic import reciprocal
 from planner_jax.core.checks import require_kind, require_number, require_scalar
 from planner_jax.core.choices import require_size
+from planner_jax.core.origin import split_far, to_world
 from planner_jax.core.rules import NOT_NEGATIVE, POSITIVE, Field, Table
 from planner_jax.lanes import with_kernel
 
@@ -30,6 +31,7 @@ class PathTable:
     """Positions and velocities of a target at N nodes; node k is at time (k - 1) * resolution."""
 
     rules: ClassVar[Table] = (Field("resolution", None, POSITIVE),)
+    positions: ClassVar[dict] = {"pos": ()}
 
     pos: Array  # (N, 3) [m], or (N, 2) in the plane
     vel: Array  # (N, 3) or (N, 2) [m/s]
@@ -45,7 +47,8 @@ def predict_path(
 ) -> PathTable:
     """Integrate the flight of a ball with quadratic drag into a table of states.
 
-    There is one Runge-Kutta step of order 4 between neighbouring nodes.
+    There is one Runge-Kutta step of order 4 between neighbouring nodes. If the ball's position is
+    in float64 NumPy arrays and over 1 km from the origin, so are the positions of the table.
 
     Args:
         ball: the ball at time 0.
@@ -65,8 +68,9 @@ def predict_path(
     require_number("drag", drag, NOT_NEGATIVE)
     require_number("gravity", gravity)
     resolution = horizon / (num_nodes - 3)
-    pos, vel = _node_function(num_nodes)(ball.pos, ball.vel, resolution, drag, gravity)
-    return PathTable(pos=pos, vel=vel, resolution=resolution)
+    start, away = split_far(ball.pos)
+    pos, vel = _node_function(num_nodes)(start, ball.vel, resolution, drag, gravity)
+    return PathTable(pos=to_world(pos, away), vel=vel, resolution=resolution)
 
 
 @functools.cache

@@ -14,6 +14,7 @@ from planner_jax.core.arithmetic import Numbers
 from planner_jax.core.checks import floating, require_number, shape_of
 from planner_jax.core.choices import require_size
 from planner_jax.core.errors import ArgumentError
+from planner_jax.core.origin import split_far, to_world
 from planner_jax.core.rules import POSITIVE
 
 MOST_NODES = 4096  # greatest number of nodes that `table_path` chooses by itself
@@ -50,7 +51,8 @@ def table_path(
         nodes: number of nodes, >= 5. Required if positions are traced by JAX; pass it also if
             several batches of tables should share a compiled program.
         error: [m], > 0, greatest error of the table; used only if `nodes` is not passed.
-        dtype: floating type of every leaf of the result.
+        dtype: floating type of every leaf of the result. Positions over 1 km from the origin stay
+            in float64 NumPy arrays, from which the function `case` subtracts its origin.
 
     Raises:
         ValueError: the times do not rise or exclude time 0, a shape does not fit, or the path needs
@@ -60,6 +62,7 @@ def table_path(
     dtype, times = floating(dtype), _check_times(times)
     named = [("positions", positions), ("velocities", velocities)]
     values = [_check_values(name, value, times.size) for name, value in named if value is not None]
+    values[0], away = split_far(values[0])
     if len(values) == 2 and np.shape(values[0]) != np.shape(values[1]):
         rule = f"the shape {np.shape(values[0])} of positions"
         raise ArgumentError("velocities", rule, np.shape(values[1]), verb="have")
@@ -69,6 +72,7 @@ def table_path(
     resolution = times[-1] / (nodes - 3)
     at = (np.arange(nodes) - 1) * resolution
     pos, vel = (jnp.asarray(_evaluate(times, values, at, order), dtype) for order in (0, 1))
+    pos = to_world(pos, away)
     return PathTable(pos, vel, jnp.full(pos.shape[:-2], resolution, dtype))
 
 

@@ -44,6 +44,7 @@ class BallPath:
         Field("drag", (3,), NOT_NEGATIVE),
         Field("gravity", (), NOT_NEGATIVE),
     )
+    positions: ClassVar[dict] = {"ball": ()}
 
     ball: BallState  # at time 0
     drag: Array  # (3,) K_i [1/s], drag coefficients of the axes
@@ -62,6 +63,7 @@ class HarmonicPath:
         *(Field(name, (3,)) for name in ("pos", "vel", "amplitude")),
         *(Field(name, ()) for name in ("rate", "phase")),
     )
+    positions: ClassVar[dict] = {"pos": ()}
 
     pos: Array  # (3,) [m]
     vel: Array  # (3,) [m/s], of the drift

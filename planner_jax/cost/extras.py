@@ -67,6 +67,7 @@ class KeepOut:
     """A sphere that the quadrotor must not enter."""
 
     rules: ClassVar[Table] = (Field("radius", None, POSITIVE),)
+    positions: ClassVar[dict] = {"centre": ()}
 
     centre: Numbers  # (3,) [m]
     radius: Numbers  # () [m], > 0
@@ -81,6 +82,7 @@ class KeepOutBox:
     """A box along the world's axes, with finite sides, that the quadrotor must not enter."""
 
     rules: ClassVar[Table] = (Field("low", None, below("high")),)
+    positions: ClassVar[dict] = {"low": (), "high": ()}
 
     low: Numbers  # (3,) [m]
     high: Numbers  # (3,) [m]
@@ -97,6 +99,7 @@ class Plane:
     """A wall or ceiling: the quadrotor must stay on the side to which the normal points."""
 
     rules: ClassVar[Table] = (Field("normal", None, NOT_ZERO),)
+    positions: ClassVar[dict] = {"point": ()}
 
     point: Numbers  # (3,) [m], anywhere on the plane
     normal: Numbers  # (3,), of any length
@@ -112,6 +115,7 @@ class Geofence:
     """A box, with finite sides, that the quadrotor must not leave."""
 
     rules: ClassVar[Table] = (Field("low", None, below("high")),)
+    positions: ClassVar[dict] = {"low": (), "high": ()}
 
     low: Numbers  # (3,) [m]
     high: Numbers  # (3,) [m]
@@ -132,6 +136,7 @@ class SpeedZone:
     """
 
     rules: ClassVar[Table] = (Field("radius", None, POSITIVE), Field("speed", None, POSITIVE))
+    positions: ClassVar[dict] = {"centre": ()}
 
     centre: Numbers  # (3,) [m]
     radius: Numbers  # () [m], > 0
@@ -148,6 +153,7 @@ class Dislike:
     """A sphere with a cost inside it, which the quadrotor avoids if it can."""
 
     rules: ClassVar[Table] = (Field("radius", None, POSITIVE), Field("weight", None, NOT_NEGATIVE))
+    positions: ClassVar[dict] = {"centre": ()}
 
     centre: Numbers  # (3,) [m]
     radius: Numbers  # () [m], > 0

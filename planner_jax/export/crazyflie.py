@@ -10,7 +10,7 @@ import numpy as np
 
 from planner_jax.core.errors import ArgumentError
 from planner_jax.export.csv_rows import write_table
-from planner_jax.export.setpoints import pieces_of
+from planner_jax.export.setpoints import pieces_of, require_near
 from planner_jax.robot.quadrotor import QuadrotorPlan
 
 MEMORY = 4096  # [bytes], memory for trajectories in the firmware
@@ -42,6 +42,7 @@ def poly4d(plan: QuadrotorPlan) -> np.ndarray:
         table = np.hstack([pieces.durations[:, None].astype(np.float32), rows.reshape(num, -1)])
     if not np.isfinite(table).all() or not (table[:, 0] > 0.0).all():
         raise ArgumentError("plan", "numbers that float32 holds", verb="have", shown="larger ones")
+    require_near(np.asarray(pieces.coeffs)[:, 0])
     return table
 
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from planner_jax.export.csv_rows import write_table
 from planner_jax.export.frames import to_ned, to_ned_yaw, yaw_of
-from planner_jax.export.setpoints import setpoints_of
+from planner_jax.export.setpoints import require_near, setpoints_of
 from planner_jax.robot.quadrotor import QuadrotorPlan, QuadrotorSetpoints
 
 _VECTORS = ("position", "velocity", "acceleration", "jerk")
@@ -28,6 +28,7 @@ def trajectory_setpoints(plan: QuadrotorPlan, rate: float) -> dict[str, np.ndarr
     """
     points = setpoints_of(plan, rate)
     assert isinstance(points, QuadrotorSetpoints)
+    require_near(points.pos)
     yaw, yaw_rate = yaw_of(points.quat_wxyz, points.body_rate)
     vectors = zip(_VECTORS, (points.pos, points.vel, points.acc, points.jerk), strict=True)
     return {

@@ -11,6 +11,7 @@ from jaxtyping import PyTree
 
 from planner_jax.core.choices import require
 from planner_jax.core.errors import ArgumentError
+from planner_jax.core.origin import ROUNDING, to_world
 from planner_jax.core.plan_files import PlanFileError, leaves_by_name, load_fitting
 from planner_jax.core.protocol import Plan, Status, is_solved, take
 from planner_jax.recovery.after_plan import is_rested
@@ -171,7 +172,16 @@ def pieces_of(plan: QuadrotorPlan) -> PiecewisePolynomial:
     taken = durations != 0.0
     is_sound = bool(np.isfinite(coeffs[taken]).all() and (durations[taken] > 0.0).all())
     require(is_sound, "plan", "finite", shown="a trajectory that is not")
-    return jax.tree.map(lambda leaf: leaf[taken], path)
+    coeffs = np.array(coeffs[taken])
+    coeffs = np.concatenate([to_world(coeffs[:, :1], plan.origin), coeffs[:, 1:]], axis=1)
+    return dataclasses.replace(path, coeffs=coeffs, durations=durations[taken])
+
+
+def require_near(positions: np.ndarray) -> None:
+    """Raise `ArgumentError` if float32 would round positions [m] by over 1 mm."""
+    far = float(np.abs(positions).max(initial=0.0))
+    rule = "within 10 km of (0, 0) in this format of float32; plan.replace(origin=None) is"
+    require(far * float(np.finfo(np.float32).eps) <= ROUNDING, "plan", rule, shown=f"{far:.8g} m")
 
 
 def load_plan(path: str | os.PathLike, row: int | None = None) -> Plan:

@@ -16,6 +16,7 @@ from jaxtyping import PyTree
 
 from planner_jax.core.checks import require_kind
 from planner_jax.core.errors import ArgumentError
+from planner_jax.core.origin import with_origin
 from planner_jax.core.planner import Planner, require_fit
 from planner_jax.core.protocol import mark_bad_input, status_of
 from planner_jax.optimise.multistart import minimise
@@ -140,4 +141,4 @@ def optimal_plan(planner: Planner, case: PyTree, *, solver: LbfgsConfig | None =
     point, excess = lax.custom_root(jax.grad(cost), start, solve, tangent_solve, has_aux=True)
     plan = minimiser.decode(point, context).replace(cost=cost(point))
     plan = plan.replace(status=status_of(plan.cost, plan.violation, excess <= 1e3))
-    return mark_bad_input(plan, case)
+    return with_origin(mark_bad_input(plan, case), case)

@@ -10,6 +10,7 @@ from jaxtyping import PyTree
 
 from planner_jax.core.checks import require_kind, require_switch
 from planner_jax.core.errors import ArgumentTypeError
+from planner_jax.core.origin import with_origin
 from planner_jax.core.planner import PlanT
 from planner_jax.core.rules import fields_of
 from planner_jax.optimise.sensitivity import Differentiated, Gradient, Quantity, part_of
@@ -87,4 +88,4 @@ def gradient(
         minimiser = minimiser.with_polish()
     differentiated = Differentiated(minimiser, of, by, steps, curvature or minimiser.adjoint)
     plans = plan(differentiated, cases, chunk=chunk, devices=devices)
-    return PlanGradient(plans=plans.whole_plan(), **fields_of(plans.gradient))
+    return PlanGradient(plans=with_origin(plans.whole_plan(), cases), **fields_of(plans.gradient))

@@ -14,6 +14,7 @@ from jaxtyping import PyTree
 
 from planner_jax.core.choices import require, require_size
 from planner_jax.core.errors import ArgumentError, ArgumentTypeError
+from planner_jax.core.origin import with_origin, without_origin
 from planner_jax.core.planner import CaseT, Kind, Planner, PlanT, require_fit
 from planner_jax.core.protocol import (
     Attempt,
@@ -95,13 +96,13 @@ def plan(
         require_batch(cases)
         if not resident:
             require_sound(cases)
-    plans, _ = Driver(chunk, devices, watch)(planner, cases)
+    plans, _ = Driver(chunk, devices, watch)(planner, without_origin(cases))
     # To save time, a single case's numbers are checked on the host only after the status BAD_INPUT.
     if alone and not resident and int(plans.status) == Status.BAD_INPUT:
         require_sound(cases)
     if not alone and resident and not is_resident(plans):
         plans = jax.device_put(plans, devices[0] if devices else None)
-    return plans
+    return with_origin(plans, cases)
 
 
 def warm_up(planner: Planner[CaseT, PlanT], case: CaseT) -> None:
@@ -189,7 +190,7 @@ def solve(planner: Planner[CaseT, PlanT], cases: CaseT) -> PlanT:
     if cases.batch_shape == () and planner.kind is Kind.COMPOSITE:
         plans = solve(planner, jax.tree.map(lambda leaf: leaf[None], cases))
         return jax.tree.map(lambda leaf: leaf[0], plans)
-    return _solve(planner, cases)
+    return with_origin(_solve(planner, without_origin(cases)), cases)
 
 
 @jax.custom_jvp

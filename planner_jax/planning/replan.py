@@ -10,6 +10,7 @@ from jaxtyping import PyTree
 
 from planner_jax.core.checks import numbers_of, require_kind
 from planner_jax.core.errors import ArgumentError
+from planner_jax.core.origin import Located, move, with_origin, without_origin
 from planner_jax.core.planner import CaseT, PlanT, require_planner
 from planner_jax.core.rules import Case
 from planner_jax.planning.plan import plan
@@ -101,4 +102,9 @@ def replan(planner: PyTree, cases: PyTree, previous: PlanT, elapsed: PyTree, **n
             np.shape(previous.status),
             verb="have",
         )
-    return plan(again, again.begin(cases, previous, elapsed, **news))
+    if not isinstance(cases, Located) or cases.origin is None:
+        return plan(again, again.begin(cases, previous, elapsed, **news))
+    dtype, by = np.asarray(cases.origin).dtype, -np.asarray(cases.origin, np.float64)
+    news |= {k: move(k, news[k], by, dtype, at) for k, at in cases.positions.items() if k in news}
+    near = again.begin(without_origin(cases), without_origin(previous), elapsed, **news)
+    return with_origin(plan(again, near), cases)

@@ -14,6 +14,7 @@ from flax import struct
 from jax import Array
 
 from planner_jax.core.arithmetic import Components, at_least, components, inverse_sqrt, reciprocal
+from planner_jax.core.origin import Located, to_world
 from planner_jax.core.protocol import Plan
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate, join
 
@@ -268,8 +269,11 @@ class QuadrotorSetpoints:
 
 
 @struct.dataclass
-class QuadrotorPlan(Plan):
-    """A quadrotor's plan: the trajectory of the centre of the propeller plane."""
+class QuadrotorPlan(Plan, Located):
+    """A quadrotor's plan: the trajectory of the centre of the propeller plane.
+
+    Positions in its arrays are relative to `origin`; positions of `sample` are not.
+    """
 
     trajectory: PiecewisePolynomial  # up to the last contact with a ball or target
     gravity: Array  # () [m/s^2], magnitude
@@ -291,7 +295,8 @@ class QuadrotorPlan(Plan):
 
         path = jax.tree.map(np.asarray, self.whole)
         ends = np.sum(path.durations, axis=-1)
-        return QuadrotorSetpoints(**sample_at_rate(rate, ends, (path, self.gravity), setpoint_at))
+        found = sample_at_rate(rate, ends, (path, self.gravity), setpoint_at)
+        return QuadrotorSetpoints(**{**found, "pos": to_world(found["pos"], self.origin)})
 
 
 def setpoint_at(leaves: tuple[PiecewisePolynomial, Array], time: Array) -> dict[str, Array]:

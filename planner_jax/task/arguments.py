@@ -15,6 +15,7 @@ from jax.typing import ArrayLike, DTypeLike
 from planner_jax.core import checks
 from planner_jax.core.choices import require_memory, require_size
 from planner_jax.core.errors import ArgumentError, ArgumentTypeError
+from planner_jax.core.origin import has_origin
 from planner_jax.core.protocol import Decision, Plan, take
 from planner_jax.core.registry import split_name
 from planner_jax.core.rules import NOT_NEGATIVE, Case
@@ -134,6 +135,8 @@ def judge_by(
     if num != cases.batch_shape:
         rule = f"the batch shape of the cases, {cases.batch_shape}"
         raise ArgumentError("plans", rule, num, verb="have")
+    if not has_origin(plans, cases):
+        raise ArgumentError("plans", "the origin of the cases", verb="have", shown="")
     alone = cases.batch_shape == ()
     if alone:
         cases, plans = jax.tree.map(lambda leaf: np.asarray(leaf)[None], (cases, plans))

@@ -11,23 +11,30 @@ Every fit uses all observations up to its time, from an array of fixed size in w
 observations are NaN. No state is stored between fits, and every fit takes the same time.
 """
 
+import dataclasses
 import enum
 
+import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 from jax import Array, lax
+from jax.core import Tracer
 from jax.typing import ArrayLike
+from jaxtyping import PyTree
 
 from planner_jax.ball.estimation import EkfState, solve_definite
 from planner_jax.ball.flight import BallState, drag_free_flight
+from planner_jax.core.origin import split_far, to_world
 
 
 class Sight(enum.IntEnum):
-    """The outcome of observing a ball: enough observations for a fit of its flight, or too few."""
+    """The outcome of observing a ball: a fit of its flight, or the reason why there is none."""
 
     SEEN = 0
     NEVER_SEEN = 1
     SEEN_ONCE = 2
+    IMPRECISE = 3
 
     @property
     def message(self) -> str:
@@ -39,7 +46,11 @@ _MESSAGES = {
     Sight.SEEN: "seen often enough for a flight",
     Sight.NEVER_SEEN: "the camera never sees the ball; check its direction, and the ball's colour",
     Sight.SEEN_ONCE: "seen at one time only, which gives no velocity; observe for longer",
+    Sight.IMPRECISE: "the times or positions are too large for their type, or not finite; pass "
+    "NumPy arrays in float64, outside compiled functions",
 }
+
+_ROUNDING = 1e-3  # greatest rounding error of times or positions, relative to their spread
 
 
 @struct.dataclass
@@ -52,7 +63,7 @@ class FlightFit:
     # standard deviations are right.
     misfit: Array
     num: Array  # () int32, number of fitted observations
-    status: Array  # () int32, a `Sight`: whether there were enough observations
+    status: Array  # () int32, a `Sight`: whether there is a fit
 
     @property
     def ball(self) -> BallState:
@@ -75,7 +86,30 @@ def fit_flight(times: Array, places: Array, information: ArrayLike, gravity: Arr
         information: W_k [1/m^2], (N, 3, 3); or (N,) or () for isotropic noise. An observation with
             zero information is ignored too.
         gravity: () [m/s^2], magnitude g.
+
+    Returns:
+        The fit. In NumPy arrays in float64, times and positions may be large, such as stamps since
+        1970 and UTM coordinates: multiples of 100 s and 100 m near the first ones are subtracted.
+        Otherwise the status is IMPRECISE if rounding of times or positions changes the velocity.
     """
+    given = times, places, information, gravity
+    if any(isinstance(leaf, Tracer) for leaf in given) or np.result_type(times) != np.float64:
+        return _fit(*given)
+    finite = np.asarray(times)[np.isfinite(times)]
+    begin = np.round(finite[0], -2) if finite.size else 0.0
+    seen = np.flatnonzero(np.isfinite(places).all(axis=-1))
+    first = seen[0] if seen.size else 0
+    near, away = split_far(np.roll(np.asarray(places), -first, axis=0))
+    fit = _fit(times - begin, np.roll(near, first, axis=0), information, gravity)
+    mean = fit.belief.mean
+    if away is not None:
+        mean = np.append(to_world(mean[:3], away), mean[3:])
+    belief = dataclasses.replace(fit.belief, mean=mean)
+    return dataclasses.replace(fit, belief=belief, time=np.asarray(fit.time, float) + begin)
+
+
+@jax.jit
+def _fit(times: Array, places: Array, information: ArrayLike, gravity: Array) -> FlightFit:
     dtype = places.dtype
     weights = jnp.asarray(information, dtype)
     if weights.ndim < 3:
@@ -131,6 +165,11 @@ def fit_flight(times: Array, places: Array, information: ArrayLike, gravity: Arr
     squares = jnp.einsum("ni,nij,nj->", off, weights, off, precision=lax.Precision.HIGHEST)
     free = jnp.maximum(3 * num - 6, 1)
     unseen = jnp.where(num == 0, Sight.NEVER_SEEN, Sight.SEEN_ONCE)
+    eps, noise = jnp.finfo(dtype).eps, jnp.sqrt(3.0 * num / jnp.sum(jnp.where(present, trace, 0.0)))
+    far = jnp.maximum(_ROUNDING * jnp.max(jnp.abs(seen)), noise)
+    exact = (eps * jnp.max(jnp.abs(times)) <= _ROUNDING * scale) & jnp.isfinite(squares)
+    exact = exact & (eps * jnp.max(jnp.abs(places)) <= far) & jnp.all(jnp.isfinite(mean))
+    seen_well = jnp.where(exact, Sight.SEEN, Sight.IMPRECISE)
     return FlightFit(
         belief=EkfState(
             mean=jnp.where(enough, mean, jnp.nan), covariance=jnp.where(enough, covariance, jnp.nan)
@@ -138,7 +177,7 @@ def fit_flight(times: Array, places: Array, information: ArrayLike, gravity: Arr
         time=middle,
         misfit=jnp.where(enough, _root(squares / free), jnp.nan),
         num=num,
-        status=jnp.where(enough, Sight.SEEN, unseen).astype(jnp.int32),
+        status=jnp.where(enough, seen_well, unseen).astype(jnp.int32),
     )
 
 
@@ -147,14 +186,19 @@ def belief_at(fit: FlightFit, time: Array, gravity: Array) -> EkfState:
 
     The time may lie before, between or after the observations.
     """
-    ahead = jnp.asarray(time, fit.time.dtype) - fit.time
-    ball = drag_free_flight(fit.ball, ahead, gravity)
+    start, away = split_far(fit.ball.pos)
+    ahead = time - fit.time  # in float64, if both are on the host
+    ahead = jnp.asarray(ahead, fit.belief.covariance.dtype)
+    ball = drag_free_flight(BallState(start, fit.ball.vel), ahead, gravity)
     P = fit.belief.covariance
     place, both, speed = P[:3, :3], P[:3, 3:], P[3:, 3:]
     to_speed = both + ahead * speed
     moved = place + ahead * (both.T + to_speed)
+    mean: PyTree = jnp.concatenate([ball.pos, ball.vel])
+    if away is not None:
+        mean = np.append(to_world(mean[:3], away), mean[3:])
     return EkfState(
-        mean=jnp.concatenate([ball.pos, ball.vel]),
+        mean=mean,
         covariance=jnp.block([[moved, to_speed], [to_speed.T, speed]]),
     )
 

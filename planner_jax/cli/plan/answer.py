@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import ClassVar, Generic, SupportsFloat, TypeVar
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
@@ -95,7 +96,8 @@ class Single(abc.ABC, Generic[SingleT]):
     def answer(self) -> Answer:
         """Plan the case and judge the plan; raise `ArgumentError` if an option is invalid."""
         try:
-            case = jax.tree.map(np.asarray, self.case())
+            # Arrays in float64 become float32, as in all other cases.
+            case = jax.tree.map(lambda leaf: np.asarray(jnp.asarray(leaf)), self.case())
             found = plan(self.planner(), case)
         except CaseError as error:
             raise error.with_names(dict(map(self._setting_of, (error.name, error.other)))) from None

@@ -8,6 +8,7 @@ from planner_jax.ball.flight import BallState
 from planner_jax.ball.target import BallPath
 from planner_jax.cli.plan.answer import Answer, Margin, Single
 from planner_jax.cli.plan.settings import SingleCatchSettings
+from planner_jax.core.origin import to_world
 from planner_jax.core.protocol import take
 from planner_jax.task.catch.case import GRAVITY
 
@@ -20,11 +21,11 @@ class SingleCatch(Single[SingleCatchSettings]):
     def case(self) -> PyTree:
         """Make the case of the specified balls, all to be caught before the time `horizon`."""
         given = self.settings
-        pos, vel = (jnp.asarray(part, jnp.float32) for part in zip(*given.balls, strict=True))
-        num = pos.shape[0]
+        balls: PyTree = np.asarray(given.balls, float)  # (N, 2, 3)
+        num = len(balls)
         pull = GRAVITY if given.gravity is None else given.gravity
         path = BallPath(
-            ball=BallState(pos, vel),
+            ball=BallState(balls[:, 0], jnp.asarray(balls[:, 1], jnp.float32)),
             drag=jnp.full((num, 3), given.drag or 0.0, jnp.float32),
             gravity=jnp.full(num, pull, jnp.float32),
         )
@@ -36,7 +37,7 @@ class SingleCatch(Single[SingleCatchSettings]):
         numbers = (answer.plan.order, verdict.catch_times, verdict.net_distance)
         for target, time, away in zip(*map(np.asarray, numbers), strict=True):
             ball = take(targets, int(target)).at(jnp.asarray(time, jnp.float32))
-            x, y, z = np.asarray(ball.pos)
+            x, y, z = to_world(np.asarray(ball.pos), answer.plan.origin)
             which = f"Ball {target + 1} caught" if len(targets.gravity) > 1 else "Caught"
             off = 1e3 * float(away)
             lines.append(

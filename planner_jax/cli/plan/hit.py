@@ -5,6 +5,7 @@ from jaxtyping import PyTree
 
 from planner_jax.cli.plan.answer import Answer, Margin, Single
 from planner_jax.cli.plan.settings import SingleHitSettings
+from planner_jax.core.origin import to_world
 
 
 class SingleHit(Single[SingleHitSettings]):
@@ -20,7 +21,7 @@ class SingleHit(Single[SingleHitSettings]):
     def contact(self, answer: Answer) -> list[str]:
         """Describe the impact and the ball's landing in one sentence."""
         stroke = answer.plan.stroke
-        x, y, z = np.asarray(stroke.ball_pos)
+        x, y, z = to_world(np.asarray(stroke.ball_pos), answer.plan.origin)
         before, after = map(float, map(np.linalg.norm, (stroke.ball_vel, stroke.ball_vel_after)))
         lands = float(stroke.time + stroke.flight_time)
         return [

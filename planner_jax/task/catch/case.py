@@ -16,6 +16,7 @@ from planner_jax.ball.target import TargetPath
 from planner_jax.core.arithmetic import Numbers
 from planner_jax.core.checks import floating, require_path, require_switch, shape_of
 from planner_jax.core.errors import ArgumentError, ArgumentTypeError
+from planner_jax.core.origin import NEAR, Located, find_origin, move
 from planner_jax.core.rules import PERMUTATION, POSITIVE, Field, Rule, Table, require_sound, within
 from planner_jax.cost.extras import Extra, for_batch
 from planner_jax.robot.quadrotor import QuadrotorLimits
@@ -34,7 +35,8 @@ RULES: Table = (
     Field("horizon", ("N",), Rule("> 0 of a target that is present", _is_ahead)),
     Field("order", ("N",), PERMUTATION, kind=np.integer),
     Field("times", ("N",)),
-    Field("head_state", (4, 3)),
+    Field("head_state", (4, 3), NEAR),
+    Field("origin", (2,)),
     Field("gravity", (), POSITIVE),
     Field("net.height", ()),
     Field("net.radius", (), POSITIVE),
@@ -71,14 +73,16 @@ class CatchChoice:
 
 
 @struct.dataclass
-class CatchCase:
+class CatchCase(Located):
     """One case, or a batch: a quadrotor has to catch up to N flying targets in its net.
 
     Every number is a leaf of the pytree. Time 0 is when planning starts. The planner first replaces
-    the order and the guessed times of catches, the fields `order` and `times`.
+    the order and the guessed times of catches, the fields `order` and `times`. Positions are
+    relative to `origin`.
     """
 
     rules: ClassVar[Table] = RULES
+    positions: ClassVar[dict] = {"targets": (), "head_state": (0,)}
 
     targets: TargetPath  # paths of the targets, leaves with a leading axis N
     present: Array  # (N,) bool, whether each target exists; absent targets only pad the arrays
@@ -127,6 +131,7 @@ def case(
     min_height=None,
     extras: Sequence[Extra] = (),
     optional: bool = False,
+    origin=None,
     dtype=jnp.float32,
 ) -> CatchCase:
     """Make one case with N targets to catch, or a batch, by default for the robot of [Yu2023catch].
@@ -148,6 +153,9 @@ def case(
     * `speed` [m/s], `body_rate` [rad/s]: greatest values; `min_height` [m] of the propeller plane;
       `min_thrust`, `max_thrust` [m/s^2], per unit mass.
     * `extras`: further constraints and costs such as `pj.KeepOut`; `dtype`: type of the numbers.
+    * `origin`: (2,) x, y [m], world position that is subtracted from all positions in float64, by
+      default the multiple of 100 m next to the first start. Positions in float64 are thus exact
+      anywhere. Targets and extras whose class has no `positions` are not moved.
     """
     dtype, shape = floating(dtype), shape_of("horizon", horizon)
     if not shape or not shape[-1]:
@@ -155,18 +163,20 @@ def case(
         raise ArgumentError("horizon", "an entry for each target", verb="have", shown=shown)
     require_switch("optional", optional)
     batch, num = shape[:-1], shape[-1]
+    shift = find_origin(start, origin, batch, dtype)
+    near = functools.partial(move, by=None if shift is None else -shift, dtype=dtype)
 
     leaf = functools.partial(array_of, batch=batch, dtype=dtype)
     require_path("targets", targets, shape, 3, "horizon")
     tool = quadrotor.require_tool(robot, NET)
     shares = np.arange(1, num + 1) / (num + 1.0)
     cases = CatchCase(
-        targets=targets,
+        targets=near("targets", targets, is_strict=origin is None),
         present=_broadcast_present(present, shape),
         horizon=leaf("horizon", horizon, num),
         order=jnp.asarray(np.broadcast_to(np.arange(num, dtype=np.int32), shape), jnp.int32),
         times=leaf("horizon", shares * np.asarray(horizon)[..., :1], num),
-        head_state=quadrotor.hover_at(start, batch, dtype),
+        head_state=quadrotor.hover_at(near("start", start), batch, dtype),
         gravity=leaf("gravity", gravity),
         net=Net(
             height=leaf("net_height", tool.height if net_height is None else net_height),
@@ -182,8 +192,9 @@ def case(
             body_rate=body_rate,
             min_height=min_height,
         ),
-        extras=for_batch(extras, batch, dtype),
+        extras=for_batch(near("extras", extras, is_strict=origin is None), batch, dtype),
         optional=optional,
+        origin=None if shift is None else leaf("origin", shift, 2),
     )
     require_sound(cases, _ARGUMENTS)
     quadrotor.require_start(cases)

@@ -1,10 +1,12 @@
 """Public functions of the task `pj.hit`, in which a quadrotor returns a ball with a racket."""
 
+import dataclasses
 from collections.abc import Sequence
 
 import jax.numpy as jnp
 from jax.typing import DTypeLike
 
+from planner_jax.core.origin import to_world
 from planner_jax.core.planner import Planner
 from planner_jax.core.registry import suite_named
 from planner_jax.referee.hit import HitVerdict, referee_hits
@@ -113,4 +115,6 @@ def judge(cases: HitCase, plans: HitPlan, **settings: object) -> HitVerdict:
         TypeError: the cases or plans belong to another task.
         ValueError: cases and plans differ in batch shape, or a setting is out of its range.
     """
-    return judge_by(referee_hits, cases, plans, (HitCase, HitPlan), settings)
+    verdict = judge_by(referee_hits, cases, plans, (HitCase, HitPlan), settings)
+    point = to_world(verdict.landing_point, cases.origin)
+    return dataclasses.replace(verdict, landing_point=point)

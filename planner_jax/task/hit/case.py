@@ -12,6 +12,7 @@ from jax import Array
 from planner_jax.ball.flight import BallState
 from planner_jax.core import rules
 from planner_jax.core.checks import floating
+from planner_jax.core.origin import NEAR, Located, find_origin, move
 from planner_jax.core.rules import Field, Table, require_sound
 from planner_jax.cost.extras import Extra, for_batch
 from planner_jax.robot.quadrotor import QuadrotorLimits
@@ -24,7 +25,8 @@ from planner_jax.task.hit.spec import DRAG, START
 RULES: Table = (
     Field("ball.pos", (3,)),
     Field("ball.vel", (3,)),
-    Field("head_state", (4, 3)),
+    Field("head_state", (4, 3), NEAR),
+    Field("origin", (2,)),
     Field("target", (3,)),
     Field("drag", (), rules.NOT_NEGATIVE),
     Field("gravity", (), rules.POSITIVE),
@@ -56,13 +58,15 @@ class HitLimits:
 
 
 @struct.dataclass
-class HitCase:
+class HitCase(Located):
     """One hit to plan, or a batch: a quadrotor has to hit a flying ball to a target with a racket.
 
-    Every number is a leaf of the pytree. Time 0 is when planning starts.
+    Every number is a leaf of the pytree. Time 0 is when planning starts. Positions are relative to
+    `origin`.
     """
 
     rules: ClassVar[Table] = RULES
+    positions: ClassVar[dict] = {"ball": (), "head_state": (0,)}
 
     ball: BallState  # position and velocity of the ball at time 0
     head_state: Array  # (4, 3) position, velocity, acceleration, jerk of the quadrotor at time 0
@@ -104,6 +108,7 @@ def case(
     min_apex=2.2,
     max_apex=6.2,
     extras: Sequence[Extra] = (),
+    origin=None,
     dtype=jnp.float32,
 ) -> HitCase:
     """Make one case of a hit, or a batch; defaults are the numbers of [Yu2023bat, Section VI-A].
@@ -131,6 +136,9 @@ def case(
         max_apex: [m], greatest apex of the returned ball.
         extras: further constraints and costs such as `pj.KeepOut`. Their leaves have the batch's
             axes, or no batch axes if all cases share them.
+        origin: (2,) x, y [m], world position that is subtracted from all positions in float64, by
+            default the multiple of 100 m next to the first start. Positions that are passed in
+            float64 are thus exact anywhere. Extras whose class has no `positions` are not moved.
         dtype: type of every floating leaf.
 
     Returns:
@@ -143,14 +151,18 @@ def case(
     """
     dtype, batch = floating(dtype), batch_of("ball_pos", ball_pos, 3)
     tool = quadrotor.require_tool(robot, RACKET)
+    shift = find_origin(start, origin, batch, dtype)
+    near = functools.partial(move, by=None if shift is None else -shift, dtype=dtype)
 
     leaf = functools.partial(array_of, batch=batch, dtype=dtype)
     racket_height = tool.height if racket_height is None else racket_height
     racket_radius = tool.radius if racket_radius is None else racket_radius
     cases = HitCase(
-        ball=BallState(pos=leaf("ball_pos", ball_pos, 3), vel=leaf("ball_vel", ball_vel, 3)),
-        head_state=quadrotor.hover_at(start, batch, dtype),
-        target=leaf("target", target, 3),
+        ball=BallState(
+            pos=leaf("ball_pos", near("ball_pos", ball_pos), 3), vel=leaf("ball_vel", ball_vel, 3)
+        ),
+        head_state=quadrotor.hover_at(near("start", start), batch, dtype),
+        target=leaf("target", near("target", target), 3),
         drag=leaf("drag", drag),
         gravity=leaf("gravity", gravity),
         restitution=leaf("restitution", tool.restitution if restitution is None else restitution),
@@ -170,8 +182,9 @@ def case(
             min_apex=leaf("min_apex", min_apex),
             max_apex=leaf("max_apex", max_apex),
         ),
-        extras=for_batch(extras, batch, dtype),
+        extras=for_batch(near("extras", extras, is_strict=origin is None), batch, dtype),
         racket_radius=leaf("racket_radius", racket_radius),
+        origin=None if shift is None else leaf("origin", shift, 2),
     )
     require_sound(cases, _ARGUMENTS)
     quadrotor.require_start(cases)

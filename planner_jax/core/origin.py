@@ -1,0 +1,162 @@
+"""Positions relative to the origin of a case, which float32 represents exactly enough anywhere.
+
+The function `case` of hits and catches subtracts the origin from all positions in float64, before
+they are rounded to float32. Planners and referees then compute near (0, 0). Samples, exports and
+`replan` add or subtract the origin in float64 on the host.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import ClassVar, TypeVar
+
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax import Array
+from jax.typing import DTypeLike
+from jaxtyping import PyTree
+
+from planner_jax.core.arithmetic import Numbers
+from planner_jax.core.checks import numbers_of, numeric
+from planner_jax.core.errors import ArgumentError
+from planner_jax.core.rules import Rule
+
+TreeT = TypeVar("TreeT")
+
+_DIGITS = -2  # origins are multiples of 100 m, which float32 represents exactly
+ROUNDING = 1.2e-3  # [m], greatest rounding error of a position
+
+# Positions in float32 must be within 10 km of the origin. In float64 the bound is 5e9 km.
+NEAR = Rule(
+    "within 10 km of the case's origin in float32",
+    lambda value, part: abs(value) * jnp.finfo(value.dtype).eps <= ROUNDING,
+)
+
+
+@struct.dataclass
+class Located:
+    """A case or a plan, or a batch, whose positions are relative to an origin in the world."""
+
+    positions: ClassVar[dict] = {}  # for `move`, of the arguments of `replan`
+
+    origin: Array | None = struct.field(default=None, kw_only=True)  # (2,) x, y [m]; None: (0, 0)
+
+
+def find_origin(
+    start: object, origin: object, batch: tuple[int, ...], dtype: DTypeLike
+) -> np.ndarray | None:
+    """Return the origin (2,) float64 [m] of a case or batch; None for (0, 0).
+
+    By default it is the multiple of 100 m next to the first position `start`.
+    """
+    first = numbers_of("start", start, batch, (3,)).reshape(-1, 3)[0, :2].astype(np.float64)
+    if origin is not None:
+        first = numbers_of("origin", origin, (), (2,)).astype(np.float64)
+        if not (first == first.astype(dtype)).all():
+            rule = f"exact in {np.dtype(dtype)}, such as a multiple of 100 m"
+            raise ArgumentError("origin", rule, origin)
+    elif np.isfinite(first).all():
+        first = np.round(first, _DIGITS)
+    return first if np.isfinite(first).all() and first.any() else None
+
+
+def move(
+    name: str,
+    value: PyTree,
+    by: np.ndarray | None,
+    dtype: DTypeLike,
+    index: tuple[int, ...] = (),
+    *,
+    is_strict: bool = False,
+) -> PyTree:
+    """Return positions moved by the vectors `by` (..., 2) [m], added in float64; None: unchanged.
+
+    Args:
+        name: name of the argument, for errors.
+        value: array of positions (..., 3), or an object whose class has `positions`: a dict of the
+            names of its fields with positions, and the index of the position in each of them.
+        by: (2,), or (B, 2) for a batch whose axis the positions have.
+        dtype: type of the moved positions.
+        index: index of the position in the array, such as (0,) in a state (4, 3).
+        is_strict: whether an object without `positions` is an error; otherwise it is not moved.
+
+    Raises:
+        ArgumentError: a class has no `positions`, or the positions have been rounded by over 1 mm.
+    """
+    if by is None:
+        return value
+    if isinstance(value, Sequence) and value and dataclasses.is_dataclass(value[0]):
+        args = by, dtype, index
+        return tuple(
+            move(f"{name}.{k}", each, *args, is_strict=is_strict) for k, each in enumerate(value)
+        )
+    if dataclasses.is_dataclass(value):
+        fields = getattr(type(value), "positions", None)
+        if fields is None and not is_strict:
+            return value
+        if fields is None:
+            rule = "of a class with `positions`, or relative to the argument origin"
+            raise ArgumentError(name, rule, shown=f"a {type(value).__name__}")
+        new = {
+            field: move(f"{name}.{field}", vars(value)[field], by, dtype, at)
+            for field, at in fields.items()
+        }
+        return dataclasses.replace(value, **new)  # type: ignore[type-var]
+    array, axes = numeric(value), by.shape[:-1]
+    if array is None or array.shape[-1:] != (3,) or array.shape[: len(axes)] != axes:
+        return value  # the caller's checks name the argument
+    array = np.asarray(array)
+    if array.dtype.kind == "f":
+        rounding = float(jnp.finfo(array.dtype).eps) * np.abs(array).max(initial=0.0)
+        if rounding > ROUNDING:
+            rule = f"in float64 NumPy arrays, as {array.dtype} rounds them by {rounding:.2g} m"
+            raise ArgumentError(name, rule, shown="")
+    return jnp.asarray(_add(array, by, index).astype(dtype))
+
+
+def _add(values: np.ndarray, by: np.ndarray, index: tuple[int, ...] = ()) -> np.ndarray:
+    moved = values.astype(np.float64)
+    part = moved[(..., *index, slice(by.shape[-1]))]
+    part += by.reshape(by.shape[:-1] + (1,) * (part.ndim - by.ndim) + by.shape[-1:])
+    return moved
+
+
+def to_world(positions: Numbers, origin: Numbers | None) -> PyTree:
+    """Return positions (..., 3) plus the origin (2,) or (B, 2) in float64; None: unchanged."""
+    if origin is None:
+        return positions
+    return _add(np.asarray(positions), np.asarray(origin, np.float64))
+
+
+def without_origin(tree: TreeT) -> TreeT:
+    """Return a case or plan without its origin, so that all origins share compiled programs."""
+    if isinstance(tree, Located) and tree.origin is not None:
+        return dataclasses.replace(tree, origin=None)
+    return tree
+
+
+def with_origin(plans: TreeT, cases: object) -> TreeT:
+    """Return plans with the origin of their cases."""
+    if isinstance(plans, Located) and isinstance(cases, Located) and cases.origin is not None:
+        return dataclasses.replace(plans, origin=cases.origin)
+    return plans
+
+
+def split_far(positions: PyTree) -> tuple[PyTree, np.ndarray | None]:
+    """Return float64 NumPy positions minus a multiple of 100 m (2,) near the first, and it.
+
+    Positions within 1 km of the origin, and in other arrays, are returned unchanged, with None.
+    """
+    if not isinstance(positions, np.ndarray) or positions.dtype != np.float64:
+        return positions, None
+    by = np.round(positions.reshape(-1, positions.shape[-1])[0, :2], _DIGITS)
+    is_far = np.isfinite(by).all() and np.abs(by).max() > 1000.0
+    return (_add(positions, -by), by) if is_far else (positions, None)
+
+
+def has_origin(plans: object, cases: object) -> bool:
+    """Return whether plans and cases have the same origin; classes without `Located` do."""
+    if not (isinstance(plans, Located) and isinstance(cases, Located)):
+        return True
+    ours, theirs = (np.zeros(2) if x.origin is None else x.origin for x in (plans, cases))
+    return np.array_equal(ours, theirs)
