@@ -4,7 +4,10 @@ import numpy as np
 import pytest
 
 from planner_jax.core.errors import ArgumentError
+from planner_jax.referee import solids
 from planner_jax.robot.arm_file import irb1600
+from planner_jax.robot.capsule_fit import directions, measure_excess
+from planner_jax.task.block.scene import make_scene
 from planner_jax.task.block.scene_file import read_scene, read_shield, shield_arm
 
 SCENE = """
@@ -16,6 +19,29 @@ floor: -0.4
 outer: [[-1, -1, 0], [1, 1, 2]]
 protected_capsule: {ends: [[0, 0, 1.2], [0, 0, 0.3]], radius: 0.3}
 """
+
+
+SQUARE = "v 0 0 0\nv 2 0 0\nv 2 1 0\nv 0 1 {}\nf 1 2 3\nf 1 3 4\nf 1 4 2\nf 2 4 3\n"
+
+
+def test_a_mesh_of_a_scene_file_is_its_hull_and_inside_the_planners_solids(tmp_path):
+    path = tmp_path / "scene.yaml"
+    (tmp_path / "part.obj").write_text(SQUARE.format(1))
+    path.write_text("meshes: [{file: part.obj, scale: 0.5, position: [0, 0, 3]}]")
+    meshes = read_scene(path).meshes
+    expected = np.array([(0, 0, 3), (0, 0.5, 3.5), (1, 0, 3), (1, 0.5, 3)])
+    hull = np.array(sorted(map(tuple, meshes.corners[0])))
+    np.testing.assert_allclose(hull, expected, atol=1e-6)
+    corners = directions(100) * [1.0, 0.3, 0.2]
+    turn = np.array([0.2, 0.4, -0.1, 0.9])
+    scene = make_scene(meshes=[(corners, 1.0, (0.5, 0.0, 1.0), turn)])
+    points, ends = scene.meshes.corners[0].T, scene.meshes.solids["capsule_ends"]
+    inside = np.zeros(points.shape[1], bool)
+    for (first, second), radius in zip(ends, scene.meshes.solids["capsule_radius"], strict=True):
+        inside |= solids.from_segment(points, first[:, None], second[:, None]) < radius + 1e-6
+    assert inside.all() and len(ends) > 0
+    most, mean = measure_excess(ends, scene.meshes.solids["capsule_radius"], points.T)
+    np.testing.assert_allclose(scene.meshes.excess, [[most, mean]], atol=2e-3)
 
 
 def test_a_scene_file_lists_obstacles_and_the_protected_body(tmp_path):
@@ -49,11 +75,18 @@ def test_a_scene_file_lists_obstacles_and_the_protected_body(tmp_path):
             r"a.yaml: the axis of protected_capsule must be parallel to a coordinate axis; use",
         ),
         ("[1]", "a.yaml must be fields with values"),
+        ("meshes: [{scale: 2}]", r"a.yaml: meshes\[0\] must have the fields file, scale, pos"),
+        ("meshes: [{file: a.stl, scale: 0}]", r"a.yaml: meshes\[0\].scale must be > 0, got 0"),
+        ("meshes: [{file: b.stl}]", r"a.yaml: meshes\[0\] must be an STL, .* got b.stl: .*opening"),
+        ("meshes: [{file: a.yaml}]", r"a.yaml: meshes\[0\] must be .*, got a.yaml: no decoder"),
+        ("meshes: [{file: flat.obj}]", r".*\[0\] must be .* with a volume; .*obj: .*coplanar"),
+        ("meshes: [{file: flat.obj, turn: [0, 0, 0, 0]}]", r"a.yaml: the rotation of meshes\[0\]"),
     ],
 )
 def test_a_wrong_element_of_a_scene_file_is_named(tmp_path, monkeypatch, text, message):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "a.yaml").write_text(text)
+    (tmp_path / "flat.obj").write_text(SQUARE.format(0))
     with pytest.raises(ArgumentError, match=f"^{message}"):
         read_scene("a.yaml")
 

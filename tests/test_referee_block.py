@@ -1,6 +1,7 @@
 """The referee of blocks, an independent check of plans, on motions in closed form."""
 
 import functools
+import itertools
 from typing import Any
 from unittest.mock import Mock
 
@@ -12,7 +13,7 @@ from scipy.optimize import least_squares, lsq_linear
 from scipy.spatial.transform import Rotation
 
 from planner_jax.referee import block, solids
-from planner_jax.referee.arm_clearance import KINDS
+from planner_jax.referee.arm_clearance import KINDS, clearances
 from planner_jax.referee.block import LIMITS, BlockVerdict, referee_blocks, times_inside
 from planner_jax.robot.arm import REGIMES, shield_pose
 from planner_jax.robot.arm_file import irb1600
@@ -450,55 +451,49 @@ def test_overlapping_boxes_are_as_deep_as_the_shortest_way_out():
     assert found == pytest.approx(-(0.1 + np.sqrt(0.5) * 0.3))
 
 
-def nearest_pair(one, other, num=2000):
-    """Return the least distance of two convex sets, given the projections onto them."""
-    point = before = np.zeros(3)
-    for _ in range(num):  # alternating projections
-        point, before = one(other(point)), point
-    return np.linalg.norm(point - other(point)), np.linalg.norm(point - before)
-
-
-def test_distances_from_a_cylinder_are_the_least_over_all_points():
-    rng, tried = np.random.default_rng(2), 0
-    for _ in range(16):
-        first, second, middle = rng.normal(size=(3, 3))
-        turn, half = Rotation.from_rotvec(rng.normal(size=3)).as_matrix(), rng.uniform(0.1, 0.4, 2)
-        length, radius = np.linalg.norm(second - first), rng.uniform(0.05, 0.3)
-        axis = (second - first) / length
-
-        def onto_cylinder(point, first=first, axis=axis, length=length, radius=radius):
-            along = np.clip((point - first) @ axis, 0.0, length)
-            across = point - first - ((point - first) @ axis) * axis
-            return first + along * axis + across * min(1.0, radius / np.linalg.norm(across))
-
-        def onto_plate(point, middle=middle, turn=turn, half=half):
-            inside = (point - middle) @ turn[:, 1:]
-            return middle + turn[:, 1:] @ np.clip(inside, -half, half)
-
-        least, moved = nearest_pair(onto_cylinder, onto_plate)
-        cylinder = first[:, None], second[:, None], np.array([radius])
-        edges = (turn[:, 1:] * half)[..., None]
-        found = solids.rectangle_to_cylinder(middle[:, None], edges, *cylinder)[0]
-        if moved < 1e-10:
-            assert found == pytest.approx(least, abs=1e-6)
-            tried += 1
-        edge = middle + edges[:, 0, 0] - edges[:, 1, 0], middle + edges[:, 0, 0] + edges[:, 1, 0]
-        side = solids.segment_to_cylinder(edge[0][:, None], edge[1][:, None], *cylinder)[0]
-        shares = np.linspace(edge[0], edge[1], 2000)
-        away = [np.linalg.norm(point - onto_cylinder(point)) for point in shares]
-        assert min(away) - 1e-3 < side <= min(away) + 1e-12 and found <= side + 1e-12
-    assert tried > 8
+def test_distances_from_cylinders_and_hulls_are_distances_from_nearly_equal_solids():
+    """A capsule on an axis is a cylinder with half-spheres, a prism a cylinder, a box a mesh."""
+    turn, middle, half = (0.9, 0.1, 0.2, 0.3), (0.7, 0.5, 1.2), np.array([0.1, 0.4, 0.2])
+    corners = np.array([*itertools.product((-1.0, 1.0), repeat=3)])
+    angle = np.linspace(0.0, 2.0 * np.pi, 41)[:-1]
+    rim = 0.1 * np.stack([np.cos(angle), np.sin(angle), np.zeros(40)], axis=1)
+    prism = np.concatenate([rim, rim + [0.0, 0.0, 1.0]])
+    ends, upright = np.array([(0.8, 0.1, 0.5), (0.8, 0.1, 1.5)]), (1.0, 0.0, 0.0, 0.0)
+    rng = np.random.default_rng(0)
+    angles = rng.uniform(-1.0, 1.0, (6, 1, 1)) + 0.8 * rng.uniform(-1.0, 1.0, (6, 1, 40))
+    least = []
+    for obstacles in (
+        {"boxes": [(middle, 2.0 * half, turn)]},
+        {"meshes": [(corners * half, 1.0, middle, turn)]},
+        {"cylinders": [(ends, 0.1)]},
+        {"meshes": [(prism, 1.0, ends[0], upright)]},
+    ):
+        leaves, one = good(scene=make_scene(**obstacles)), np.ones((1, 1), bool)
+        near = [clearances(leaves, ARM, angles[..., [k]], one) for k in range(40)]
+        least.append([float(each["obstacle"][0][0]) for each in near])
+    box, mesh, cylinder, prism = np.array(least)
+    assert min(box) < 0.0 < max(box) and min(cylinder) < 0.0 < max(cylinder)
+    free = box > 0.0  # inside, the depth of a capsule in a box is at most its radius
+    np.testing.assert_allclose(mesh[free], box[free], atol=1e-6)
+    assert np.all(mesh[~free] <= box[~free] + 1e-6)
+    np.testing.assert_allclose(prism, cylinder, atol=5e-4)
 
 
 def test_every_kind_of_obstacle_is_hit_and_named():
     boxes = [((0.0, 2.0, 1.0), (0.2, 0.2, 0.2), (1.0, 0.0, 0.0, 0.0)), (CONTACT, *BOX)]
     rods = [([(2.0, 0.0, 0.0), (2.0, 0.0, 1.0)], 0.1), ([CONTACT - 0.1, CONTACT + 0.1], 0.05)]
     given: dict[str, Any] = {"boxes": boxes, "capsules": rods, "cylinders": rods}
+    points = np.eye(4, 3) - 0.25
+    given["meshes"] = [(points, 0.1, middle, (1.0, 0.0, 0.0, 0.0)) for middle, *_ in boxes]
+    singular = {"boxes": "box", "meshes": "mesh"}
     for kind, some in given.items():
-        scene, name = make_scene(**{kind: some}), kind.removesuffix("s").replace("boxe", "box")
+        scene, name = make_scene(**{kind: some}), singular.get(kind, kind.removesuffix("s"))
         verdict = assert_limit(good(scene=scene), "obstacle")
         assert verdict.failed_part[0].endswith(f" and {name} 2")
     assert_good(good(scene=make_scene(boxes=boxes[:1], capsules=rods[:1], cylinders=rods[:1])))
+    absent = good(scene=make_scene(meshes=given["meshes"]))
+    absent["scene.meshes.corners"][:] = np.nan
+    assert judge(absent).failed_limit[0] == "not finite"
 
 
 def test_a_ball_must_be_within_the_outline_of_the_shield():

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 import planner_jax as pj
 from planner_jax.robot.arm_file import irb1600
@@ -87,8 +88,24 @@ def test_a_motion_through_a_box_is_rejected_by_planner_and_judge():
     case = reach(scene=WALL)
     verdict = pj.reach.judge(case, through)
     assert verdict.failed_limit == "obstacle"
-    assert "and a box are" in verdict.sentence()
+    assert "and box 1 are" in verdict.sentence()
     assert not pj.are_solved(pj.plan(DIRECT, case))
+
+
+def test_a_mesh_is_judged_as_its_hull_and_planned_as_the_box_around_it():
+    through = pj.plan(DIRECT, reach())
+    corners = [(x, y, z) for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)]
+    pose = (0.95, 0.0, 0.9), (0.98, 0.0, 0.0, 0.2)
+    of_box = pj.reach.make_scene(boxes=[(pose[0], (0.3, 0.1, 0.5), pose[1])])
+    of_mesh = pj.reach.make_scene(meshes=[(np.multiply(corners, [0.3, 0.1, 0.5]), 0.5, *pose)])
+    one, two = (pj.reach.judge(reach(scene=scene), through) for scene in (of_box, of_mesh))
+    assert "and mesh 1 are" in two.sentence(0) and not two.success.any()
+    np.testing.assert_allclose(two.obstacle_clearance, one.obstacle_clearance, atol=1e-5)
+    solid = of_mesh.without_meshes()
+    np.testing.assert_allclose(solid.box_middle, of_box.box_middle, atol=1e-6)
+    axes = [Rotation.from_quat(np.roll(s.box_turn[0], -1)).as_matrix() for s in (of_box, solid)]
+    same = np.abs(axes[0].T @ axes[1])  # the edges in another order
+    np.testing.assert_allclose(of_box.box_half[0] @ same, solid.box_half[0], atol=1e-5)
 
 
 def edit(plan, factor=1.0, **offsets):

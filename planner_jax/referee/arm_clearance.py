@@ -13,11 +13,13 @@ plate, the shield, 0.01 m thick. These distances are tested:
 import dataclasses
 from collections.abc import Callable, Sequence
 from functools import partial
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 
 from planner_jax.referee import solids
+from planner_jax.referee.reach import Bodies
 
 KINDS = ("floor", "obstacle", "rig", "base", "self")
 THICKNESS = 0.01  # [m], thickness of the shield's plate
@@ -96,37 +98,6 @@ class _Box:
 
 
 @dataclasses.dataclass(frozen=True)
-class _Cylinder:
-    """A cylinder (an obstacle) in each of B cases."""
-
-    name: str
-    first: np.ndarray  # (3, B, 1) [m], first end of the axis
-    second: np.ndarray  # (3, B, 1) [m], second end of the axis
-    radius: np.ndarray  # (B, 1) [m]
-
-    def distance_to_point(self, point: np.ndarray) -> np.ndarray:
-        return solids.length(solids.from_cylinder(point, self.first, self.second, self.radius))
-
-    def distance_to_capsule(self, other: _Capsule) -> np.ndarray:
-        gap = solids.segment_to_cylinder(
-            other.first, other.second, self.first, self.second, self.radius
-        )
-        return gap - other.radius
-
-    def distance_to_box(self, other: _Box) -> np.ndarray:
-        """Return the distance from the middle plane of a plate, rounded by half its thickness."""
-        edges = other.turn[:, 1:] * other.half[1:]
-        gap = solids.rectangle_to_cylinder(
-            other.middle, edges, self.first, self.second, self.radius
-        )
-        return gap - other.half[0]
-
-    def at(self, lane: np.ndarray, sample: np.ndarray) -> "_Cylinder":
-        first, second = (end[..., lane, 0] for end in (self.first, self.second))
-        return _Cylinder(self.name, first, second, self.radius[lane, 0])
-
-
-@dataclasses.dataclass(frozen=True)
 class _Pair:
     """Two solids, or a solid and the floor, whose distance is tested at S samples of B motions."""
 
@@ -175,8 +146,7 @@ def clearances(case: dict, arm: Any, angles: np.ndarray, sampled: np.ndarray) ->
 
     The distance of overlapping solids is minus the penetration depth. If one solid is a capsule,
     the depth is at most its radius, and for two capsules at most the sum of both radii. Distances
-    at samples are exact. For cylinders, the edges of the shield are rounded: the shield is larger
-    by up to half its thickness.
+    at samples are exact. MuJoCo computes the distances from cylinders and hulls of meshes.
 
     Args:
         case: arrays of B cases.
@@ -206,7 +176,29 @@ def clearances(case: dict, arm: Any, angles: np.ndarray, sampled: np.ndarray) ->
         "base": [_pair(body, part, body.name) for body in off_base for part in base],
         "self": [_pair(a, b, f"{a.name} and {b.name}") for a, b in (*folded, *guarded)],
     }
-    return {kind: _least(pairs[kind], sampled) for kind in KINDS}
+    found = {kind: _least(pairs[kind], sampled) for kind in KINDS}
+    found["obstacle"] = _with_hulls(case, arm, angles, sampled, found["obstacle"])
+    return found
+
+
+def _with_hulls(
+    case: dict, arm: Any, angles: np.ndarray, sampled: np.ndarray, others: tuple
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return `others`, a result of `_least`, or the distance from cylinders and meshes if less."""
+    ends, radius = case["scene.cylinder_ends"], case["scene.cylinder_radius"]
+    hulls = case.get("scene.meshes.corners", radius[:, :0])
+    least, at, part = others[0], others[1], others[2].astype("<U64")
+    for k in range(len(least) if radius.shape[1] + hulls.shape[1] else 0):
+        own = {name[4:]: leaf[k] for name, leaf in case.items() if name.startswith("arm.")}
+        known = [leaf for name, leaf in own.items() if name not in ("lower", "upper")]
+        if not all(np.isfinite(leaf).all() for leaf in (*known, ends[k], radius[k], hulls[k])):
+            continue  # the plan fails as "not finite"
+        bodies = Bodies(SimpleNamespace(**vars(arm) | own), ends[k], radius[k], hulls[k])
+        index = np.flatnonzero(sampled[k])
+        gap, sample, name = bodies.clearances(angles[:, k, index].T)["obstacle"]
+        if gap < least[k]:
+            least[k], at[k], part[k] = gap, index[sample], name
+    return least, at, part
 
 
 def _arm(case: dict, links: Sequence, angles: np.ndarray) -> tuple[list[_Capsule], _Box]:
@@ -257,16 +249,13 @@ def _rods(case: dict, kind: str) -> list[_Capsule]:
     return rods
 
 
-def _obstacles(case: dict) -> list["_Capsule | _Box | _Cylinder"]:
-    solids: list[_Capsule | _Box | _Cylinder] = [*_rods(case, "capsule")]
+def _obstacles(case: dict) -> list[_Capsule | _Box]:
+    solids: list[_Capsule | _Box] = [*_rods(case, "capsule")]
     for k in range(case["scene.box_half"].shape[1]):
         middle, turn, half = (
             case[f"scene.box_{name}"][:, k].T[..., None] for name in ("middle", "turn", "half")
         )
         solids.append(_Box(f"box {k + 1}", middle, _rotation(turn), half))
-    for k, radius in enumerate(case["scene.cylinder_radius"].T):
-        first, second = case["scene.cylinder_ends"][:, k].transpose(1, 2, 0)[..., None]
-        solids.append(_Cylinder(f"cylinder {k + 1}", first, second, radius[:, None]))
     return solids
 
 
@@ -276,7 +265,7 @@ def _base_box(case: dict) -> _Box:
     return _Box("the base", 0.5 * (lower + upper), turn, 0.5 * (upper - lower))
 
 
-def _pair(one: _Capsule | _Box, other: _Capsule | _Box | _Cylinder, name: str) -> _Pair:
+def _pair(one: _Capsule | _Box, other: _Capsule | _Box, name: str) -> _Pair:
 
     def exact(lane: np.ndarray, sample: np.ndarray) -> np.ndarray:
         return _distance(one.at(lane, sample), other.at(lane, sample))
@@ -284,14 +273,11 @@ def _pair(one: _Capsule | _Box, other: _Capsule | _Box | _Cylinder, name: str) -
     return _Pair(name, other.distance_to_point(one.middle) - one.reach, exact)
 
 
-def _distance(one: _Capsule | _Box, other: _Capsule | _Box | _Cylinder) -> np.ndarray:
+def _distance(one: _Capsule | _Box, other: _Capsule | _Box) -> np.ndarray:
     if isinstance(one, _Capsule):
         return other.distance_to_capsule(one)
-    return (
-        one.distance_to_capsule(other)
-        if isinstance(other, _Capsule)
-        else other.distance_to_box(one)
-    )
+    is_capsule = isinstance(other, _Capsule)
+    return one.distance_to_capsule(other) if is_capsule else other.distance_to_box(one)
 
 
 def _least(pairs: list[_Pair], sampled: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

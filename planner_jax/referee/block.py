@@ -172,6 +172,8 @@ def _read(cases, plans) -> dict[str, np.ndarray]:
     for kind, parts in _OBSTACLES.items():
         num_solids = (*np.shape(getattr(cases.scene, f"{kind}_{[*parts][-1]}")), 0, 0)[1]
         shapes |= {f"scene.{kind}_{name}": (num_solids, *of) for name, of in parts.items()}
+    if meshes := getattr(cases.scene, "meshes", None):
+        shapes["scene.meshes.corners"] = np.shape(meshes.corners)[1:]
     leaves = {"plan.motion.coeffs": coeffs} | judging.read_leaves(cases, shapes, num_lanes)
     of_plan = {"motion.durations": coeffs.shape[1:2], "contact_time": ()}
     leaves |= judging.read_leaves(plans, of_plan, num_lanes, "plan.")

@@ -79,7 +79,6 @@ def referee_reaches(
 
     Raises:
         ValueError: a leaf has the wrong shape.
-        ModuleNotFoundError: MuJoCo is not installed.
     """
     coeffs = np.asarray(plans.motion.coeffs, float)
     durations = np.asarray(plans.motion.durations, float)
@@ -119,7 +118,8 @@ class _Lane:
         value = getattr(self._tree, name)
         if dataclasses.is_dataclass(value):
             return _Lane(value, self._k)
-        return value if isinstance(value, tuple) else np.asarray(value, float)[self._k]
+        is_whole = value is None or isinstance(value, tuple)
+        return value if is_whole else np.asarray(value, float)[self._k]
 
 
 def _judge(
@@ -191,19 +191,27 @@ def _judge(
     number = np.arange(len(piece)) - np.repeat(np.cumsum(count) - count, count)
     time = np.append(begins[piece] + number / count[piece] * durations[piece], total)
     samples = state(time, np.append(piece, len(index) - 1), 0)
-    for kind, (least, at, part) in _Bodies(case).clearances(samples).items():
+    scene, hulls = case.scene, () if case.scene.meshes is None else case.scene.meshes.corners
+    bodies = Bodies(case.arm, scene.cylinder_ends, scene.cylinder_radius, hulls, scene)
+    for kind, (least, at, part) in bodies.clearances(samples).items():
         measured[f"{kind}_clearance"] = least
         tests[kind], parts[kind] = (-least > contact, -least, float(time[at])), part
     return tests, parts, measured, True
 
 
-class _Bodies:
-    """A MuJoCo model of one case's arm and obstacles, and the pairs that must not touch."""
+class Bodies:
+    """A MuJoCo model of an arm and obstacles, and the pairs that must not touch."""
 
-    def __init__(self, case: _Lane) -> None:
-        mujoco: Any = importlib.import_module("mujoco")  # only this referee needs it
+    def __init__(
+        self, arm: Any, ends: np.ndarray, radius: np.ndarray, hulls: Any, scene: Any = None
+    ) -> None:
+        """Make a model of an arm, cylinders, hulls of K meshes (K, V, 3) [m], and a scene's rest.
+
+        The cylinders' axes have the ends (L, 2, 3) [m], and their radii are (L,) [m].
+        """
+        mujoco: Any = importlib.import_module("mujoco")  # slow to import
         self._mujoco = mujoco
-        spec, arm = mujoco.MjSpec(), case.arm
+        spec = mujoco.MjSpec()
         kinds = mujoco.mjtGeom
         self._names: list[str] = []
         body, links = spec.worldbody, []
@@ -225,11 +233,14 @@ class _Bodies:
             size = [radius, 0.0, 0.0]
             return add(name, body, kinds.mjGEOM_CAPSULE, fromto=ends.ravel(), size=size)
 
-        def add_box(name: str, body, middle: np.ndarray, turn: np.ndarray, half: np.ndarray) -> int:
+        def add_hull(name: str, body, corners: np.ndarray, **pose) -> int:
             mesh = f"mesh {len(self._names)}"
-            corners = np.array(list(itertools.product((-1.0, 1.0), repeat=3))) * half
             spec.add_mesh(name=mesh, uservert=corners.ravel())
-            return add(name, body, kinds.mjGEOM_MESH, meshname=mesh, pos=middle, quat=turn)
+            return add(name, body, kinds.mjGEOM_MESH, meshname=mesh, **pose)
+
+        def add_box(name: str, body, middle: np.ndarray, turn: np.ndarray, half: np.ndarray) -> int:
+            corners = np.array(list(itertools.product((-1.0, 1.0), repeat=3))) * half
+            return add_hull(name, body, corners, pos=middle, quat=turn)
 
         shapes = zip(arm.capsule_link, arm.capsule_ends, arm.capsule_radius, strict=True)
         capsules = [
@@ -255,22 +266,26 @@ class _Bodies:
             box = 0.5 * (lower + upper), upright, 0.5 * (upper - lower)
             base = add_box("the base", links[-1], *box)
             own += [(k, base) for k in based]
-        scene = case.scene
-        rods = [*zip(scene.capsule_ends, scene.capsule_radius, strict=True)]
-        rods += zip(scene.beam_ends, scene.beam_radius, strict=True)
-        fixed = [add_capsule("a capsule", links[-1], *rod) for rod in rods if rod[1] >= 0.0]
-        solids = zip(scene.box_middle, scene.box_turn, scene.box_half, strict=True)
-        fixed += [add_box("a box", links[-1], *solid) for solid in solids]
-        for ends, radius in zip(scene.cylinder_ends, scene.cylinder_radius, strict=True):
-            size = [radius, 0.0, 0.0]
-            fixed.append(
-                add("a cylinder", links[-1], kinds.mjGEOM_CYLINDER, fromto=ends.ravel(), size=size)
-            )
-        floor = [0.0, 0.0, float(scene.floor)]
-        floor = add("the floor", links[-1], kinds.mjGEOM_PLANE, pos=floor, size=[1.0, 1.0, 1.0])
-        low = [k for k in moving if k not in capsules or arm.capsule_link[k] > 0]
-        pairs = [(k, j) for k in moving for j in fixed] + [(k, floor) for k in low]
-        self._pairs = {"obstacle": np.array(pairs), "self": np.array(own, int).reshape(-1, 2)}
+        fixed = [add_hull(f"mesh {k + 1}", links[-1], hull) for k, hull in enumerate(hulls)]
+        for k, each in enumerate(zip(ends, radius, strict=True), 1):
+            shape = {"fromto": each[0].ravel(), "size": [max(each[1], 1e-9), 0.0, 0.0]}
+            fixed.append(add(f"cylinder {k}", links[-1], kinds.mjGEOM_CYLINDER, **shape))
+        self._pairs, pairs = {}, []
+        if scene is not None:
+            for kind in ("capsule", "beam"):
+                rods = (getattr(scene, f"{kind}_{name}") for name in ("ends", "radius"))
+                rods = enumerate(zip(*rods, strict=True), 1)
+                known = [(f"{kind} {k}", links[-1], *rod) for k, rod in rods if rod[1] >= 0.0]
+                fixed += [add_capsule(*each) for each in known]
+            boxes = zip(scene.box_middle, scene.box_turn, scene.box_half, strict=True)
+            fixed += [add_box(f"box {k}", links[-1], *box) for k, box in enumerate(boxes, 1)]
+            shape = {"pos": [0.0, 0.0, float(scene.floor)], "size": [1.0, 1.0, 1.0]}
+            floor = add("the floor", links[-1], kinds.mjGEOM_PLANE, **shape)
+            low = [k for k in moving if k not in capsules or arm.capsule_link[k] > 0]
+            self._pairs["self"] = np.array(own, int).reshape(-1, 2)
+            pairs = [(k, floor) for k in low]
+        pairs += [(k, j) for k in moving for j in fixed]
+        self._pairs["obstacle"] = np.array(pairs)
         self._model = spec.compile()
         self._data = mujoco.MjData(self._model)
         # MuJoCo numbers the geoms body by body.

@@ -9,7 +9,6 @@ import numpy as np
 
 # Two edges count as parallel if the norm of their unit vectors' cross product is below this number.
 _PARALLEL = 1e-9
-_HALVINGS = 50  # bisections for the point of a segment that is nearest to a cylinder
 
 
 def dot(a: np.ndarray | list, b: np.ndarray | list) -> np.ndarray:
@@ -95,57 +94,6 @@ def from_cylinder(
     off = length(across)
     beyond = height - np.clip(height, -0.5 * span, 0.5 * span)
     return across * np.maximum(1.0 - _ratio(radius, off), 0.0) * (off > 0.0) + beyond * axis
-
-
-def segment_to_cylinder(
-    start: np.ndarray, end: np.ndarray, first: np.ndarray, second: np.ndarray, radius: np.ndarray
-) -> np.ndarray:
-    """Return the distances (...) [m] of segments `start` to `end` from cylinders; 0 if they meet.
-
-    The squared distance is convex along a segment. Bisection finds the zero of its derivative.
-    """
-    span = end - start
-    low = np.zeros(np.broadcast_shapes(span.shape, first.shape)[1:])
-    high = np.ones_like(low)
-    for _ in range(_HALVINGS):
-        share = 0.5 * (low + high)
-        slope = dot(from_cylinder(start + share * span, first, second, radius), span)
-        low, high = np.where(slope < 0.0, share, low), np.where(slope < 0.0, high, share)
-    return length(from_cylinder(start + 0.5 * (low + high) * span, first, second, radius))
-
-
-def rectangle_to_cylinder(
-    middle: np.ndarray, edges: np.ndarray, first: np.ndarray, second: np.ndarray, radius: np.ndarray
-) -> np.ndarray:
-    """Return the distances (...) [m] of rectangles from cylinders; 0 if they meet.
-
-    The nearest point of the rectangle is on one of its edges, or its inside is nearest to the point
-    of the cylinder that lies farthest in the direction of the rectangle's plane. A cylinder that
-    meets the rectangle meets an edge, or its axis or rim crosses the plane within the rectangle.
-
-    Args:
-        middle: (3, ...) [m], middles of the rectangles.
-        edges: (3, 2, ...) [m], vectors along the edges, half as long as an edge, at right angles.
-        first: (3, ...) [m], first ends of the cylinders' axes.
-        second: (3, ...) [m], second ends of the axes.
-        radius: (...) [m], radii of the cylinders.
-    """
-    sides = []
-    for one, other in ((edges[:, 0], edges[:, 1]), (edges[:, 1], edges[:, 0])):
-        for start in (middle + one - other, middle - one - other):
-            end = start + 2.0 * other
-            sides.append(segment_to_cylinder(start, end, first, second, radius))
-    half = length(edges)
-    along = edges / half
-    normal = np.cross(along[:, 0], along[:, 1], axis=0)
-    # The points of the cylinder farthest along the normal and against it are  centre +- reach.
-    axis, centre = 0.5 * (second - first), 0.5 * (first + second) - middle
-    across = normal - axis * (dot(normal, axis) / dot(axis, axis))
-    reach = np.sign(dot(normal, axis)) * axis + across * _ratio(radius, length(across))
-    share = np.clip(-_ratio(dot(normal, centre), dot(normal, reach)), -1.0, 1.0)
-    point = centre + share * reach
-    beside = [np.maximum(np.abs(dot(along[:, k], point)) - half[k], 0.0) for k in range(2)]
-    return np.minimum.reduce([*sides, length([*beside, dot(normal, point)])])
 
 
 def between_boxes(

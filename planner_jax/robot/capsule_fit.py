@@ -1,13 +1,18 @@
-"""Capsules that enclose convex bodies, fitted so that they are hardly larger than the bodies."""
+"""Capsules and boxes that enclose convex bodies and are hardly larger, and hulls of meshes."""
 
 import functools
+import importlib
 import itertools
 import math
-from typing import NamedTuple
+import os
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.optimize import minimize
-from scipy.spatial import ConvexHull
+from scipy.spatial import ConvexHull, QhullError
+
+from planner_jax.core.errors import ArgumentError
 
 # [m]: one more capsule is used if it reduces the mean excess by at least this length.
 _WORTH = 0.002
@@ -51,6 +56,46 @@ def _cover(content: bytes, most: int) -> Cover:
         fitted = np.stack(ends), np.array(radius)
         covers.append(Cover(*fitted, *measure_excess(*fitted, corners)))
     return min(covers, key=lambda each: each.mean + _WORTH * len(each.radius))
+
+
+def enclosing_box(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return middle (3,) [m], rotation (3, 3) and half edges (3,) [m] of a box around V points.
+
+    The rotation maps the frame of the box to the frame of the points (V, 3) [m]. The edges are
+    parallel to the coordinate axes or to the principal axes of the points, whichever edges are
+    shorter.
+    """
+    boxes = []
+    for axes in (np.eye(3), _principal_axes(points)):
+        axes = axes * np.linalg.det(axes)  # right-handed
+        low, high = np.min(points @ axes.T, axis=0), np.max(points @ axes.T, axis=0)
+        boxes.append((0.5 * (low + high) @ axes, axes.T, 0.5 * (high - low) + _ROUNDING))
+    return min(boxes, key=lambda box: np.sum(box[2]))
+
+
+def hull_of(mesh: str | os.PathLike | ArrayLike, scale: float, name: str) -> np.ndarray:
+    """Return the corners (V, 3) [m] of the convex hull of a mesh.
+
+    The mesh is an STL, OBJ or MSH file, which MuJoCo reads, or points (N, 3). Its unit of length is
+    `scale` [m]. An `ArgumentError` calls the mesh `name`.
+    """
+    points, shown = mesh, ""
+    try:
+        if isinstance(mesh, str | os.PathLike):
+            shown = f"{os.fspath(mesh)}: "
+            mujoco: Any = importlib.import_module("mujoco")  # slow to import
+            spec, turn = mujoco.MjSpec(), np.zeros(9)
+            read = spec.add_mesh(name="mesh", file=os.fspath(mesh))
+            read.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
+            model = spec.compile()
+            mujoco.mju_quat2Mat(turn, model.mesh_quat[0])  # MuJoCo moves a mesh to its centre
+            points = model.mesh_vert @ turn.reshape(3, 3).T + model.mesh_pos[0]
+        points = scale * np.reshape(np.asarray(points, float), (-1, 3))
+        return points[ConvexHull(points).vertices]
+    except (ValueError, QhullError) as error:
+        reason = str(error).removeprefix("Error: ").partition("\n")[0]
+        rule = "an STL, OBJ or MSH file of a mesh with a volume; correct the path or the mesh"
+        raise ArgumentError(name, rule, shown=shown + reason) from None
 
 
 def measure_excess(ends: np.ndarray, radius: np.ndarray, points: np.ndarray) -> tuple[float, float]:

@@ -39,6 +39,12 @@ class SingleBlock(Single[SingleBlockSettings]):
         lines = super().describe(answer)
         if not answer.success:
             lines.insert(1, f"Prospects: {prospects(answer.case).sentence()}.")
+        meshes = answer.case.scene.meshes
+        for k, (most, mean) in enumerate([] if meshes is None else 1e3 * meshes.excess, 1):
+            lines.append(
+                f"The planner's solids around mesh {k} exceed its hull by {most:.1f} mm at "
+                f"most, {mean:.1f} mm on average."
+            )
         return lines
 
     def task_margins(self, answer: Answer) -> list[Margin]:

@@ -1,8 +1,9 @@
 """Distances of an arm and its shield from obstacles, and between the arm's own links.
 
 The links are represented by capsules, and the shield by a plate of 0.01 m with rounded edges. The
-obstacles are capsules, boxes and cylinders of the scene, the rig's beams, the floor, the base and
-other links. The arm states which of its bodies must not touch each other.
+obstacles are capsules, boxes and cylinders of the scene, which also enclose its meshes, the rig's
+beams, the floor, the base and other links. The arm states which of its bodies must not touch each
+other.
 
 The functions process N poses of the arm at once. N is the last axis of arrays, so that a processor
 works on several poses with one instruction.
@@ -47,7 +48,7 @@ def clearances(arm: Arm, scene: Scene, angles: Array) -> Array:
     if the bodies overlap. The first `num_of_obstacles(arm, scene)` of the R rows are distances from
     capsules, boxes and cylinders of the scene.
     """
-    every = _pairs(arm, scene, _poses(arm, angles))
+    every = _pairs(arm, scene.without_meshes(), _poses(arm, angles))
     return jnp.concatenate([pairs.measure(*pairs.bodies) - pairs.thick for pairs in every])
 
 
@@ -66,7 +67,7 @@ def clearances_and_slopes(
     moves both bodies of a pair as one is zero.
     """
     poses = _poses(arm, angles)
-    every = _pairs(arm, scene, poses)
+    every = _pairs(arm, scene.without_meshes(), poses)
     found = [space.nearest_points(pairs.measure, *pairs.bodies) for pairs in every]
     distances = [each - pairs.thick for (each, _), pairs in zip(found, every, strict=True)]
     joint = np.arange(arm.num)[:, None]
@@ -94,6 +95,7 @@ def clearances_and_slopes(
 
 def num_of_obstacles(arm: Arm, scene: Scene) -> int:
     """Return the number of pairs of a link or the shield, and a part of a scene's obstacle."""
+    scene = scene.without_meshes()
     solids = (scene.capsule_radius, scene.box_half, scene.cylinder_radius)
     rods, boxes, cylinders = (len(each) for each in solids)
     # The shield has pairs with capsules, axes of cylinders, and the 12 edges of each box. Each box

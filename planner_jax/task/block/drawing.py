@@ -103,7 +103,8 @@ def _obstacle_points(scene: Scene) -> list[np.ndarray]:
     """Return points (V, 3) [m] for each obstacle, whose convex hull is the obstacle."""
     spread = directions(400)
     rods = zip(scene.capsule_ends, scene.capsule_radius, strict=True)
-    found = [
+    found = [] if scene.meshes is None else [*scene.meshes.corners]
+    found += [
         (ends[:, None] + radius * spread).reshape(-1, 3) for ends, radius in rods if radius >= 0
     ]
     signs = np.array([*itertools.product((-1.0, 1.0), repeat=3)])

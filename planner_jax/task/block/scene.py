@@ -1,19 +1,24 @@
 """The box that the arm protects, and obstacles, in the robot's base frame [Natarajan2024]."""
 
 import dataclasses
+import itertools
+import os
 from collections.abc import Sequence
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jax import Array, lax
 from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
 
 from planner_jax.ball.flight import BallState, drag_free_fall_time, drag_free_flight
 from planner_jax.core import rules
 from planner_jax.core.arithmetic import host_leaf
 from planner_jax.core.choices import require
 from planner_jax.core.rules import Field, Table
+from planner_jax.robot.capsule_fit import cover, enclosing_box, hull_of, measure_excess
 
 INNER_HALF, INNER_HEIGHT = 0.4, 1.35  # [m], half side and height of the protected box
 OUTER_HALF, OUTER_HEIGHT = 1.0, 1.85  # [m], half side and height of the box where balls are met
@@ -42,6 +47,7 @@ RULES: Table = (
     Field("scene.box_half", ("M", 3), rules.NOT_NEGATIVE),
     Field("scene.cylinder_ends", ("L", 2, 3)),
     Field("scene.cylinder_radius", ("L",), rules.NOT_NEGATIVE),
+    Field("scene.meshes.corners", ("K", "V", 3)),
 )
 
 
@@ -51,6 +57,17 @@ class Box:
 
     lower: Array  # (3,) [m], least coordinates
     upper: Array  # (3,) [m], greatest coordinates
+
+
+@struct.dataclass
+class Meshes:
+    """Convex hulls of meshes, and the capsules and boxes by which the planner encloses them."""
+
+    corners: Array  # (K, V, 3) [m], corners of the hulls; the last corner may be repeated
+    # (K, 2) [m], greatest distance of the enclosing solids' points from the hull, and how much
+    # farther the solids reach than the hull, as a mean over all directions
+    excess: Array
+    solids: dict[str, Array]  # enclosing solids, as fields of `Scene`
 
 
 @struct.dataclass
@@ -72,6 +89,15 @@ class Scene:
     box_half: Array  # (M, 3) [m], halves of the boxes' edges
     cylinder_ends: Array  # (L, 2, 3) [m], ends of the cylinders' axes
     cylinder_radius: Array  # (L,) [m]
+    meshes: Meshes | None = None
+
+    def without_meshes(self) -> "Scene":
+        """Return the scene with the solids that enclose meshes instead of the meshes."""
+        if self.meshes is None:
+            return self
+        solids = self.meshes.solids.items()
+        joined = {name: jnp.concatenate([getattr(self, name), own]) for name, own in solids}
+        return dataclasses.replace(self, meshes=None, **joined)
 
 
 def paper_scene(*, has_pole: bool = True, pole: Sequence[float] = POLE, size: float = 1.0) -> Scene:
@@ -97,16 +123,16 @@ def paper_scene(*, has_pole: bool = True, pole: Sequence[float] = POLE, size: fl
             pair[:, along] = -0.5 * RIG_LENGTH, 0.5 * RIG_LENGTH
             pair[:, 1 - along] = side
             ends.append(pair)
+    axis = size * np.array([[*pole, FLOOR], [*pole, POLE_TOP]])
+    rods = [(axis, size * (POLE_RADIUS if has_pole else ABSENT))]
     return Scene(
         inner=box(INNER_HALF, INNER_HEIGHT),
         inner_radius=leaf(0.0),
         outer=box(OUTER_HALF, OUTER_HEIGHT),
-        capsule_ends=leaf([[[*pole, FLOOR], [*pole, POLE_TOP]]]),
-        capsule_radius=leaf([POLE_RADIUS if has_pole else ABSENT]),
         floor=leaf(FLOOR),
         beam_ends=leaf(ends),
         beam_radius=leaf(np.full(4, RIG_RADIUS)),
-        **_solids((), ()),
+        **_solids(rods, (), ()),
     )
 
 
@@ -116,6 +142,7 @@ def make_scene(
     spheres: Sequence[tuple[ArrayLike, float]] = (),
     capsules: Sequence[tuple[ArrayLike, float]] = (),
     cylinders: Sequence[tuple[ArrayLike, float]] = (),
+    meshes: Sequence[tuple[str | os.PathLike | ArrayLike, float, ArrayLike, ArrayLike]] = (),
     floor: float = -100.0,
     protected_box: ArrayLike | None = None,
     protected_capsule: tuple[ArrayLike, float] | None = None,
@@ -131,6 +158,10 @@ def make_scene(
         spheres: for each sphere its middle (3,) [m] and its radius [m].
         capsules: for each capsule the ends of its axis (2, 3) [m] and its radius [m].
         cylinders: for each cylinder the different ends of its axis (2, 3) [m] and its radius [m].
+        meshes: for each mesh its STL, OBJ or MSH file or its points (N, 3), its unit of length [m],
+            the position (3,) [m] of its origin, and its rotation as a quaternion w, x, y, z != 0.
+            The obstacle is the mesh's convex hull. The planner encloses the hull by a box or by
+            capsules, whichever exceed the hull less: see `Scene.meshes.excess`.
         floor: [m], height of the floor.
         protected_box: lowest and highest corner [m] of the box that blocks protect; by default the
             box of [Natarajan2024].
@@ -161,21 +192,46 @@ def make_scene(
         inner=box(body, paper.inner),
         inner_radius=host_leaf(0.0 if capsule is None else capsule[1], np.float32),
         outer=box(outer, paper.outer),
-        capsule_ends=host_leaf([ends for ends, _ in rounded], np.float32).reshape(-1, 2, 3),
-        capsule_radius=host_leaf([radius for _, radius in rounded], np.float32),
         floor=host_leaf(floor, np.float32),
         beam_ends=paper.beam_ends[:0],
         beam_radius=paper.beam_radius[:0],
-        **_solids(boxes, cylinders),
+        **_solids(rounded, boxes, cylinders),
+        meshes=_enclose(meshes) if meshes else None,
     )
 
 
-def _solids(boxes: Sequence, cylinders: Sequence) -> dict[str, Array]:
+def _enclose(meshes: Sequence) -> Meshes:
+    hulls, excess, capsules, boxes = [], [], [], []
+    for k, (mesh, scale, position, turn) in enumerate(meshes):
+        require(bool(np.any(turn)), f"the rotation of meshes[{k}]", "a quaternion != 0", turn)
+        own = hull_of(mesh, float(scale), f"meshes[{k}]")
+        rotation = Rotation.from_quat(np.roll(turn, -1))
+        middle, axes, half = enclosing_box(own)
+        corners = middle + [*itertools.product((-1.0, 1.0), repeat=3)] * half @ axes.T
+        of_box = measure_excess(corners.reshape(4, 2, 3), np.zeros(4), own)
+        fitted = cover(own, most=4)
+        if is_boxed := of_box[1] <= fitted.mean:
+            turn = np.roll((rotation * Rotation.from_matrix(axes)).as_quat(), 1)
+            boxes.append((rotation.apply(middle) + position, 2.0 * half, turn))
+        else:
+            ends = [rotation.apply(each) + position for each in fitted.ends]
+            capsules += zip(ends, fitted.radius, strict=True)
+        hulls.append(rotation.apply(own) + position)
+        excess.append(of_box if is_boxed else fitted[2:])
+    most = max(map(len, hulls))
+    corners = [np.pad(hull, ((0, most - len(hull)), (0, 0)), "edge") for hull in hulls]
+    leaves = host_leaf(corners, np.float32), host_leaf(excess, np.float32)
+    return Meshes(*leaves, _solids(capsules, boxes, ()))
+
+
+def _solids(rods: Sequence, boxes: Sequence, cylinders: Sequence) -> dict[str, Any]:
     def column(solids: Sequence, k: int, *shape: int) -> np.ndarray:
         return np.reshape([solid[k] for solid in solids], (-1, *shape)).astype(np.float32)
 
     turn = column(boxes, 2, 4)
     leaves = {
+        "capsule_ends": column(rods, 0, 2, 3),
+        "capsule_radius": column(rods, 1),
         "box_middle": column(boxes, 0, 3),
         "box_turn": turn / np.linalg.norm(turn, axis=1, keepdims=True),
         "box_half": 0.5 * column(boxes, 1, 3),

@@ -15,12 +15,14 @@ from planner_jax.robot.arm_file import Shield, irb1600, read_shield_arm
 from planner_jax.task.block.scene import Scene, make_scene
 
 _ROD = {"ends": (2, 3), "radius": ()}
-# Fields of an element of each list of obstacles in a file, with their shapes.
-_KINDS: dict[str, dict[str, tuple[int, ...]]] = {
+_USUAL = {"turn": [1.0, 0.0, 0.0, 0.0], "scale": 1.0, "position": [0.0, 0.0, 0.0]}
+# Fields of an element of each list of obstacles in a file, with their shapes; None is a file.
+_KINDS: dict[str, dict[str, tuple[int, ...] | None]] = {
     "boxes": {"middle": (3,), "size": (3,), "turn": (4,)},
     "spheres": {"middle": (3,), "radius": ()},
     "capsules": _ROD,
     "cylinders": _ROD,
+    "meshes": {"file": None, "scale": (), "position": (3,), "turn": (4,)},
 }
 _SINGLE: dict[str, tuple[int, ...]] = {"floor": (), "protected_box": (2, 3), "outer": (2, 3)}
 _SHIELD = {"half": (2,), "radius": (), "position": (3,), "turn": (4,), "mass": ()}
@@ -38,7 +40,8 @@ def read_scene(path: str | os.PathLike) -> Scene:
             if not isinstance(value, list):
                 raise ArgumentError(f"{source}: {name}", "a list of obstacles", value)
             places = [f"{source}: {name}[{k}]" for k in range(len(value))]
-            parts = [_element(*each, _KINDS[name]) for each in zip(places, value, strict=True)]
+            folder, of = os.path.dirname(source), _KINDS[name]
+            parts = [_element(*each, of, folder) for each in zip(places, value, strict=True)]
             scene[name] = [tuple(each.values()) for each in parts]
         elif name == "protected_capsule":
             scene[name] = tuple(_element(f"{source}: {name}", value, _ROD).values())
@@ -104,15 +107,18 @@ def _fields(name: str, source: str) -> dict[str, Any]:
         raise ArgumentError(source, str(error).removeprefix("must "), verb="", shown="") from None
 
 
-def _element(place: str, value: Any, shapes: dict[str, tuple[int, ...]]) -> dict[str, np.ndarray]:
-    """Return the numbers of one obstacle's fields; a box without `turn` is not rotated."""
-    if not isinstance(value, dict) or {*value, "turn"} - {*shapes, "turn"}:
+def _element(place: str, value: Any, shapes: dict[str, Any], folder: str = "") -> dict[str, Any]:
+    """Return one obstacle's fields; the path of a file is relative to `folder`."""
+    if not isinstance(value, dict) or {*value} - {*shapes} or "file" in {*shapes} - {*value}:
         raise ArgumentError(place, f"the fields {', '.join(shapes)}", value, verb="have")
-    usual = {"turn": [1.0, 0.0, 0.0, 0.0]}
-    found = {}
+    found: dict[str, Any] = {}
     for name, shape in shapes.items():
-        found[name] = _numbers(f"{place}.{name}", value.get(name, usual.get(name)), shape)
-    name = "radius" if "radius" in found else "size"
+        own = value.get(name, _USUAL.get(name))
+        is_file = shape is None
+        found[name] = (
+            os.path.join(folder, str(own)) if is_file else _numbers(f"{place}.{name}", own, shape)
+        )
+    name = next(each for each in ("radius", "size", "scale") if each in found)
     if not np.all(found[name] > 0.0):
         raise ArgumentError(f"{place}.{name}", "> 0", value[name])
     if "cylinders" in place and np.array_equal(*found["ends"]):

@@ -166,7 +166,7 @@ def _is_valid(
 
 def _gaps(scene: Scene, path: np.ndarray) -> np.ndarray:
     """Return the distances (K, N) [m] of points (N, 3) from the K obstacles of a scene."""
-    point = path.T
+    point, scene = path.T, scene.without_meshes()
 
     def ends_of(rods: tuple) -> Iterator[tuple]:
         for ends, radius in zip(*rods, strict=True):

@@ -206,6 +206,7 @@ def library_of(
     scene = setting.scene
     radius = float(scene.inner_radius)
     require(radius == 0.0, "scene.inner_radius", "0 for stored motions", radius)
+    require(scene.meshes is None, "scene", "without meshes for stored motions", shown="meshes")
     table = Table(rows=rows, homes=homes, inner=scene.inner, outer=scene.outer, layout=layout)
     return Library(table=table, setting=setting)
 
