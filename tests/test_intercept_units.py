@@ -8,13 +8,17 @@ from flax import struct
 
 import planner_jax as pj
 from planner_jax.plane.obstacles import place
-from planner_jax.plane.reach import Lattice
 from planner_jax.task.intercept.plan import make_plan
-from planner_jax.task.intercept.searches import Search
 from planner_jax.task.intercept.terms import least_between, nearest_in_region
+from tests.planners import ONE_SEARCH
 
-SMALL = {"searches": (Search(2, lattice=Lattice(layers=20, headings=16), is_direct=True),)}
+# test_intercept plans batches of equal shapes with this planner, so that its program is shared.
+PLANNER = pj.intercept.planner(searches=ONE_SEARCH)
 BOX = np.array([[-1.0, -0.5], [1.0, -0.5], [1.0, 0.5], [-1.0, 0.5]])
+
+
+def stack(cases):
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *cases)
 
 
 def problem(length=1.0, time=1.0, shift=(0.0, 0.0), turn=0.0):
@@ -49,31 +53,38 @@ def problem(length=1.0, time=1.0, shift=(0.0, 0.0), turn=0.0):
     )
 
 
-def test_a_problem_in_other_units_far_away_and_rotated_has_the_same_plan():
-    planner = pj.intercept.planner(**SMALL)
-    usual = pj.plan(planner, problem())
+# Length and time of the units [1/m, 1/s], position [m] and heading [rad] of the frame.
+UNITS = [
+    (1.0, 1.0, (0.0, 0.0), 0.0),
+    (1000.0, 1.0, (0.0, 0.0), 0.0),
+    (1e-3, 1.0 / 3600.0, (0.0, 0.0), 0.0),
+    (1.0, 1.0, (5e5, 4.6e6), 0.0),
+    (1.0, 1.0, (-30.0, 20.0), 2.2),
+    (1000.0, 1.0, (5e8, 1e8), -0.7),
+]
+
+
+@pytest.fixture(scope="module")
+def planned():
+    cases = stack([problem(*each) for each in UNITS])
+    return cases, pj.plan(PLANNER, cases)
+
+
+def test_a_problem_in_other_units_far_away_and_rotated_has_the_same_plan(planned):
+    cases, plans = planned
+    usual = pj.take(plans, 0)
     assert usual.status == pj.Status.CONVERGED
-    for length, time, shift, turn in (
-        (1000.0, 1.0, (0.0, 0.0), 0.0),
-        (1e-3, 1.0 / 3600.0, (0.0, 0.0), 0.0),
-        (1.0, 1.0, (5e5, 4.6e6), 0.0),
-        (1.0, 1.0, (-30.0, 20.0), 2.2),
-        (1000.0, 1.0, (5e8, 1e8), -0.7),
-    ):
-        case = problem(length, time, shift, turn)
-        plan = pj.plan(planner, case)
-        assert pj.intercept.judge(case, plan).success
+    assert pj.intercept.judge(cases, plans).success.all()
+    for k, (length, time, _, _) in enumerate(UNITS):
+        plan = pj.take(plans, k)
         np.testing.assert_allclose(plan.speed * time / length, usual.speed, rtol=2e-3, atol=2e-3)
         np.testing.assert_allclose(plan.curvature * length, usual.curvature, atol=1e-3)
         np.testing.assert_allclose(plan.cost * time**3 / length**2, usual.cost, rtol=1e-2)
 
 
-def test_samples_of_a_plan_at_utm_coordinates_are_exact_to_a_millimetre():
-    shift = np.array([500123.25, 4612345.75])
-    case = problem(shift=shift)
-    plan = pj.plan(pj.intercept.planner(**SMALL), case)
-    near = pj.plan(pj.intercept.planner(**SMALL), problem())
-    far, here = plan.sample(5.0).pos, near.sample(5.0).pos
+def test_samples_of_a_plan_at_utm_coordinates_are_exact_to_a_millimetre(planned):
+    shift = np.asarray(UNITS[3][2])
+    far, here = (pj.take(planned[1], k).sample(5.0).pos for k in (3, 0))
     assert far.dtype == np.float64
     np.testing.assert_allclose(far[0], shift, atol=1e-9)
     np.testing.assert_allclose(far - shift, here, atol=0.02)
@@ -108,26 +119,24 @@ def test_the_car_avoids_a_recorded_mover_and_stops_in_a_region_with_a_margin():
         end_speed=(0.0, 0.05),
         margin=0.1,
     )
-    plan = pj.plan(pj.intercept.planner(**SMALL), case)
+    plan = pj.plan(PLANNER, case)
     verdict = pj.intercept.judge(case, plan)
     assert plan.status == pj.Status.CONVERGED and verdict.success, verdict.sentence(())
     assert verdict.mover_clearance >= 0.099 and verdict.wall_clearance >= 0.099
     assert verdict.end_speed <= 0.0501 and verdict.miss <= 0.01
 
 
-@pytest.mark.parametrize(
-    "settings, status",
-    [
-        ({"time": 1.0}, pj.Status.TOO_FAR),
-        ({"start": (-1.0, 4.0, 0.0)}, pj.Status.BLOCKED),
-        ({"start": (0.8, 4.0, 0.0), "walls": [0.3 * BOX + [0.9, 4.0]]}, pj.Status.BLOCKED),
-        ({"walls": [[[2, -1], [2.2, -1], [2.2, 9], [2, 9]]]}, pj.Status.NO_PATH),
-    ],
-)
-def test_the_status_says_why_there_is_no_plan(settings, status):
+def test_the_status_says_why_there_is_no_plan():
     target = pj.TurningPath(np.float32([6.5, 4.0]), np.zeros(2, np.float32), np.float32(0.0))
-    case = pj.intercept.case(target, **{"time": 10.0, **settings})
-    assert pj.plan(pj.intercept.planner(**SMALL), case).status == status
+    settings = {
+        pj.Status.TOO_FAR: {"time": 1.0},
+        pj.Status.BLOCKED: {"start": (0.8, 4.0, 0.0), "walls": [0.3 * BOX + [0.9, 4.0]]},
+        pj.Status.NO_PATH: {"walls": [[[2, -1], [2.2, -1], [2.2, 9], [2, 9]]]},
+    }
+    cases = [pj.intercept.case(target, **{"time": 10.0, **each}) for each in settings.values()]
+    cases.append(pj.intercept.case(target, 10.0, start=(-1.0, 4.0, 0.0)))
+    status = pj.plan(PLANNER, stack(cases)).status
+    np.testing.assert_array_equal(status, [*settings, pj.Status.BLOCKED])
 
 
 @struct.dataclass
