@@ -111,12 +111,15 @@ tool.radius | ~ | tool.radius must be given, got nothing
 tool.kind | rackett | tool.kind must be net or racket, got 'rackett'; did you mean racket?
 masss | 1 kg | field must be one of FIELDS, got 'masss'; did you mean mass?
 tool.size | 1 m | tool field must be one of TOOL, got 'size'
-rotors.places | 1 m | rotors.places must be 8 numbers in m, cm, mm, got '1 m'
+rotors.places | 1 m | rotors.places must be 8 or 12 or 16 numbers in m, cm, mm, got '1 m'
+rotors.count | 5 | rotors.count must be 4, 6 or 8, got 5
 rotors.diagonal | ~ | rotors.places or diagonal must be given, got nothing
 rotors.places | [[0, 1], [1, 1], [2, 1], [3, 1]] | rotors must have diagonal or places, not both
 rotors.max_thrust | 1 N | 4 x rotors.max_thrust must be > the weight of 7.85 N, got 4 N
+rotors.max_thrust | 2.06 N | limits.rotor_share must HOVER, 90% of RANGE
 limits.body_rate | 3 deg | limits.body_rate must be in RATES, got '3 deg'; did you mean deg/s?
 limits.speed | '~' | limits.speed must be in m/s, cm/s, km/h, got '~'
+inertia | 3 3 5 0 0 4 g m^2 | inertia must be OF_A_BODY, got (0.003, 0.003, 0.005, 0.0, 0.0, 0.004)
 inertia | 1 1 9 g m^2 | inertia must be OF_A_BODY, got (0.001, 0.001, 0.009)
 inertia | 3 3 5 g m | inertia must be in INERTIAS, got '3 3 5 g m'; did you mean g m^2?
 inertia | 3 3 5 | inertia must have its UNIT, got '3 3 5'
@@ -129,6 +132,8 @@ WORDS = {
     "FIELDS": "name, source, mass, inertia, rotors, tool, limits",
     "TOOL": "kind, height, radius, restitution, max_angle",
     "OF_A_BODY": "of a body, none above the other two together",
+    "HOVER": "let the robot hover with 1.962 N a rotor, got 0.103 to 1.957 N",
+    "RANGE": "a rotor's range",
     "UNIT": "unit, one of INERTIAS, as in '3 3 5 g m^2'",
     "INERTIAS": "kg m^2, kg cm^2, kg mm^2, g m^2, g cm^2, g mm^2",
 }
@@ -208,7 +213,7 @@ XML = (DATA / "quadrotor.xml").read_text()
 @pytest.mark.parametrize(
     ("old", "new", "rule"),
     [
-        (r"<actuator>.*</actuator>", "", "the model must have 4 actuators, all on sites, got none"),
+        (r"<actuator>.*</actuator>", "", "the model must have 4, 6 or 8 actuators, all on sites"),
         ("<freejoint/>", "", "the model must have one free joint, got 0"),
         ("2 0 0 -0.04", "2 0 0 0.04", "gear of neighbouring rotors must turn in opposite direct"),
         ('left" gear="0 0 2', 'left" gear="2 0 0', "gear of actuator 2 must push along z, got 2"),
@@ -217,10 +222,6 @@ XML = (DATA / "quadrotor.xml").read_text()
         ("0.1 2.25", "-1 2.25", "ctrlrange must be the same for all rotors"),
         ("<general", '<general biastype="affine" biasprm="1 0 0"', "actuator 1 must have a fixed"),
         ("</mujoco>", "", "must be MJCF, "),
-        (
-            *('diaginertia="0.003 0.003 0.005"', 'fullinertia="0.003 0.003 0.005 0.001 0 0"'),
-            "inertia must be along the body's axes, got a product of 0.001 kg m^2",
-        ),
     ],
 )
 def test_mjcf_of_something_else_is_refused_in_one_line(old, new, rule, tmp_path):
@@ -233,13 +234,81 @@ def test_mjcf_of_something_else_is_refused_in_one_line(old, new, rule, tmp_path)
     assert "\n" not in str(error.value)
 
 
-def test_a_lag_that_mjcf_does_not_have_has_to_be_said(tmp_path):
+def test_a_lag_that_mjcf_does_not_have_is_assumed_and_said(tmp_path):
     place = tmp_path / "mine.xml"
     place.write_text(XML.replace('dyntype="filterexact" dynprm="0.03"', ""))
-    with pytest.raises(RobotError, match="mine.xml: rotors.lag must be in s, ms, got None$"):
-        pj.read_robot(place, tool=TOOL, limits=LIMITS)
+    robot = pj.read_robot(place, tool=TOOL, limits=LIMITS)
+    assert robot.rotors.lag == 0.02 and robot.source == "mine.xml; lag of 20 ms assumed"
     robot = pj.read_robot(place, tool=TOOL, limits=LIMITS, rotors={"lag": "25 ms"})
-    assert robot.rotors.lag == 0.025
+    assert robot.rotors.lag == 0.025 and robot.source == "mine.xml"
+
+
+def test_what_yaml_states_is_not_read_from_the_model(tmp_path):
+    place = tmp_path / "mine.xml"
+    text = XML.replace("0.1 2.25", "0.1 2.5", 1).replace("2 0 0 -0.04", "2 0 0 0.04", 1)
+    place.write_text(text.replace('dynprm="0.03"', 'dynprm="0.05"', 1))
+    own = {"max_thrust": "4 N", "min_thrust": 0.0, "torque_ratio": "2 cm", "lag": "25 ms"}
+    robot = pj.read_robot(place, tool=TOOL, limits=LIMITS, rotors=own)
+    assert robot.rotors.max_thrust == 4.0 and robot.rotors.places[0] == pytest.approx((0.1, 0.1))
+    place.write_text(re.sub(r"<actuator>.*</actuator>", "", XML, flags=re.DOTALL))
+    own |= {"diagonal": "30 cm", "count": 6}
+    assert len(pj.read_robot(place, tool=TOOL, limits=LIMITS, rotors=own).rotors.places) == 6
+
+
+# A model with products of inertia, meshes and pictures whose files are missing, and motors without
+# a lag. The motors on each side turn in one direction.
+PICTURED = """<mujoco><compiler autolimits="true" assetdir="none"/>
+<default><default class="x"><geom mass="0"/><motor ctrlrange="0 13"/></default></default>
+<asset><texture type="2d" file="skin.png"/><material name="skin" texture="skin"/>
+  <mesh name="hull" file="hull.obj"/></asset>
+<worldbody><body childclass="x"><freejoint/><geom type="mesh" mesh="hull" material="skin"/>
+  {arms}<geom type="ellipsoid" size=".16 .04 .02" pos="0 0 .02" mass=".3"/></body></worldbody>
+<actuator>{motors}</actuator></mujoco>"""
+ARM = '<site name="{0}" pos="{1}"/><geom type="sphere" size=".05" pos="{1}" mass=".25"/>'
+MOTOR = '<motor class="x" site="{}" gear="0 0 1 0 0 {}"/>'
+
+
+def test_a_model_with_products_of_inertia_and_missing_pictures_is_read(tmp_path):
+    place = tmp_path / "mine.xml"
+    places = "-.14 -.18 .05", "-.14 .18 .05", ".14 .18 .08", ".14 -.18 .08"
+    arms = "".join(ARM.format(*each) for each in enumerate(places))
+    for spins, is_sound in (
+        ((-0.02, 0.02, -0.02, 0.02), True),
+        ((-0.02, 0.02, 0.02, -0.02), False),
+    ):
+        motors = "".join(MOTOR.format(*each) for each in enumerate(spins))
+        place.write_text(PICTURED.format(arms=arms, motors=motors))
+        robot = pj.read_robot(place, tool=TOOL, limits=LIMITS)
+        assert robot.inertia[3:] == pytest.approx((0.0, -0.25 * 4 * 0.14 * 0.015, 0.0))
+        np.testing.assert_allclose(np.abs(robot.rotors.places), np.tile([0.14, 0.18], (4, 1)))
+        assert robot.rotors.max_thrust == 13.0 and robot.rotors.torque_ratio == 0.02
+        assert robot.source.endswith("assumed") == is_sound
+        assert ("cannot turn the body about z alone" in robot.source) != is_sound
+        (tmp_path / "again.yaml").write_text(to_yaml(robot))
+        assert pj.read_robot(tmp_path / "again.yaml") == robot
+    place.write_text(place.read_text().replace('<geom mass="0"/>', ""))
+    with pytest.raises(RobotError, match="mine.xml: must be MJCF, Error.*hull.obj"):
+        pj.read_robot(place, tool=TOOL, limits=LIMITS)
+
+
+def test_a_model_of_one_thrust_and_three_moments_needs_the_rotors_diagonal(tmp_path):
+    place = tmp_path / "mine.xml"
+    moments = "".join(
+        f'<motor site="0" gear="0 0 0 {gear}" ctrlrange="-1 1"/>'
+        for gear in ("-1 0 0", "0 -1 0", "0 0 -1")
+    )
+    thrust = '<motor site="0" gear="0 0 1 0 0 0" ctrlrange="0 20"/>'
+    arms = ARM.format(0, "0 0 0")
+    place.write_text(PICTURED.format(arms=arms, motors=thrust + moments))
+    with pytest.raises(
+        RobotError, match="mine.xml: rotors must have a diagonal, or places and max"
+    ):
+        pj.read_robot(place, tool=TOOL, limits=LIMITS)
+    own: dict = {"diagonal": "30 cm"}
+    assert pj.read_robot(place, tool=TOOL, limits=LIMITS, rotors=own).rotors.max_thrust == 5.0
+    own["count"] = 8
+    robot = pj.read_robot(place, tool=TOOL, limits=LIMITS, rotors=own)
+    assert robot.rotors.max_thrust == 2.5 and robot.rotors.places[7][1] < 0.0
 
 
 def test_an_unknown_robot_is_refused_with_the_nearest_name_and_each_names_its_sources():

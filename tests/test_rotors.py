@@ -13,8 +13,15 @@ from sweeps import quick_hit
 
 import planner_jax as pj
 from planner_jax.referee.rotors import rotor_thrusts as judged_thrusts
-from planner_jax.robot.quadrotor import RotorLimits, rotor_thrusts
-from planner_jax.robot.quadrotor_model import NET, RACKET, FlightLimits, Rotors, Tool
+from planner_jax.robot.quadrotor import RotorLimits, flat_attitude, rotor_thrusts
+from planner_jax.robot.quadrotor_model import (
+    NET,
+    RACKET,
+    FlightLimits,
+    Rotors,
+    Tool,
+    place_in_cross,
+)
 
 GRAVITY = 9.81
 MODEL = pj.QuadrotorModel(
@@ -53,21 +60,49 @@ def test_in_a_plane_the_torque_is_the_inertia_times_the_angle_s_second_derivativ
     np.testing.assert_allclose(wrench, [thrust, *torque], atol=1e-6)
 
 
+HEXACOPTER = dataclasses.replace(
+    MODEL,
+    inertia=(0.003, 0.004, 0.006, 2e-4, -5e-4, 3e-4),
+    rotors=Rotors(place_in_cross(0.3, 6), max_thrust=4.5),
+)
+
+
 @float64
-def test_planner_and_referee_find_the_same_thrusts():
+@pytest.mark.parametrize("model", [MODEL, HEXACOPTER], ids=["4 rotors", "6 rotors, products"])
+def test_planner_and_referee_find_the_same_thrusts(model):
     coeffs = np.random.default_rng(0).normal(size=(3, 4, 2, 8))  # tilt and turn
     coeffs *= np.array([1, 1, 2, 2, 1, 1, 0.5, 0.5])
     times = np.broadcast_to(np.linspace(0.0, 0.8, 9), (4, 2, 9))
     batch = np.ones(4)
-    mixer = np.broadcast_to(ROTORS.mixer, (4, 4, 4))
-    body = batch * MODEL.mass, batch[:, None] * ROTORS.inertia, mixer
+    mixer, inertia = model.rotors.mixer, np.array(model.inertia)
+    rotors = dataclasses.replace(ROTORS, inertia=inertia, mixer=mixer)
+    body = batch * model.mass, batch[:, None] * inertia, np.stack([mixer] * 4)
     found = judged_thrusts(coeffs, times, batch * GRAVITY, *body)
     for lane, piece, sample in np.ndindex(4, 2, 9):
         axes = [np.polynomial.Polynomial(axis) for axis in coeffs[:, lane, piece]]
         time = times[lane, piece, sample]
         motion = [np.array([axis.deriv(k)(time) for axis in axes]) for k in (2, 3, 4)]
-        planned = np.array(rotor_thrusts(*motion, GRAVITY, ROTORS))
+        planned = np.array(rotor_thrusts(*motion, GRAVITY, rotors))
         np.testing.assert_allclose(found[lane, piece, sample], planned, rtol=1e-6, atol=1e-6)
+
+
+@float64
+def test_the_torque_of_a_turn_is_the_change_of_angular_momentum():
+    """The world's angular momentum is  R I w , with the matrix I of products, too."""
+    coeffs = np.random.default_rng(1).normal(size=(3, 8))
+    axes, step = [np.polynomial.Polynomial(axis) for axis in coeffs], 1e-4
+
+    def momentum(time):
+        acc, jerk = (jax.numpy.array([axis.deriv(k)(time) for axis in axes]) for k in (2, 3))
+        turn, rate = flat_attitude(acc, jerk, jax.numpy.array(GRAVITY))
+        return np.array(turn @ HEXACOPTER.inertia_matrix @ rate), np.array(turn)
+
+    change = (momentum(0.3 + step)[0] - momentum(0.3 - step)[0]) / (2.0 * step)
+    motion = [np.array([axis.deriv(k)(0.3) for axis in axes]) for k in (2, 3, 4)]
+    own = HEXACOPTER.rotors
+    rotors = dataclasses.replace(ROTORS, inertia=np.array(HEXACOPTER.inertia), mixer=own.mixer)
+    wrench = own.allocation @ np.array(rotor_thrusts(*motion, GRAVITY, rotors))
+    np.testing.assert_allclose(wrench[1:], momentum(0.3)[1].T @ change, rtol=1e-5, atol=1e-7)
 
 
 @pytest.fixture(scope="module")
@@ -115,7 +150,7 @@ def test_a_rotor_beyond_its_bound_fails_by_name(hits, name, off):
         ({"mass": 2.0}, "4 x rotors.max_thrust must be > the weight of 19.6 N, got 18 N"),
         ({"mass": -1.0}, "mass must be > 0, got -1"),
         ({"inertia": (0.1, 0.0, 0.1)}, "inertia must be > 0, got 0"),
-        ({"inertia": (0.1, 0.1)}, r"inertia must be 3 numbers, got \(0.1, 0.1\)"),
+        ({"inertia": (0.1, 0.1)}, r"inertia must be 3 or 6 numbers, got \(0.1, 0.1\)"),
     ],
 )
 def test_a_robot_that_cannot_be_is_refused_in_one_line(changed, message):

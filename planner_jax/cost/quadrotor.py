@@ -173,12 +173,16 @@ _KINDS = (
     _Kind(
         "min_height", (_PLAIN,), lambda motion, _, own: (ground_excess(motion.height, own),), (0,)
     ),
-    _Kind("rotors", (_PLAIN,) * 8, _rotor_excess, (2, 3, 4)),
+    _Kind("rotors", (_PLAIN,) * 2, _rotor_excess, (2, 3, 4)),  # for one rotor
 )
 
 
 def _kinds(limits: QuadrotorLimits) -> list[_Kind]:
-    return [kind for kind in _KINDS if vars(limits)[kind.field] is not None]
+    kinds = [kind for kind in _KINDS if vars(limits)[kind.field] is not None]
+    if limits.rotors is not None:
+        measures = limits.rotors.mixer.shape[-2] * kinds[-1].measures
+        kinds[-1] = dataclasses.replace(kinds[-1], measures=measures)
+    return kinds
 
 
 def flight_excess(motion: Motion, gravity: Array, limits: QuadrotorLimits) -> tuple[Array, ...]:

@@ -95,7 +95,6 @@ MOTION_SENTENCES = {
     "jerk make {excess:.3g} m of displacement",
 }
 MOTION_UNBOUNDED = {"body rate": "no thrust or upside down, so without attitude, at {time:.3f} s"}
-_ROTOR_SHAPES = {"mass": (), "inertia": (3,), "mixer": (4, 4), "min_thrust": (), "max_thrust": ()}
 
 # [s] An error e of the n-th derivative of the position counts as the displacement |e| h^n / n!,
 # where h is the mean duration of a piece, but at least this number.
@@ -130,8 +129,11 @@ def read_flight(cases, plans) -> dict[str, np.ndarray]:
     limits = ("speed", "acceleration", "body_rate", "min_thrust", "max_thrust", "min_height")
     shapes = {"gravity": ()} | {f"limits.{name}": () for name in limits}
     leaves |= read_leaves(cases, shapes, num_lanes)
-    if cases.limits.rotors is not None:
-        leaves |= read_leaves(cases.limits.rotors, _ROTOR_SHAPES, num_lanes, "limits.rotors.")
+    if (rotors := cases.limits.rotors) is not None:
+        shapes = dict.fromkeys(("mass", "min_thrust", "max_thrust"), ())
+        shapes |= {"inertia": ((3,), (6,))[np.shape(rotors.inertia)[-1:] == (6,)]}
+        shapes |= {"mixer": (*np.shape(rotors.mixer)[-2:-1], 4)}
+        leaves |= read_leaves(rotors, shapes, num_lanes, "limits.rotors.")
     if plans.recovery is not None:
         coeffs = check_coeffs(plans.recovery.coeffs)
         shapes = {"coeffs": coeffs.shape[1:], "durations": coeffs.shape[1:2]}

@@ -1,4 +1,4 @@
-"""Thrusts of a quadrotor's four rotors along a trajectory, for the referee, in float64 NumPy.
+"""Thrusts of the rotors of a quadrotor along a trajectory, for the referee, in float64 NumPy.
 
 Attitude and body rate follow from thrust and jerk (Hopf fibration at zero heading). The angular
 acceleration is a central difference of body rates, so that the referee is independent of the
@@ -54,7 +54,7 @@ def rotor_thrusts(
     inertia: np.ndarray,
     mixer: np.ndarray,
 ) -> np.ndarray:
-    """Return the thrusts (B, M, S, 4) [N] of four rotors at S times in M pieces of B trajectories.
+    """Return the thrusts (B, M, S, R) [N] of R rotors at S times in M pieces of B trajectories.
 
     The thrusts are not finite where the attitude is undefined: without thrust and upside down.
 
@@ -64,8 +64,9 @@ def rotor_thrusts(
         times: (B, M, S) [s], since each piece's start.
         gravity: (B,) [m/s^2], magnitude.
         mass: (B,) [kg].
-        inertia: (B, 3) [kg m^2], about the body's axes.
-        mixer: (B, 4, 4), matrix from thrust [N] and torques [N m] to the thrusts of the rotors.
+        inertia: (B, 3) or (B, 6) [kg m^2], about the body's axes: I_xx, I_yy, I_zz, and maybe
+            I_xy, I_xz, I_yz.
+        mixer: (B, R, 4), matrix from thrust [N] and torques [N m] to the thrusts of the rotors.
     """
     pull, rate = _pull_and_rate(coeffs, times, gravity)
     before, after = (
@@ -77,8 +78,10 @@ def rotor_thrusts(
     axes = _body_axes(pull)
     own = np.einsum("...ij,...i->...j", axes, rate)
     turning = np.einsum("...ij,...i->...j", axes, change)
-    inertia = inertia[:, None, None]
-    torque = inertia * turning + np.cross(own, inertia * own)
+    x, y, z, xy, xz, yz = np.pad(inertia, ((0, 0), (0, 6 - inertia.shape[1]))).T
+    matrix = np.stack([x, xy, xz, xy, y, yz, xz, yz, z], axis=1).reshape(-1, 1, 1, 3, 3)
+    spin, push = (np.einsum("...ij,...j->...i", matrix, each) for each in (own, turning))
+    torque = push + np.cross(own, spin)
     thrust = mass[:, None, None, None] * np.linalg.norm(pull, axis=-1)[..., None]
     return np.einsum("bik,bmsk->bmsi", mixer, np.concatenate([thrust, torque], axis=-1))
 

@@ -29,8 +29,9 @@ class RotorLimits:
     """Thrust limits of a rotor, and mass, inertia and mixer, which give the thrusts of a motion."""
 
     mass: Array  # () [kg], of the quadrotor
-    inertia: Array  # (3,) [kg m^2], principal moments about the body's axes
-    mixer: Array  # (4, 4), from total thrust [N] and torque [N m] to the rotors' thrusts [N]
+    # (3,) or (6,) [kg m^2], about the body's axes: I_xx, I_yy, I_zz, and maybe I_xy, I_xz, I_yz
+    inertia: Array
+    mixer: Array  # (R, 4), from total thrust [N] and torque [N m] to the R rotors' thrusts [N]
     min_thrust: Array  # () [N], least thrust of one rotor
     max_thrust: Array  # () [N], greatest thrust of one rotor
 
@@ -134,7 +135,7 @@ def body_rate(acc: Components, jerk: Components, gravity: Array) -> tuple[Array,
 def rotor_thrusts(
     acc: Components, jerk: Components, snap: Components, gravity: Array, rotors: RotorLimits
 ) -> tuple[Array, ...]:
-    """Return the thrusts (...) [N] that the four rotors need for a motion at zero heading.
+    """Return the thrusts (...) [N] that R rotors need for a motion at zero heading.
 
     Acceleration [m/s^2], jerk [m/s^3] and snap [m/s^4] are (..., 3), gravity is () [m/s^2].
     """
@@ -146,7 +147,16 @@ def rotor_thrusts(
     roll = about_x * turning[0] + (about_z - about_y) * rate[1] * rate[2]
     pitch = about_y * turning[1] + (about_x - about_z) * rate[2] * rate[0]
     yaw = about_z * turning[2] + (about_y - about_x) * rate[0] * rate[1]
-    rows = (rotors.mixer[..., i, :] for i in range(4))
+    if rotors.inertia.shape[-1] == 6:  # the matrix P of the products adds  P w' + w x P w
+        xy, xz, yz = (rotors.inertia[..., k] for k in range(3, 6))
+        (own, bent) = (
+            (xy * v[1] + xz * v[2], xy * v[0] + yz * v[2], xz * v[0] + yz * v[1])
+            for v in (rate, turning)
+        )
+        roll += bent[0] + rate[1] * own[2] - rate[2] * own[1]
+        pitch += bent[1] + rate[2] * own[0] - rate[0] * own[2]
+        yaw += bent[2] + rate[0] * own[1] - rate[1] * own[0]
+    rows = (rotors.mixer[..., i, :] for i in range(rotors.mixer.shape[-2]))
     return tuple(
         row[..., 0] * thrust + row[..., 1] * roll + row[..., 2] * pitch + row[..., 3] * yaw
         for row in rows
@@ -233,7 +243,8 @@ def _greatest_thrust(limits: QuadrotorLimits) -> Array | None:
     """Return an upper bound () [m/s^2] on the thrust per unit mass; None if there is no limit."""
     bounds = [] if limits.max_thrust is None else [limits.max_thrust]
     if limits.rotors is not None:
-        bounds.append(4.0 * limits.rotors.max_thrust / limits.rotors.mass)
+        num = limits.rotors.mixer.shape[-2]
+        bounds.append(num * limits.rotors.max_thrust / limits.rotors.mass)
     return ALLOWED * jnp.min(jnp.stack(bounds)) if bounds else None
 
 

@@ -10,7 +10,7 @@
 A number without a unit is in SI units. Only an inertia must have its unit, because it is often
 stated in g m^2. In an acceleration "g" is the standard gravity, elsewhere the gram. The field
 `model`, a path such as mine.xml, reads body and rotors from a MuJoCo model (MJCF); fields of the
-YAML file override the model's. This module imports no JAX.
+YAML file override the model's, which are then not checked. This module imports no JAX.
 """
 
 import dataclasses
@@ -30,6 +30,7 @@ from planner_jax.core.errors import MissingExtra, PlannerJaxError
 from planner_jax.host.files import open_plain
 from planner_jax.host.yaml_files import Value, read_fields
 from planner_jax.robot.quadrotor_model import (
+    COUNTS,
     NET,
     RACKET,
     FlightLimits,
@@ -83,13 +84,13 @@ class _Quantity(NamedTuple):
     """Format of a field's value: kind of quantity, and how many numbers it has."""
 
     kind: str  # a key of `UNITS`
-    count: int = 1  # pyright: ignore[reportIncompatibleMethodOverride]
+    counts: tuple[int, ...] = (1,)
     span: bool = False  # whether the word "to" stands between its two numbers
     optional: bool = False  # whether the value may be null, which means no limit
     example: str = ""  # value for an error message if a unit is obligatory; "": units are optional
 
 
-_LENGTH = _Quantity("length")
+_LENGTH, _COORDINATES = _Quantity("length"), tuple(2 * count for count in COUNTS)
 # Section of a robot's file -> field -> format of its value, or None for a text. The sections are
 # "rotors", "tool" and "limits"; "" holds the fields outside of them.
 _FIELDS: dict[str, dict[str, _Quantity | None]] = {
@@ -97,11 +98,12 @@ _FIELDS: dict[str, dict[str, _Quantity | None]] = {
         "name": None,
         "source": None,
         "mass": _Quantity("mass"),
-        "inertia": _Quantity("inertia", 3, example="3 3 5 g m^2"),
+        "inertia": _Quantity("inertia", (3, 6), example="3 3 5 g m^2"),
     },
     "rotors": {
         "diagonal": _LENGTH,
-        "places": _Quantity("length", 8),
+        "count": _Quantity("share"),
+        "places": _Quantity("length", _COORDINATES),
         "max_thrust": _Quantity("force"),
         "min_thrust": _Quantity("force"),
         "torque_ratio": _LENGTH,
@@ -120,7 +122,7 @@ _FIELDS: dict[str, dict[str, _Quantity | None]] = {
         "body_rate": _Quantity("rate"),
         "min_height": _LENGTH,
         "acceleration": _Quantity("acceleration", optional=True),
-        "thrust": _Quantity("acceleration", 2, span=True, optional=True),
+        "thrust": _Quantity("acceleration", (2,), span=True, optional=True),
         "rotor_share": _Quantity("share", optional=True),
     },
 }
@@ -142,7 +144,7 @@ def read_robot(path: str | os.PathLike, **given: Value) -> QuadrotorModel:
         OSError: the file cannot be read.
     """
     place = os.fspath(path)
-    description = _read_description(Path(place))
+    description = _read_description(Path(place), given)
     _require_units({k: v for k, v in given.items() if isinstance(v, str)}, place)
     parts = tuple(_PARTS.values())
     plain = {k: dataclasses.asdict(v) if isinstance(v, parts) else v for k, v in given.items()}
@@ -169,7 +171,11 @@ def model_of(description: Mapping[str, Value], place: str = "robot") -> Quadroto
     if "diagonal" in rotors:
         if "places" in rotors:
             raise RobotError(f"{place}: rotors must have diagonal or places, not both")
-        rotors["places"] = place_in_cross(rotors.pop("diagonal"))
+        if (count := rotors.pop("count", 4)) not in COUNTS:
+            raise RobotError(f"{place}: rotors.count must be 4, 6 or 8, got {count:g}")
+        rotors["places"] = place_in_cross(rotors.pop("diagonal"), int(count))
+    elif "count" in rotors:
+        raise RobotError(f"{place}: rotors.count must be left out without a diagonal")
     if kind not in (NET, RACKET):
         hint = suggestion(kind, (NET, RACKET))
         raise RobotError(f"{place}: tool.kind must be {NET} or {RACKET}, got {kind!r}{hint}")
@@ -189,10 +195,10 @@ def to_yaml(model: QuadrotorModel) -> str:
     """Format a quadrotor as the text of a YAML file; `read_robot` restores it without rounding."""
     plain: dict[str, Value] = dataclasses.asdict(model)
     rotors = plain["rotors"]
-    diagonal = round(2.0 * float(max(abs(x) for x in rotors["places"][0])) * 2.0**0.5, 12)
-    if place_in_cross(diagonal) == rotors["places"]:
+    num, diagonal = len(rotors["places"]), round(2.0 * math.hypot(*rotors["places"][0]), 12)
+    if place_in_cross(diagonal, num) == rotors["places"]:
         del rotors["places"]
-        plain["rotors"] = {"diagonal": diagonal, **rotors}
+        plain["rotors"] = {"diagonal": diagonal, **({} if num == 4 else {"count": num}), **rotors}
     shown = {name: _add_unit(plain[name], kind) for name, kind in _FIELDS[""].items()}
     if not model.source:
         del shown["source"]
@@ -205,15 +211,18 @@ def to_yaml(model: QuadrotorModel) -> str:
 def _add_unit(value: Value, quantity: _Quantity | None) -> Value:
     if quantity is None or value is None or quantity.kind == "share":
         return value
-    if quantity.count == 8:
-        return [_add_unit(pair, _Quantity(quantity.kind, 2)) for pair in value]
+    if quantity.counts == _COORDINATES:
+        return [_add_unit(pair, _Quantity(quantity.kind, (2,))) for pair in value]
     numbers = value if isinstance(value, list | tuple) else [value]
     text = (" to " if quantity.span else " ").join(repr(float(number)) for number in numbers)
     return f"{text} {next(iter(UNITS[quantity.kind]))}"
 
 
-def _read_description(path: Path) -> dict[str, Value]:
-    """Return the fields in a YAML or MJCF file, as a dictionary; raise `RobotError` if invalid."""
+def _read_description(path: Path, over: Mapping[str, Value]) -> dict[str, Value]:
+    """Return the fields in a YAML or MJCF file, as a dictionary; raise `RobotError` if invalid.
+
+    The fields `over` will replace fields of the file. A model's values for them are not checked.
+    """
     if path.suffix.lower() not in ENDINGS:
         raise RobotError(f"path must end in {', '.join(ENDINGS)}, got {str(path)!r}")
     if path.suffix.lower() == ".xml":
@@ -222,7 +231,7 @@ def _read_description(path: Path) -> dict[str, Value]:
             describe = pkgutil.resolve_name("planner_jax.sims.robots.quadrotor.mjcf:describe_mjcf")
         except MissingExtra as error:
             raise error.with_names({error.feature: path.name}) from None
-        return describe(path)
+        return describe(path, over)
     try:
         fields = read_fields(path)
     except ValueError as error:
@@ -233,7 +242,7 @@ def _read_description(path: Path) -> dict[str, Value]:
         return fields
     if not isinstance(model, str) or not model.lower().endswith(".xml"):
         raise RobotError(f"{path}: model must name an MJCF file, .xml, got {model!r:.60}")
-    return _merge(_read_description(path.parent / model), fields)
+    return _merge(_read_description(path.parent / model, _merge(fields, over)), fields)
 
 
 def _merge(under: Mapping[str, Value], over: Mapping[str, Value]) -> dict[str, Value]:
@@ -292,30 +301,30 @@ def _to_si(given: Mapping[str, Value], part: str, place: str) -> dict[str, Value
 
 
 def _to_numbers(value: Value, quantity: _Quantity) -> Value:
-    """Convert a field's value to SI units; eight numbers become positions (x, y) of four rotors."""
-    is_pairs = quantity.count == 8
+    """Convert a field's value to SI units; coordinates become positions (x, y) of rotors."""
+    is_pairs = quantity.counts == _COORDINATES
     if is_pairs and isinstance(value, list | tuple):
         pairs = (pair if isinstance(pair, list | tuple) else [pair] for pair in value)
         value = [each for pair in pairs for each in pair]
-    numbers = parse_numbers(value, quantity.kind, quantity.count, span=quantity.span)
+    numbers = parse_numbers(value, quantity.kind, *quantity.counts, span=quantity.span)
     if is_pairs:
         return tuple(zip(numbers[::2], numbers[1::2], strict=True))
-    return numbers[0] if quantity.count == 1 else numbers
+    return numbers[0] if quantity.counts == (1,) else numbers
 
 
-def parse_numbers(value: Value, kind: str, count: int, *, span: bool = False) -> tuple[float, ...]:
+def parse_numbers(value: Value, kind: str, *counts: int, span: bool = False) -> tuple[float, ...]:
     """Parse the numbers of a value, such as "3 3 5 g m^2", and convert them to SI units.
 
-    A value is a text, a number, or a list of them. `kind` is a key of `UNITS`, and `count` the
-    required number of numbers. With `span` the word "to" may stand between two numbers.
+    A value is a text, a number, or a list of them. `kind` is a key of `UNITS`, and `counts` are the
+    allowed numbers of numbers. With `span` the word "to" may stand between two numbers.
 
     Raises:
         QuantityError: the value has another unit or count, or is not made of numbers.
     """
     parts = value if isinstance(value, list | tuple) else [value]
     numbers = tuple(number for part in parts for number in _parse(part, kind, span))
-    if len(numbers) != count:
-        what = "a number" if count == 1 else f"{count} numbers"
+    if len(numbers) not in counts:
+        what = "a number" if counts == (1,) else f"{' or '.join(map(str, counts))} numbers"
         raise QuantityError(f"must be {what} in {_list_units(kind)}, got {_shorten(value)}")
     return numbers
 

@@ -18,6 +18,7 @@ from planner_jax.core.errors import ArgumentError
 GRAVITY = 9.81  # [m/s^2], used to check that the quadrotor can hover
 
 NET, RACKET = "net", "racket"
+COUNTS = (4, 6, 8)  # numbers of rotors
 
 # Rules of numbers: the text of an error message, and the function that tests a number.
 _FINITE = ("finite", lambda x: True)
@@ -46,9 +47,9 @@ class Tool:
 
 @dataclasses.dataclass(frozen=True)
 class Rotors:
-    """Four rotors; neighbouring rotors turn in opposite directions."""
+    """R = 4, 6 or 8 rotors; each rotor turns in the direction opposite to the next rotor's."""
 
-    places: tuple[tuple[float, float], ...]  # (4, 2) [m], x and y of rotors, counter-clockwise
+    places: tuple[tuple[float, float], ...]  # (R, 2) [m], x and y of rotors, counter-clockwise
     max_thrust: float  # [N], of one rotor
     min_thrust: float = 0.0  # [N], of one rotor
     torque_ratio: float = 0.016  # [m], drag torque of a rotor divided by its thrust
@@ -56,8 +57,9 @@ class Rotors:
     radius: float = 0.06  # [m], of a propeller; used only for pictures
 
     def __post_init__(self) -> None:
-        is_shaped = np.shape(self.places) == (4, 2)
-        require(is_shaped, "rotors.places", "4 of 2 numbers", self.places)
+        is_shaped = len(self.places) in COUNTS and np.shape(self.places)[1:] == (2,)
+        rule = "x and y of 4, 6 or 8 rotors"
+        require(is_shaped, "rotors.places", rule, shown=f"{len(self.places)} rotors")
         require(bool(np.isfinite(self.places).all()), "rotors.places", "finite", self.places)
         least = self.min_thrust
         _require("rotors.min_thrust", least, *_NOT_NEGATIVE)
@@ -65,40 +67,49 @@ class Rotors:
         _require("rotors.torque_ratio", self.torque_ratio, *_POSITIVE)
         _require("rotors.lag", self.lag, *_POSITIVE)
         _require("rotors.radius", self.radius, *_POSITIVE)
-        if abs(np.linalg.det(self.allocation)) < 1e-12:
+        square = self.allocation @ self.allocation.T
+        if np.linalg.det(square) < 1e-24:
             raise ArgumentError("rotors.places", "them turn the body", self.places, verb="let")
 
     @property
     def positions(self) -> np.ndarray:
-        """Centres of the rotors (4, 3) [m], body frame."""
+        """Centres of the rotors (R, 3) [m], body frame."""
         return np.pad(np.asarray(self.places, float), ((0, 0), (0, 1)))
 
     @property
     def torque_arms(self) -> np.ndarray:
-        """Drag torque of each rotor about body z, divided by the rotor's thrust, (4,) [m]."""
-        return self.torque_ratio * np.array([1.0, -1.0, 1.0, -1.0])
+        """Drag torque of each rotor about body z, divided by the rotor's thrust, (R,) [m]."""
+        return self.torque_ratio * np.resize([1.0, -1.0], len(self.places))
 
     @property
     def allocation(self) -> np.ndarray:
-        """Matrix (4, 4) from rotor thrusts [N] to total thrust [N] and torque [N m]."""
+        """Matrix (4, R) from rotor thrusts [N] to total thrust [N] and torque [N m]."""
         x, y = np.asarray(self.places, float).T
-        return np.stack([np.ones(4), y, -x, self.torque_arms])
+        return np.stack([np.ones(len(x)), y, -x, self.torque_arms])
 
     @property
     def mixer(self) -> np.ndarray:
-        """Matrix (4, 4) from total thrust [N] and torque [N m] to rotor thrusts [N]."""
-        return np.linalg.inv(self.allocation)
+        """Matrix (R, 4) from total thrust [N] and torque [N m] to the least rotor thrusts [N]."""
+        is_square = len(self.places) == 4
+        return np.linalg.inv(self.allocation) if is_square else np.linalg.pinv(self.allocation)
 
     @property
     def shares(self) -> np.ndarray:
-        """Fraction (4,) of the total thrust that each rotor produces if there is no torque."""
+        """Fraction (R,) of the total thrust that each rotor produces if there is no torque."""
         return self.mixer[:, 0]
 
 
-def place_in_cross(diagonal: float) -> tuple[tuple[float, float], ...]:
-    """Return x and y [m] of four rotors on a square whose `diagonal` [m] joins opposite rotors."""
-    half = 0.5 * diagonal * math.sqrt(0.5)
-    return ((half, half), (-half, half), (-half, -half), (half, -half))
+def place_in_cross(diagonal: float, count: int = 4) -> tuple[tuple[float, float], ...]:
+    """Return x and y [m] of rotors on a regular polygon whose `diagonal` [m] joins opposite rotors.
+
+    The front of the body is in the middle between two rotors.
+    """
+    if count == 4:
+        half = 0.5 * diagonal * math.sqrt(0.5)
+        return ((half, half), (-half, half), (-half, -half), (half, -half))
+    angles = (np.arange(count) + 0.5) * 2.0 * np.pi / count
+    places = 0.5 * diagonal * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    return tuple((x, y) for x, y in places.tolist())
 
 
 @dataclasses.dataclass(frozen=True)
@@ -138,7 +149,9 @@ class QuadrotorModel:
 
     name: str
     mass: float  # [kg]
-    inertia: tuple[float, float, float]  # [kg m^2], principal moments about the body's axes
+    # [kg m^2], about the body's axes: the moments I_xx, I_yy, I_zz, and if they are not 0 also the
+    # other entries I_xy, I_xz, I_yz of the inertia matrix
+    inertia: tuple[float, ...]
     rotors: Rotors
     tool: Tool
     limits: FlightLimits
@@ -146,19 +159,28 @@ class QuadrotorModel:
 
     def __post_init__(self) -> None:
         _require("mass", self.mass, *_POSITIVE)
-        require(np.shape(self.inertia) == (3,), "inertia", "3 numbers", self.inertia)
-        for axis in self.inertia:
-            _require("inertia", axis, *_POSITIVE)
-        is_body = 2.0 * max(self.inertia) <= sum(self.inertia) * (1.0 + 1e-9)
-        require(is_body, "inertia", "of a body, none above the other two together", self.inertia)
-        weight, most = self.mass * GRAVITY, 4.0 * self.rotors.max_thrust
+        require(np.shape(self.inertia) in ((3,), (6,)), "inertia", "3 or 6 numbers", self.inertia)
+        for k, axis in enumerate(self.inertia):
+            _require("inertia", axis, *(_POSITIVE if k < 3 else _FINITE))
+        moments = np.linalg.eigvalsh(self.inertia_matrix)
+        is_body = moments[0] > 0.0 and 2.0 * moments[2] <= sum(moments) * (1.0 + 1e-9)
+        require(
+            bool(is_body), "inertia", "of a body, none above the other two together", self.inertia
+        )
+        num = len(self.rotors.places)
+        weight, most = self.mass * GRAVITY, num * self.rotors.max_thrust
         rule = f"> the weight of {weight:.3g} N"
-        require(most > weight, "4 x rotors.max_thrust", rule, shown=f"{most:.3g} N")
+        require(most > weight, f"{num} x rotors.max_thrust", rule, shown=f"{most:.3g} N")
         lift = weight * self.rotors.shares
         if not np.all((lift > self.rotors.min_thrust) & (lift < self.rotors.max_thrust)):
             shown = " ".join(f"{each:.3g}" for each in lift)
             rule = "each rotor carry its part of the weight"
             raise ArgumentError("rotors.places", rule, verb="let", shown=f"{shown} N")
+        low, high = self.rotor_range or (0.0, math.inf)
+        if not np.all((lift > low) & (lift < high)):
+            rule = f"the robot hover with {max(lift):.4g} N a rotor"
+            used = f"{low:.4g} to {high:.4g} N, {self.limits.rotor_share:.0%} of a rotor's range"
+            raise ArgumentError("limits.rotor_share", rule, verb="let", shown=used)
         thrust = self.limits.thrust
         if thrust is not None and not thrust[0] < GRAVITY < thrust[1]:
             rule = f"the weight of {GRAVITY} m/s^2"
@@ -168,12 +190,19 @@ class QuadrotorModel:
         return repr(self.name)
 
     @property
+    def inertia_matrix(self) -> np.ndarray:
+        """Inertia matrix (3, 3) [kg m^2] about the body's axes."""
+        x, y, z, xy, xz, yz = (*self.inertia, 0.0, 0.0, 0.0)[:6]
+        return np.array([[x, xy, xz], [xy, y, yz], [xz, yz, z]])
+
+    @property
     def thrust_bounds(self) -> tuple[float, float]:
         """Least, greatest thrust per unit mass [m/s^2]: `limits.thrust`; if None, by the rotors."""
         if self.limits.thrust is not None:
             return self.limits.thrust
         low, high = self.rotor_range or (self.rotors.min_thrust, self.rotors.max_thrust)
-        return 4.0 * low / self.mass, 4.0 * high / self.mass
+        num = len(self.rotors.places)
+        return num * low / self.mass, num * high / self.mass
 
     @property
     def rotor_range(self) -> tuple[float, float] | None:

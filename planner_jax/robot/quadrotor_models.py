@@ -138,7 +138,7 @@ def _summarise(model: QuadrotorModel) -> dict[str, str]:
         "robot": model.name,
         "mass [kg]": f"{model.mass:g}",
         "across [m]": f"{across:.3g}",
-        "thrust/weight": f"{4.0 * rotors.max_thrust / (model.mass * GRAVITY):.2f}",
+        "thrust/weight": f"{len(rotors.places) * rotors.max_thrust / (model.mass * GRAVITY):.2f}",
         "lag [ms]": f"{1e3 * rotors.lag:g}",
         "tool": f"{model.tool.kind} of {model.tool.radius:g} m",
         "speed [m/s]": f"{limits.speed:g}",

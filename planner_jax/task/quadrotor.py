@@ -16,6 +16,7 @@ from planner_jax.core.rules import Field, Table
 from planner_jax.robot.quadrotor import QuadrotorLimits, RotorLimits
 from planner_jax.robot.quadrotor_model import NET, QuadrotorModel, Tool
 
+_MOMENTS = rules.Rule("> 0", lambda x, _: (x > 0.0) | (np.arange(x.shape[-1]) > 2))
 # Shapes and ranges of the quadrotor's limits, for the cases of hits and of catches.
 FLIGHT_RULES: Table = (
     Field("limits.speed", (), rules.POSITIVE),
@@ -25,8 +26,8 @@ FLIGHT_RULES: Table = (
     Field("limits.min_thrust", (), rules.below("limits.max_thrust")),
     Field("limits.max_thrust", (), rules.POSITIVE_OR_NONE),
     Field("limits.rotors.mass", (), rules.POSITIVE),
-    Field("limits.rotors.inertia", (3,), rules.POSITIVE),
-    Field("limits.rotors.mixer", (4, 4)),
+    Field("limits.rotors.inertia", ("I",), _MOMENTS),
+    Field("limits.rotors.mixer", ("R", 4)),
     Field("limits.rotors.min_thrust", (), rules.NOT_NEGATIVE),
     Field("limits.rotors.min_thrust", (), rules.below("limits.rotors.max_thrust")),
     Field("limits.rotors.max_thrust", ()),
@@ -105,8 +106,8 @@ def _rotors_of(robot: QuadrotorModel, leaf: Callable[..., Array]) -> RotorLimits
     least, most = robot.rotor_range
     return RotorLimits(
         mass=leaf("robot.mass", robot.mass),
-        inertia=leaf("robot.inertia", robot.inertia, 3),
-        mixer=leaf("robot.rotors", robot.rotors.mixer, 4, 4),
+        inertia=leaf("robot.inertia", robot.inertia, len(robot.inertia)),
+        mixer=leaf("robot.rotors", robot.rotors.mixer, len(robot.rotors.places), 4),
         min_thrust=leaf("robot.rotors.min_thrust", least),
         max_thrust=leaf("robot.rotors.max_thrust", most),
     )

@@ -7,7 +7,7 @@ from planner_jax.robot.quadrotor_model import Rotors
 
 
 def rotor_thrusts(rotors: Rotors, thrust: Array, torque: Array, spare: float) -> Array:
-    """Return rotor thrusts (4,) [N] that produce a thrust and a torque, within the rotors' limits.
+    """Return rotor thrusts (R,) [N] that produce a thrust and a torque, within the rotors' limits.
 
     If the rotors cannot produce thrust and torque completely, roll and pitch have priority over
     thrust, since otherwise the thrust would point in a wrong direction. Thrust has priority over
@@ -21,11 +21,12 @@ def rotor_thrusts(rotors: Rotors, thrust: Array, torque: Array, spare: float) ->
         spare: [N], greatest increase of a rotor's thrust in favour of a torque.
     """
     least, most = rotors.min_thrust, rotors.max_thrust
-    # Each rotor's fraction of a thrust that causes no torque, times 4: 1 for symmetric rotors.
-    share = jnp.asarray(4.0 * rotors.shares, torque.dtype)
+    # Each rotor's fraction of a thrust that causes no torque, times R: 1 for symmetric rotors.
+    num = len(rotors.places)
+    share = jnp.asarray(num * rotors.shares, torque.dtype)
     inverse = jnp.asarray(rotors.mixer, torque.dtype)
     turning = jnp.matmul(inverse[:, 1:3], torque[:2], precision=lax.Precision.HIGHEST)
-    lift = 0.25 * thrust * share
+    lift = thrust / num * share
     room = jnp.maximum(lift + spare - least, 0.0) / jnp.maximum(-turning, 1e-6)
     turning *= jnp.minimum(jnp.min(jnp.where(turning < 0.0, room, 1.0)), 1.0)
     wanted = lift + turning

@@ -70,7 +70,7 @@ def rotation_error(R: Array, R_wanted: Array) -> Array:
 def control(
     state: RobotState, reference: Reference, model: QuadrotorModel, gains: Gains, world: World
 ) -> Array:
-    """Return rotor thrusts (4,) [N] that track a planned state, for one quadrotor.
+    """Return rotor thrusts (R,) [N] that track a planned state, for one quadrotor.
 
     Args:
         state: estimated state of the quadrotor.
@@ -100,9 +100,10 @@ def control(
     # The correction is bounded, since saturated rotors could not stop a fast rotation in time.
     back = jnp.clip(stiffness * rotation_error(R, R_wanted), -gains.correction, gains.correction)
     rate = turn - half * reference.angular_acc + back
-    inertia = jnp.asarray(model.inertia, acc.dtype)
+    inertia = jnp.asarray(model.inertia_matrix, acc.dtype)
     angular_acc = reference.angular_acc + reference.torque_lead
     angular_acc += gains.rate * (rate - state.rate)
-    torque = inertia * angular_acc + jnp.cross(state.rate, inertia * state.rate)
+    spin = jnp.matmul(inertia, state.rate, precision=highest)
+    torque = jnp.matmul(inertia, angular_acc, precision=highest) + jnp.cross(state.rate, spin)
     spare = gains.spare * model.rotors.max_thrust
     return rotor_thrusts(model.rotors, jnp.maximum(thrust, 0.0), torque, spare)

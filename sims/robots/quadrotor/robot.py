@@ -56,9 +56,10 @@ class Quadrotor:
             f'dyntype="filterexact" dynprm="{xml_numbers(rotors.lag)}"/>'
             for i, torque in enumerate(rotors.torque_arms)
         )
+        inertia = "diaginertia" if len(model.inertia) == 3 else "fullinertia"
         body = (
             '<body name="quadrotor"><freejoint/><inertial pos="0 0 0" '
-            f'mass="{model.mass}" diaginertia="{xml_numbers(*model.inertia)}"/>'
+            f'mass="{model.mass}" {inertia}="{xml_numbers(*model.inertia)}"/>'
             f"{discs}{self._tool_xml()}</body>"
         )
         return body, motors
@@ -92,7 +93,7 @@ class Quadrotor:
         )
 
     def drive(self, physics: Physics, command: Array, timestep: float) -> tuple[Array, Array]:
-        """Return the command unchanged, as rotor thrusts (4,) [N], and zero extra forces."""
+        """Return the command unchanged, as rotor thrusts (R,) [N], and zero extra forces."""
         return command, jnp.zeros(self.num_vel, command.dtype)
 
     def state(self, physics: Physics) -> RobotState:
