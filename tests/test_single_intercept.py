@@ -16,6 +16,7 @@ from planner_jax.cli.plan.intercept import SingleIntercept, read_case
 from planner_jax.cli.plan.settings import SingleInterceptSettings
 from planner_jax.plane.maps import MapError
 from planner_jax.task.intercept.spec import TASK
+from tests.planners import ONE_SEARCH
 
 CASE = {
     "target": {"position": [3.0, 4.6], "velocity": [0.0, -0.1]},
@@ -25,6 +26,13 @@ CASE = {
     "mover_velocities": [0, 0.4],
     "speed": 1.6,
 }
+
+
+@pytest.fixture
+def one_search(monkeypatch):
+    """Let the command plan by one search, because all searches compile for half a minute."""
+    options = {"searches": ONE_SEARCH}
+    monkeypatch.setattr(SingleInterceptSettings, "planner_options", lambda self: options)
 
 
 def write_case(folder, **fields):
@@ -79,7 +87,7 @@ def test_a_target_out_of_reach_is_reported_with_the_limit_that_fails(tmp_path, c
     assert "Referee on the best plan found: " in printed
 
 
-def test_limits_that_need_to_be_relaxed_are_printed_for_an_unsolved_case(tmp_path):
+def test_limits_that_need_to_be_relaxed_are_printed_for_an_unsolved_case(tmp_path, one_search):
     single = SingleIntercept(
         TASK, SingleInterceptSettings(planner="spacetime", map=str(write_case(tmp_path)))
     )
@@ -153,7 +161,7 @@ def test_a_bad_field_ends_the_command_with_code_2(tmp_path, capsys):
     assert line == f"planner-jax: error: {path}: speed must be > 0, got -1\n"
 
 
-def test_infinite_limits_have_no_row(tmp_path):
+def test_infinite_limits_have_no_row(tmp_path, one_search):
     settings = SingleInterceptSettings(map=str(write_case(tmp_path, steering_rate=float("inf"))))
     task = pj.task_named("intercept")
     single = SingleIntercept(task, settings.of(task))
