@@ -35,12 +35,12 @@ class ArmState:
     """The variables that change while an arm follows its course (a timed joint motion)."""
 
     physics: Physics
-    torques: Array  # (6,) [N m], acting torques
-    squared_error: Array  # (6,) [rad^2 s], integral of the squared angle error
-    worst_error: Array  # (6,) [rad], greatest angle error
-    squared_torque: Array  # (6,) [N^2 m^2 s], integral of the squared torque
-    worst_torque: Array  # (6,) [N m], greatest torque
-    saturated: Array  # (6,) [s], time during which the command exceeded the torque limit
+    torques: Array  # (n,) [N m], acting torques
+    squared_error: Array  # (n,) [rad^2 s], integral of the squared angle error
+    worst_error: Array  # (n,) [rad], greatest angle error
+    squared_torque: Array  # (n,) [N^2 m^2 s], integral of the squared torque
+    worst_torque: Array  # (n,) [N m], greatest torque
+    saturated: Array  # (n,) [s], time during which the command exceeded the torque limit
     time: Array  # () [s]
     key: Array
 
@@ -52,7 +52,7 @@ class _Setting:
     course: Course
     since: Array  # () [s], start of the interval in which errors and torques are summed
     until: Array  # () [s], end of that interval
-    torques: Array  # (6,) [N m], torque limits
+    torques: Array  # (n,) [N m], torque limits
     lag: Array  # () [s], first-order lag of the torques
     stds: Array  # (2,), standard deviations of measured angles [rad] and rates [rad/s]
     mass_error: Array  # (), relative error of the masses in the controller's model
@@ -66,16 +66,16 @@ class Executed:
     """
 
     times: np.ndarray  # (S,) [s], times of the frames; the first is 0
-    angles: np.ndarray  # (B, S, 6) [rad], joint angles of the simulated arms
-    wanted: np.ndarray  # (B, S, 6) [rad], planned angles, without the drives' delays
+    angles: np.ndarray  # (B, S, n) [rad], joint angles of the simulated arms
+    wanted: np.ndarray  # (B, S, n) [rad], planned angles, without the drives' delays
     tracking: np.ndarray  # (B, 2) [m], distance of the shield's centre from its plan: rms and worst
-    # (B, 6) [rad], rms difference of joint angles and the commanded motion, which may start late.
+    # (B, n) [rad], rms difference of joint angles and the commanded motion, which may start late.
     error_rms: np.ndarray
-    error_worst: np.ndarray  # (B, 6) [rad], greatest error of each joint from the commanded motion
-    torque_rms: np.ndarray  # (B, 6) [N m], rms torque of each joint
-    torque_worst: np.ndarray  # (B, 6) [N m], greatest torque of each joint
-    saturation: np.ndarray  # (B, 6), fraction of the time in which a drive was at its torque limit
-    last_rates: np.ndarray  # (B, 6) [rad/s], rates at the last frame, where another plan may start
+    error_worst: np.ndarray  # (B, n) [rad], greatest error of each joint from the commanded motion
+    torque_rms: np.ndarray  # (B, n) [N m], rms torque of each joint
+    torque_worst: np.ndarray  # (B, n) [N m], greatest torque of each joint
+    saturation: np.ndarray  # (B, n), fraction of the time in which a drive was at its torque limit
+    last_rates: np.ndarray  # (B, n) [rad/s], rates at the last frame, where another plan may start
 
 
 def _arm(world: World) -> ShieldArm:
@@ -187,6 +187,9 @@ def execute(
         raise ArgumentError("world", "an arm", verb="hold", shown=f"a {type(world.robot).__name__}")
     if not np.isclose(world.timestep, TIMESTEP):
         raise ArgumentError("timestep", f"{TIMESTEP:g}", world.timestep)
+    joints = world.robot.num_pos
+    if len(drives.torques) != joints:
+        raise ArgumentError("torques", f"{joints} numbers", drives.torques)
     start, advance, wanted = _compile(world)
     dtype = jnp.asarray(courses.begin).dtype
     num = len(courses.begin)

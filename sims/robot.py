@@ -66,9 +66,21 @@ class Robot(Protocol):
     """The protocol of a simulated robot; `world` is the `sims.model.World` that holds it."""
 
     WORDS: ClassVar[str]  # description of simulation and control, for the report of a run
-    num_pos: ClassVar[int]  # R, number of the robot's joint positions in `qpos`
-    num_vel: ClassVar[int]  # R', number of the robot's joint velocities in `qvel`
-    noise_shape: ClassVar[tuple[int, ...]]  # shape of the standard normal noise that `sense` uses
+
+    @property
+    def num_pos(self) -> int:
+        """R, the number of the robot's joint positions in `qpos`."""
+        ...
+
+    @property
+    def num_vel(self) -> int:
+        """R', the number of the robot's joint velocities in `qvel`."""
+        ...
+
+    @property
+    def noise_shape(self) -> tuple[int, ...]:
+        """Shape of the standard normal noise that `sense` uses."""
+        ...
 
     def mjcf(self) -> tuple[str, str]:
         """Return two texts in MJCF, MuJoCo's model format: the robot's body, and its actuators."""

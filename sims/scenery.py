@@ -17,15 +17,16 @@ _SIDES, _RINGS = 14, 3  # numbers of facets of a drawn capsule, around its axis 
 
 @dataclasses.dataclass(frozen=True)
 class Part:
-    """An upright box or cylinder of the surroundings, for drawing."""
+    """An upright box or cylinder, or a convex hull of points, of the surroundings, for drawing."""
 
-    kind: str  # "box" or "cylinder"
+    kind: str  # "box", "cylinder" or "hull"
     # [m]: length, width, height; length and width of a cylinder both are its diameter.
     size: tuple[float, float, float]
     centre: tuple[float, float, float]  # [m], world frame
     colour: str  # as #RRGGBB
     turn: float = 0.0  # [rad], rotation about z
     opacity: float = 1.0  # less than 1 for transparent parts
+    corners: tuple[tuple[float, float, float], ...] = ()  # [m], of a hull, in the world frame
 
     @property
     def quat_wxyz(self) -> tuple[float, float, float, float]:
@@ -89,7 +90,9 @@ def machine_parts(mouth: Sequence[float] | np.ndarray, heading: float) -> list[P
 
 
 def outlines(part: Part) -> list[np.ndarray]:
-    """Return the edges of a part as lines of points [m], in the world frame."""
+    """Return the edges of a part as lines of points [m], in the world frame; a hull has none."""
+    if part.corners:
+        return []
     if part.kind == "box":
         angle = np.linspace(0.25, 2.25, 5) * np.pi
         ring = np.sign(np.stack([np.cos(angle), np.sin(angle)], axis=1))
@@ -114,6 +117,14 @@ def hull(points: np.ndarray) -> Solid:
     inward = np.sum(np.cross(b - a, c - a) * found.equations[:, :3], axis=1) < 0.0
     triangles = np.where(inward[:, None], found.simplices[:, ::-1], found.simplices)
     return Solid(points, triangles)
+
+
+def make_hull_part(points: np.ndarray, colour: str) -> Part:
+    """Return the convex hull of P points (P, 3) [m] as a part."""
+    corners = points[np.unique(ConvexHull(points).vertices)]
+    size, (x, y, z) = np.ptp(corners, axis=0), corners.mean(axis=0)
+    # Slightly transparent, as films fill transparent parts alone.
+    return Part("hull", (*size,), (x, y, z), colour, 0.0, 0.95, (*map(tuple, corners.tolist()),))
 
 
 def box_solid(lower: np.ndarray, upper: np.ndarray) -> Solid:
@@ -142,6 +153,8 @@ def capsule_solid(first: np.ndarray, second: np.ndarray, radius: float) -> Solid
 
 def part_solid(part: Part) -> Solid:
     """Return the surface of a part in the world frame; a cylinder becomes a prism."""
+    if part.corners:
+        return hull(np.array(part.corners))
     return hull(np.concatenate([line[:-1] for line in outlines(part)[:2]]))
 
 
@@ -156,7 +169,9 @@ def xml_colour(colour: str, opacity: float = 1.0) -> str:
 
 
 def part_xml(part: Part) -> str:
-    """Return a part of the surroundings as an MJCF geom."""
+    """Return a part of the surroundings as an MJCF geom; hulls are left out."""
+    if part.corners:
+        return ""
     length, width, height = (0.5 * size for size in part.size)
     half = (length, width, height) if part.kind == "box" else (length, height)
     return (

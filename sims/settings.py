@@ -13,7 +13,7 @@ from planner_jax.core.registry import Task, all_tasks, split_name
 from planner_jax.runs.settings import Options, option, require_count
 from planner_jax.sims.noise import NOISES, PLANE_NOISES, PlaneSensing, Sensing, require_whole
 from planner_jax.sims.robots.arm.drives import ENCODERS, TORQUES, Drives
-from planner_jax.sweep.block.settings import REGIMES, require_moderate
+from planner_jax.sweep.block.settings import REGIMES, ArmSettings, require_moderate
 from planner_jax.sweep.quadrotor_settings import resolve_robot, robot_option
 from planner_jax.task.block.spec import TASK as BLOCK
 from planner_jax.task.catch.spec import DECISIONS, TRAINED
@@ -272,7 +272,7 @@ class InterceptFly(FlySettings):
 
 
 @dataclasses.dataclass(frozen=True)
-class BlockFly(FlySettings):
+class BlockFly(ArmSettings, FlySettings):
     """Settings of flights of thrown balls, which an arm with a shield is to block.
 
     The defaults with `perception` are settings under which the arm blocks most of the balls.
@@ -329,12 +329,14 @@ class BlockFly(FlySettings):
 
     def __post_init__(self) -> None:
         seen = self.perception
-        usual = {"suite": "short" if seen else "pole", "regime": "R1" if seen else "R2"}
+        fast = seen and self.arm is None  # another arm has limits of its own
+        usual = {"suite": "short" if seen else "pole", "regime": "R1" if fast else "R2"}
         for name, value in {**usual, "wide": seen}.items():
             if vars(self)[name] is None:
                 object.__setattr__(self, name, value)
         require_one_of(ENCODERS, "encoders", self.encoders)
         require_one_of(REGIMES, "regime", self.regime)
+        self.require_own_limits(str(self.regime))
         require_one_of(BLOCK.suites, "suite", self.suite)
         for name in ("observe", "planning_budget", "noise", "lag", "latency"):
             require_moderate(name, getattr(self, name))
@@ -369,16 +371,15 @@ class BlockFly(FlySettings):
         usual = 0.05 if self.perception else 0.03
         return usual if self.planning_budget is None else self.planning_budget
 
-    @property
-    def drives(self) -> Drives:
-        """The torque limits and errors of the arm's drives and encoders.
+    def drives(self, torques: tuple[float, ...] = TORQUES) -> Drives:
+        """Return the drives with scaled limits `torques` [N m], and the errors of the encoders.
 
         Raises:
             ValueError: a value is out of its range.
         """
         angle_std, rate_std = ENCODERS[self.encoders]
         return Drives(
-            torques=tuple(self.torque * each for each in TORQUES),
+            torques=tuple(self.torque * each for each in torques),
             lag=self.lag,
             latency=self.latency,
             angle_std=angle_std,
@@ -402,7 +403,7 @@ class BlockFly(FlySettings):
 
     def draw_options(self) -> Options:
         """Return the arguments of `pj.block.draw` that these settings specify."""
-        return {"regime": self.regime, "wide": self.wide}
+        return {"regime": self.regime, "wide": self.wide} | self.arm_options()
 
     def check_rate(self) -> None:
         """Raise `ValueError` for invalid drives of the arm, or for replanning without a camera.
@@ -412,4 +413,4 @@ class BlockFly(FlySettings):
         rule = ">= 0, and 0 without perception: a block is planned once"
         most = math.inf if self.perception else 1e-9
         require(0.0 <= self.rate < most, "replan", rule, self.rate)
-        _ = self.drives
+        _ = self.drives()

@@ -22,7 +22,7 @@ from planner_jax.runs.style import BLUE, GREEN, GREY, INK, RED, SKY
 from planner_jax.sims.film import BALL_COLOURS
 from planner_jax.sims.guard import guard_server
 from planner_jax.sims.recording import Recording, frame
-from planner_jax.sims.scenery import GROUND_COLOUR, Part, machine_parts
+from planner_jax.sims.scenery import GROUND_COLOUR, Part, machine_parts, part_solid
 from planner_jax.sims.task import FlightTask
 
 _RATE = 30.0  # [Hz], rate of the displayed frames
@@ -236,7 +236,9 @@ class Viewer:
             if part.opacity < 1.0:
                 style["opacity"] = part.opacity
             own = f"{name}/{number}"
-            if part.kind == "box":
+            if part.corners:
+                drawn.append(self._add_mesh(own, *part_solid(part), part.colour))
+            elif part.kind == "box":
                 drawn.append(self._scene.add_box(own, dimensions=part.size, **style))
             else:
                 radius, height = 0.5 * part.size[0], part.size[2]

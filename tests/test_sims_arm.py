@@ -6,8 +6,11 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
+from arms import KINDS as ARMS
+from arms import mjcf_of
 from test_block_library import make_library
 
 import planner_jax as pj
@@ -16,10 +19,11 @@ from planner_jax.cli.main import main
 from planner_jax.core.errors import ArgumentError
 from planner_jax.referee.arm_clearance import KINDS
 from planner_jax.robot.arm import shield_pose
-from planner_jax.robot.arm_file import irb1600
+from planner_jax.robot.arm_file import Shield, irb1600
 from planner_jax.sims.execution import FRAME, TIMESTEP, Executed, execute
 from planner_jax.sims.film import draw_flight
 from planner_jax.sims.launch import flight_keys
+from planner_jax.sims.model import World, mjcf
 from planner_jax.sims.perception.observation import eye, see
 from planner_jax.sims.perception.receding import Decided
 from planner_jax.sims.robot import rotation
@@ -39,9 +43,12 @@ from planner_jax.sims.tasks.block_flights import (
     score,
     throws,
 )
+from planner_jax.sims.tasks.block_shown import ground_of, scenery
 from planner_jax.sims.tasks.intercept import CAR_WORLD
 from planner_jax.sims.view import Viewer
 from planner_jax.task.block.motion import polynomial, profiles
+from planner_jax.task.block.scene import FLOOR
+from planner_jax.task.block.suites import GRAVITY
 
 HOME, LANES = np.asarray(irb1600().home), 4  # all batches are of one size: one program
 TURN = np.array([-0.4, -0.5, 0.4, 0.6, -0.5, 0.8])  # [rad], of a motion without collisions
@@ -151,6 +158,71 @@ def test_noise_lag_and_mass_errors_hardly_matter_and_a_seed_gives_the_same_bits(
     assert flown.tracking[:, 1].max() < 2e-3
 
 
+@pytest.fixture
+def seven(tmp_path):
+    """Return the options of an arm of seven joints in a file, with a shield of 1.5 kg."""
+    own = ARMS["seven joints"]
+    limits = {"position": np.stack([own.lower, own.upper], 1).tolist(), "torque": 50.0}
+    files = {"limits.yaml": {"velocity": 2.0, "acceleration": 9.0, **limits}}
+    files["shield.yaml"] = {"radius": 0.2, "position": [0.0, 0.0, 0.3], "mass": 1.5}
+    for name, fields in files.items():
+        (tmp_path / f"arm.{name}").write_text(json.dumps(fields))
+    body = '<site name="shield"'
+    ball = '<geom type="sphere" size=".02" mass="0"/>'
+    (tmp_path / "arm.xml").write_text(mjcf_of(own).replace(body, ball + body))
+    names = {"arm": "arm.xml", "shield": "arm.shield.yaml"}
+    return {name: str(tmp_path / file) for name, file in names.items()} | {"tip": "shield"}
+
+
+def test_an_arm_of_a_file_is_simulated_as_mujoco_reads_it(seven):
+    flight = BlockFly(num=1, torque=0.5, **seven).flight()
+    robot, own = flight.robot, ARMS["seven joints"]
+    assert robot.noise_shape == (2, 7) and flight.drives.torques == (25.0,) * 7
+    model, read = (
+        mujoco.MjModel.from_xml_string(text)
+        for text in (mjcf(World(robot, GRAVITY, num_balls=0)), mjcf_of(own))
+    )
+    np.testing.assert_allclose(model.body_mass[-7:], [1.0] * 6 + [2.5])
+    angles = np.linspace(0.3, 0.9, 7) * own.upper
+    states = [mujoco.MjData(each) for each in (model, read)]
+    for each, state in zip((model, read), states, strict=True):
+        state.qpos[:] = angles
+        mujoco.mj_forward(each, state)
+    here, there = states
+    site, turn = there.site_xpos[0], there.site_xmat[0].reshape(3, 3)
+    raised = [0.0, 0.0, robot.base_height]
+    np.testing.assert_allclose(robot.place(angles), site + 0.3 * turn[:, 2] + raised, atol=1e-6)
+    plate = model.geom("shield").id
+    face = here.geom_xpos[plate] + 0.005 * here.geom_xmat[plate, ::3]
+    np.testing.assert_allclose(face, robot.place(angles), atol=1e-6)
+    places = robot.places(angles)
+    assert len(places) == len(robot.shapes()) == 9
+    np.testing.assert_allclose(places[7][0], here.xpos[-1], atol=1e-6)
+    (plate,) = robot.shapes()[-1].solids
+    rim = places[-1][0] + plate.corners @ rotation(places[-1][1], np).T
+    away = np.linalg.norm(rim - robot.place(angles), axis=1)
+    assert 0.2 - 1e-6 < away.min() and away.max() < 0.201
+
+
+def test_solids_of_a_scene_are_drawn_where_they_are():
+    turned = (0.9, 0.3, 0.2, 0.0)
+    scene = pj.block.make_scene(
+        boxes=[((0.7, -0.8, 1.0), (0.2, 0.1, 0.3), turned)],
+        spheres=[((1.0, 0.8, 0.5), 0.1)],
+        protected_capsule=([(0.0, 0.0, 0.3), (0.0, 0.0, 1.2)], 0.3),
+    )
+    parts = scenery(irb1600(np.float64), scene)
+    raised = -ground_of(scene)
+    assert ground_of(scene) == FLOOR and ground_of(pj.block.make_scene(floor=-0.3)) == -0.3
+    inner, _, _, ball, box = parts
+    np.testing.assert_allclose(inner.size, (0.6, 0.6, 1.5), atol=1e-6)
+    ball, box = (np.array(each.corners) - [0.0, 0.0, raised] for each in (ball, box))
+    np.testing.assert_allclose(np.linalg.norm(ball - [1.0, 0.8, 0.5], axis=1), 0.1, atol=1e-6)
+    edges = np.linalg.norm(box[:, None] - box[None], axis=2)
+    assert len(box) == 8 and edges.max() == pytest.approx(np.linalg.norm((0.2, 0.1, 0.3)), rel=1e-5)
+    assert np.unique(edges.round(5))[1:4] == pytest.approx((0.1, 0.2, np.hypot(0.1, 0.2)), rel=1e-3)
+
+
 def throw_at_shield(places, speed=8.0):
     turn, middle = map(np.asarray, shield_pose(irb1600(), jnp.asarray(HOME)))
     goal = middle + np.asarray(places) @ turn[:, 1:].T
@@ -175,6 +247,9 @@ def test_a_ball_on_the_shield_is_blocked_and_one_beside_it_is_not():
     assert found.blocked.tolist() == [True, True, False, False]
     assert found.success.tolist() == found.blocked.tolist()
     np.testing.assert_allclose(found.miss, np.linalg.norm(places, axis=1), atol=1e-4)
+    disc = dataclasses.replace(irb1600(), shield_corners=np.array(Shield(radius=0.17).outline))
+    cases = dataclasses.replace(throw_at_shield(places), arm=batch(*[disc] * len(places)))
+    assert score_standstill(cases, HOME).blocked.tolist() == [True, False, True, False]
     # The ball touches the shield's face when the ball's centre is one radius (5 cm) away.
     np.testing.assert_allclose(found.contact[:2], 0.5 - 0.05 / 8.0, atol=1e-4)
     assert np.isnan(found.contact[2:]).all() and np.isnan(found.contact_pos[2:]).all()
@@ -345,6 +420,18 @@ def test_observed_balls_are_blocked_from_the_command_line(tmp_path, capsys):
     assert (out / "figures" / "budget.png").exists()
 
 
+@pytest.mark.slow
+def test_an_arm_of_a_file_blocks_balls_from_the_command_line(tmp_path, seven, capsys):
+    out = tmp_path / "run"
+    options = [word for name, value in seven.items() for word in (f"--{name}", value)]
+    command = ["fly", "block", "--num", "4", "--suite", "open", "--wide", "--encoders", "none"]
+    assert main([*command, *options, "--out", str(out)]) == 0
+    assert "Limits of the arm's file, wide" in capsys.readouterr().out
+    summary = json.loads((out / "manifest.json").read_text())["summary"]
+    assert summary["successes"] == summary["planned"] > 0 and len(summary["error_rms"]) == 7
+    assert max(summary["error_rms"]) < 0.01
+
+
 def test_flights_take_a_library_of_their_limits_and_scene_alone(tmp_path):
     path = tmp_path / "a.lib"
     save_library(path, make_library(regime="R1"))
@@ -368,11 +455,15 @@ def test_another_robot_arm_or_time_is_refused_in_one_line():
         carried = dataclasses.replace(BLOCK_WORLD, timestep=2.0 * TIMESTEP)
         nothing: Any = (None, None)
         execute(carried, *nothing, since=np.zeros(1), until=np.zeros(1), end=1.0)
+    with pytest.raises(ValueError, match=r"^torques must be 6 numbers, got \(1.0, 2.0\)$"):
+        fly_blocks(
+            BLOCK_WORLD, cases, drives=Drives(torques=(1.0, 2.0)), plan=plans(STILL, contact=0.5)
+        )
     rule = "planning_budget must be >= 0 and <= the delay 0.1, got 0.2"
     with pytest.raises(ValueError, match=f"^{rule}$"):
         fly_blocks(BLOCK_WORLD, cases, planning_budget=0.2)
     heavy = dataclasses.replace(cases.cases.arm, mass=2.0 * cases.cases.arm.mass)
     with pytest.raises(ValueError, match="^mass must be the same in plan and simulated arm$"):
         require_arm(BLOCK_WORLD, dataclasses.replace(cases.cases, arm=heavy))
-    with pytest.raises(ValueError, match="^torques must be six numbers > 0, got "):
-        Drives(torques=(1.0, 2.0))
+    with pytest.raises(ValueError, match="^torques must be numbers > 0, got "):
+        Drives(torques=(1.0, -2.0))

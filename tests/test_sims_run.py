@@ -48,6 +48,8 @@ BlockFly(perception=True, frame_rate=0.0) | frame_rate must be finite and > 0, g
 BlockFly(perception=True, planner="library:some.lib") | planner must be one other than 'library' wi
 BlockFly(encoders="no") | encoders must be one of none, fine, coarse, got 'no'
 BlockFly(observe=-0.1) | observe must be finite and >= 0, got -0.1
+BlockFly(tip="flange") | tip must be left out without --arm, got 'flange'
+BlockFly(arm="arm.xml", regime="R1") | regime must be left out with --arm, which has limits of its o
 BlockFly(mass_error=-1.0) | mass_error must be > -1 and < 1, got -1
 """.strip().splitlines()
 
@@ -59,6 +61,7 @@ def test_blocks_with_a_camera_have_defaults_of_their_own():
 
     assert of() == ("pole", "R2", False)
     assert of(perception=True) == ("short", "R1", True)
+    assert of(perception=True, arm="arm.xml") == ("short", "R2", True)  # R2: limits of the file
     assert of(perception=True, wide=False, suite="open", regime="R3") == ("open", "R3", False)
 
 

@@ -290,7 +290,7 @@ class _Arms:
 
 def _still(cases: BlockCase, shape: tuple[int, ...]) -> PiecewisePolynomial:
     num, dtype = cases.batch_shape[0], cases.gravity.dtype
-    coeffs = np.zeros((num, *shape, 6), dtype)
+    coeffs = np.zeros((num, *shape, cases.angles.shape[1]), dtype)
     coeffs[:, :, 0], coeffs[:, :, 1] = cases.angles[:, None], cases.rates[:, None]
     durations = np.zeros((num, shape[0]), dtype)
     return PiecewisePolynomial(coeffs=host_leaf(coeffs), durations=host_leaf(durations))

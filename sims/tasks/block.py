@@ -1,6 +1,7 @@
 """Simulated blocks, in which an arm moves a shield into balls' paths: table, recordings, report."""
 
 import dataclasses
+import functools
 import zlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -21,10 +22,11 @@ from planner_jax.sims.model import World
 from planner_jax.sims.perception.observation import eye
 from planner_jax.sims.perception.receding import Decided, decide
 from planner_jax.sims.recording import Recording
+from planner_jax.sims.robots.arm.drives import Drives
+from planner_jax.sims.robots.arm.robot import ShieldArm
 from planner_jax.sims.settings import BlockFly
 from planner_jax.sims.task import FlightTask
 from planner_jax.sims.tasks.block_flights import (
-    BLOCK_ARM,
     BLOCK_WORLD,
     FALL,
     TOUCH,
@@ -39,15 +41,16 @@ from planner_jax.sims.tasks.block_shown import (
     BUDGET,
     budget_figure,
     budget_table,
+    ground_of,
     joint_table,
     scenery,
 )
 from planner_jax.task.block.api import planner as block_planner
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.end_poses import flight_of
-from planner_jax.task.block.scene import FLOOR
+from planner_jax.task.block.scene import Scene
 from planner_jax.task.block.spec import SUITES
-from planner_jax.task.block.suites import BALL_RADIUS
+from planner_jax.task.block.suites import BALL_RADIUS, scene_for
 
 _BOUNCE = 0.5  # restitution of a blocked ball, an assumption that only pictures use
 _KEPT = 5  # number of simulated frames from one recorded sample to the next
@@ -57,6 +60,24 @@ class BlockFlight(FlightTask):
     """The simulation of blocks, which `sims/run.py` calls to simulate, score and draw a run."""
 
     settings: BlockFly
+
+    @functools.cached_property
+    def scene(self) -> Scene:
+        """The obstacles and the protected body."""
+        own = self.settings.arm_options()
+        return own.get("scene") or scene_for(own.get("arm"), has_pole=SUITES[self.suite].has_pole)
+
+    @functools.cached_property
+    def robot(self) -> ShieldArm:
+        """The simulated arm."""
+        own = self.settings
+        height = -ground_of(self.scene)
+        return ShieldArm(height, file=own.arm, tip=own.tip, shield=own.shield)
+
+    @functools.cached_property
+    def drives(self) -> Drives:
+        """The joints' drives, with the torque limits of the arm's file."""
+        return self.settings.drives(self.robot.torques)
 
     THING = "ball"
     THING_RADIUS = BALL_RADIUS
@@ -73,20 +94,20 @@ class BlockFlight(FlightTask):
             ("blocked", "", "whether the shield's face met the ball before the inner box", BOOL),
             ("contact_time", "s", "of ball and shield; NaN without contact", NUMBER, "contact"),
             ("miss", "m", "of the ball from the shield's centre, in its plane; NaN if too late"),
-            ("struck", "", "whether the ball hit base or links 1 to 3 before the contact", BOOL),
+            ("struck", "", "whether the ball hit base or links before the wrist", BOOL),
             ("clearance", "m", "least up to the contact; negative inside"),
             ("nearest", "", "link and obstacle at the least clearance", TEXT),
             ("clearance_after", "m", "least after the contact, while the arm brakes"),
             (
                 "error_rms",
                 "rad",
-                "of the six joints from their commanded course",
+                "of the joints from their commanded course",
                 LIST,
                 "flown.error_rms",
             ),
-            ("error_worst", "rad", "greatest error of the six joints", LIST, "flown.error_worst"),
-            ("torque_rms", "N m", "of the six drives", LIST, "flown.torque_rms"),
-            ("torque_worst", "N m", "of the six drives", LIST, "flown.torque_worst"),
+            ("error_worst", "rad", "greatest error of each joint", LIST, "flown.error_worst"),
+            ("torque_rms", "N m", "of the drives", LIST, "flown.torque_rms"),
+            ("torque_worst", "N m", "of the drives", LIST, "flown.torque_worst"),
             ("saturated", "1", "share of the time at the torque limit", LIST, "flown.saturation"),
             ("motions", "", "number of motions that the arm started", NUMBER),
             ("fit_error", "m", "of the first fit of the ball's flight; NaN if known", NUMBER),
@@ -100,16 +121,16 @@ class BlockFlight(FlightTask):
 
     def world(self) -> World:
         """Return the simulated world with the arm and its drawn surroundings."""
-        return dataclasses.replace(
-            BLOCK_WORLD, scenery=scenery(BLOCK_ARM.arm, SUITES[self.suite].has_pole)
-        )
+        world = dataclasses.replace(BLOCK_WORLD, robot=self.robot)
+        return dataclasses.replace(world, scenery=scenery(self.robot.arm, self.scene))
 
     def parameters(self) -> dict[str, Any]:
         """Return the parameters of joint drives, encoders and control, for the run's manifest."""
-        robot = BLOCK_ARM
+        drives = dataclasses.asdict(self.drives)
+        torques = [each if np.isfinite(each) else None for each in drives["torques"]]
         return {
-            "drives": dataclasses.asdict(self.settings.drives),
-            "gains": dataclasses.asdict(robot.gains),
+            "drives": drives | {"torques": torques},  # None for a joint without a limit
+            "gains": dataclasses.asdict(self.robot.gains),
             "gravity": BLOCK_WORLD.gravity,
             "timestep": BLOCK_WORLD.timestep,
         }
@@ -128,10 +149,10 @@ class BlockFlight(FlightTask):
         if settings.perception:
             decided, seconds, _ = measure(lambda: self._observe_and_plan(planner, cases.cases))
         flights = fly_blocks(
-            BLOCK_WORLD,
+            dataclasses.replace(BLOCK_WORLD, robot=self.robot),
             cases,
             settings.seed,
-            drives=settings.drives,
+            drives=self.drives,
             planner=planner,
             planning_budget=settings.until_set,
             decided=decided,
@@ -164,17 +185,17 @@ class BlockFlight(FlightTask):
     ) -> Recording:
         """Return a recording of the flights whose indices in the batch are `lanes`."""
         lanes = np.asarray(lanes)
-        some, flown, robot = cases[lanes], flights.flown, BLOCK_ARM
+        some, flown, robot = cases[lanes], flights.flown, self.robot
         kept = np.arange(0, flown.times.size, _KEPT)
-        raised = np.array([0.0, 0.0, -FLOOR])
-        met = flights.contact[lanes]
+        raised = np.array([0.0, 0.0, robot.base_height])
+        met, balls = flights.contact[lanes], _balls(some.cases, flights, lanes, -robot.base_height)
         return Recording(
             index=some.index,
             success=flights.success[lanes],
             time=np.tile(flown.times[kept], (len(some), 1)),
             robot=flown.angles[lanes][:, kept],
             wanted=robot.place(flown.wanted[lanes][:, kept]),
-            balls=(_balls(some.cases, flights, lanes)[:, kept] + raised)[:, :, None],
+            balls=(balls[:, kept] + raised)[:, :, None],
             met=met[:, None],
             contact=(flights.contact_pos[lanes] + raised)[:, None],
             target=np.full((len(some), 3), np.nan),
@@ -191,10 +212,12 @@ class BlockFlight(FlightTask):
         """Times for sensing and planning, and errors of drives and encoders, for the report."""
         settings = self.settings
         meeting = "wide" if settings.wide else "strict"
+        limits = f"Regime {settings.regime}" if settings.arm is None else "Limits of the arm's file"
+        scale = f"{100 * settings.torque:g} %" if np.isfinite(self.drives.torques).all() else "free"
         return (
-            f"Regime {settings.regime}, {meeting}, {1e3 * settings.until_known:g} ms for sensing "
+            f"{limits}, {meeting}, {1e3 * settings.until_known:g} ms for sensing "
             f"and {1e3 * settings.until_set:g} ms for planning; torques "
-            f"{100 * settings.torque:g} % with a lag of {1e3 * settings.lag:g} ms, plans "
+            f"{scale} with a lag of {1e3 * settings.lag:g} ms, plans "
             f"{1e3 * settings.latency:g} ms late, "
             f"encoders {settings.encoders}, {100 * settings.mass_error:g} % error of the masses"
         )
@@ -204,13 +227,13 @@ class BlockFlight(FlightTask):
         """A description of arm and balls, for the report of a run."""
         settings = self.settings
         if not settings.perception:
-            return f"{BLOCK_ARM.WORDS}; balls fall freely and are known exactly"
+            return f"{ShieldArm.WORDS}; balls fall freely and are known exactly"
         noise = (
             f"{100 * settings.noise:g} cm of noise" if settings.noise else "a stereo camera's noise"
         )
         again = f"planned at {settings.rate:g} Hz" if settings.rate else "planned once"
         return (
-            f"{BLOCK_ARM.WORDS}; balls fall freely and are observed at {settings.frame_rate:g} Hz "
+            f"{ShieldArm.WORDS}; balls fall freely and are observed at {settings.frame_rate:g} Hz "
             f"with {noise}; motions are {again}, as if planning never exceeded its time limit"
         )
 
@@ -268,7 +291,7 @@ class BlockFlight(FlightTask):
                 f"the median, the last fit {last:.1f} cm; arms started "
                 f"{summary['motions'] / number:.1f} motions each."
             )
-        if self.settings.perception:
+        if self.settings.perception and self.settings.arm is None:
             lines.append(
                 "Hard for an arm that observes its balls are the joint limits R2: it starts late, "
                 "and misses some half of the balls of the suite short and a third of pole, where "
@@ -296,7 +319,7 @@ def _part(batch: Any, name: str) -> np.ndarray:
     return getattr(batch.verdict.budget, name)
 
 
-def _balls(cases: BlockCase, flights: BlockFlights, lanes: np.ndarray) -> np.ndarray:
+def _balls(cases: BlockCase, flights: BlockFlights, lanes: np.ndarray, ground: float) -> np.ndarray:
     case, flown = referee_leaves(cases), flights.flown
     times, met = flown.times, flights.contact[lanes]
     free = np.moveaxis(ball_places(case, times), 0, 2)
@@ -314,4 +337,4 @@ def _balls(cases: BlockCase, flights: BlockFlights, lanes: np.ndarray) -> np.nda
     fall = 0.5 * case["gravity"][:, None, None] * span**2 * FALL
     back = flights.contact_pos[lanes][:, None] + away[:, None] * span - fall
     path = np.where((times > np.nan_to_num(met, nan=np.inf)[:, None])[..., None], back, free)
-    return np.where(path[..., 2:] > FLOOR, path, np.nan)
+    return np.where(path[..., 2:] > ground, path, np.nan)

@@ -86,7 +86,7 @@ class BlockFlights(Flights):
     contact_pos: np.ndarray  # (B, 3) [m], ball's centre at the contact; NaN without contact
     # (B,) [m], distance from the shield's centre at which the ball crosses the shield's plane.
     miss: np.ndarray
-    # (B,) bool, whether the ball touched the arm's base or links 1 to 3 before the contact.
+    # (B,) bool, whether the ball touched base or links before the wrist before the contact.
     struck: np.ndarray
     clearance: np.ndarray  # (B,) [m], least clearance up to the contact; negative inside
     nearest: np.ndarray  # (B,) str, link and obstacle at the least clearance
@@ -274,8 +274,10 @@ def score(cases: BlockCase, plans: BlockPlan, flown: Executed, budget: Budget) -
     when = times[:-1] + share * FRAME
     there = beside[..., :-1] + share * (beside[..., 1:] - beside[..., :-1])
     miss = np.where(comes & (when < entry[:, None]), np.linalg.norm(there, axis=0), np.inf)
-    half = case["arm.shield_half"].T[:, :, None]
-    over = np.all(np.abs(there) <= half, axis=0)
+    corners = np.moveaxis(case["arm.shield_corners"], (1, 2), (0, 1))[..., None]  # (K, 2, B, 1)
+    over = np.ones(miss.shape, bool)
+    for (y, z), (y_next, z_next) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+        over &= (there[0] - y) * (z_next - z) <= (there[1] - z) * (y_next - y)
     lanes, first = np.arange(len(entry)), np.where(over, miss, np.inf).argmin(axis=1)
     hit = over[lanes, first] & np.isfinite(miss[lanes, first])
     nearest = miss.argmin(axis=1)
@@ -315,9 +317,9 @@ def _strikes(
 ) -> np.ndarray:
     found = np.zeros(ball.shape[1:], bool)
     for k, link in enumerate(links):
-        # Only base and links 1 to 3 are tested for contact with the ball, because the capsules that
-        # model the wrist protrude through the shield's face, unlike the real wrist.
-        if link > 2:
+        # Base and links before the wrist are tested for contact with the ball: links 1 to 3 of 6.
+        # The capsules that model the wrist protrude through the shield's face, unlike real wrists.
+        if link > len(turns) - 4:
             continue
         first, second = case["arm.capsule_ends"][:, k].transpose(1, 2, 0)[..., None]
         if link >= 0:

@@ -7,10 +7,12 @@ import numpy as np
 from planner_jax.robot.arm import Arm
 from planner_jax.runs.style import BLUE, GREEN, GREY, INK, PALE, PURPLE, RED, SKY, label
 from planner_jax.runs.table import RateTable
-from planner_jax.sims.scenery import Part
-from planner_jax.task.block.scene import FLOOR, Box, paper_scene
+from planner_jax.sims.scenery import Part, make_hull_part
+from planner_jax.task.block.drawing import obstacle_points
+from planner_jax.task.block.scene import FLOOR, Scene
 
 _BARS = 32  # greatest number of balls in the picture of the time budget
+_DEEP = -10.0  # [m], a floor below this height stands for no floor, and is not drawn
 # Parts of a ball's time of flight, each a name of a field of `Budget` with its description.
 BUDGET = {
     "sense": "until the ball's flight is known",
@@ -22,34 +24,38 @@ BUDGET = {
 }
 
 
-def _make_box_part(box: Box, colour: str, opacity: float) -> Part:
-    lower, upper = np.asarray(box.lower, float), np.asarray(box.upper, float)
+def ground_of(scene: Scene) -> float:
+    """Return the height [m] of the drawn ground; a scene without a floor has the paper's."""
+    height = round(float(scene.floor), 6)
+    return height if height > _DEEP else FLOOR
+
+
+def _make_box_part(corners: np.ndarray, colour: str, opacity: float) -> Part:
+    lower, upper = corners
     (x, y, z), (length, width, height) = 0.5 * (lower + upper), upper - lower
-    return Part("box", (length, width, height), (x, y, z - FLOOR), colour, opacity=opacity)
+    return Part("box", (length, width, height), (x, y, z), colour, opacity=opacity)
 
 
-def _around(ends: np.ndarray, radius: float) -> np.ndarray:
-    across = radius * (ends[0] == ends[1])
-    return np.stack([ends.min(axis=0) - across, ends.max(axis=0) + across])
-
-
-def scenery(arm: Arm, has_pole: bool) -> tuple[Part, ...]:
-    """Return the drawn parts: outer box, protected inner box, beams, pedestal and pole."""
-    scene, (lower, upper) = paper_scene(has_pole=has_pole), arm.base_box
-    parts = [_make_box_part(scene.inner, GREEN, 0.1), _make_box_part(scene.outer, SKY, 0.07)]
-    for ends, radius in zip(scene.beam_ends, scene.beam_radius, strict=True):
-        parts.append(
-            _make_box_part(Box(*_around(np.asarray(ends, float), float(radius))), GREY, 1.0)
+def scenery(arm: Arm, scene: Scene) -> tuple[Part, ...]:
+    """Return the drawn parts: outer box, protected inner box, beams, pedestal and obstacles."""
+    raised = np.array([0.0, 0.0, -ground_of(scene)])
+    inner, outer, base = (
+        raised + np.asarray(corners, float)
+        for corners in (
+            (scene.inner.lower - scene.inner_radius, scene.inner.upper + scene.inner_radius),
+            (scene.outer.lower, scene.outer.upper),
+            arm.base_box,
         )
-    x, y, _ = 0.5 * (lower + upper)
-    length, width, _ = upper - lower
-    parts.append(Part("box", (length, width, -FLOOR), (x, y, -0.5 * FLOOR), GREY))
-    for ends, radius in zip(scene.capsule_ends, scene.capsule_radius, strict=True):
-        x, y, middle = np.asarray(ends, float).mean(axis=0)
-        size = 2.0 * float(radius), 2.0 * float(radius), float(np.ptp(ends[:, 2]))
-        if radius >= 0.0:  # an upright pole
-            parts.append(Part("cylinder", size, (x, y, middle - FLOOR), "#5B6B73"))
-    return tuple(parts)
+    )
+    parts = [_make_box_part(inner, GREEN, 0.1), _make_box_part(outer, SKY, 0.07)]
+    for ends, radius in zip(np.asarray(scene.beam_ends), scene.beam_radius, strict=True):
+        across = radius * (ends[0] == ends[1])
+        beam = raised + [ends.min(axis=0) - across, ends.max(axis=0) + across]
+        parts.append(_make_box_part(beam, GREY, 1.0))
+    base[:, 2] = 0.0, raised[2]  # a pedestal below the base
+    if np.ptp(base, axis=0).all():
+        parts.append(_make_box_part(base, GREY, 1.0))
+    return (*parts, *(make_hull_part(raised + each, "#5B6B73") for each in obstacle_points(scene)))
 
 
 def budget_table(rows: Any) -> RateTable:
@@ -74,7 +80,7 @@ def joint_table(rows: Any) -> RateTable:
         return np.stack(rows[name].to_numpy(zero_copy_only=False))[planned]
 
     cells = []
-    for joint in range(6) if planned.any() else ():
+    for joint in range(of("error_rms").shape[1]) if planned.any() else ():
         rms = (np.sqrt((of(name)[:, joint] ** 2).mean()) for name in ("error_rms", "torque_rms"))
         error, torque = rms
         worst = (of(name)[:, joint].max() for name in ("error_worst", "torque_worst"))

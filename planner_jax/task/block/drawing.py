@@ -91,7 +91,7 @@ def _draw_scene(axes: Axes, case: BlockCase, across: int, up: int) -> None:
     ):
         corner, size = box.lower[[across, up]], (box.upper - box.lower)[[across, up]]
         axes.add_patch(Rectangle(tuple(corner), *size, **look))
-    for points in _obstacle_points(scene):
+    for points in obstacle_points(scene):
         flat = points[:, [across, up]]
         corners = flat[ConvexHull(flat, qhull_options="QJ").vertices]
         axes.add_patch(Polygon(corners, color=style.GREY))
@@ -99,7 +99,7 @@ def _draw_scene(axes: Axes, case: BlockCase, across: int, up: int) -> None:
         axes.axhline(float(scene.floor), color=style.INK, linewidth=1.0)
 
 
-def _obstacle_points(scene: Scene) -> list[np.ndarray]:
+def obstacle_points(scene: Scene) -> list[np.ndarray]:
     """Return points (V, 3) [m] for each obstacle, whose convex hull is the obstacle."""
     spread = directions(400)
     rods = zip(scene.capsule_ends, scene.capsule_radius, strict=True)

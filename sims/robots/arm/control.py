@@ -26,28 +26,28 @@ class Gains:
 
 @struct.dataclass
 class Course:
-    """A motion of six joints with its start time, and how the joints brake after its end."""
+    """A motion of n joints with its start time, and how the joints brake after its end."""
 
-    motion: PiecewisePolynomial  # (M, D + 1, 6) [rad], joint angles as M pieces of degree D
+    motion: PiecewisePolynomial  # (M, D + 1, n) [rad], joint angles as M pieces of degree D
     begin: Array  # () [s], start time of the motion
-    braking: Array  # (6,) [rad/s^2], deceleration of joints that still move when the motion ends
+    braking: Array  # (n,) [rad/s^2], deceleration of joints that still move when the motion ends
 
 
 @struct.dataclass
 class JointState:
     """Angles and rates of the joints at one instant: true, measured or estimated."""
 
-    angles: Array  # (6,) [rad]
-    rates: Array  # (6,) [rad/s]
+    angles: Array  # (n,) [rad]
+    rates: Array  # (n,) [rad/s]
 
 
 @struct.dataclass
 class JointReference:
     """The planned angles, rates and accelerations of the joints at one instant."""
 
-    angles: Array  # (6,) [rad]
-    rates: Array  # (6,) [rad/s]
-    accelerations: Array  # (6,) [rad/s^2]
+    angles: Array  # (n,) [rad]
+    rates: Array  # (n,) [rad/s]
+    accelerations: Array  # (n,) [rad/s^2]
 
 
 def reference_at(course: Course, time: Array) -> JointReference:
@@ -75,7 +75,7 @@ def reference_at(course: Course, time: Array) -> JointReference:
 def control(
     state: JointState, reference: JointReference, arm: Arm, gains: Gains, gravity: float
 ) -> Array:
-    """Return joint torques (6,) [N m] that track a planned state, by the dynamics of `arm`."""
+    """Return joint torques (n,) [N m] that track a planned state, by the dynamics of `arm`."""
     angle_error, rate_error = reference.angles - state.angles, reference.rates - state.rates
     wanted = (
         reference.accelerations

@@ -16,7 +16,7 @@ TORQUES = (700.0, 700.0, 250.0, 10.0, 5.0, 2.0)
 
 @dataclasses.dataclass(frozen=True)
 class Drives:
-    """Limits of the drives of six joints, and errors of their encoders.
+    """Limits of the drives of n joints, and errors of their encoders.
 
     Raises:
         ValueError: a value is out of its range.
@@ -30,8 +30,8 @@ class Drives:
     mass_error: float = 0.0  # relative error of the masses and inertias in the controller's model
 
     def __post_init__(self) -> None:
-        if len(self.torques) != 6 or not all(torque > 0.0 for torque in self.torques):
-            raise ArgumentError("torques", "six numbers > 0", self.torques)
+        if not all(torque > 0.0 for torque in self.torques):
+            raise ArgumentError("torques", "numbers > 0", self.torques)
         for name in ("lag", "latency", "angle_std", "rate_std"):
             value = getattr(self, name)
             if not value >= 0.0:

@@ -1,4 +1,4 @@
-"""The simulated arm, a `sims.robot.Robot`: six hinges on a fixed base.
+"""The simulated arm, a `sims.robot.Robot`: n hinges on a fixed base.
 
 `qpos` starts with the joint angles, `qvel` with the joint rates, and the actuators are joint
 torques. The base frame of plans is parallel to the world frame and lies above the ground. The
@@ -7,6 +7,7 @@ collisions afterwards.
 """
 
 import dataclasses
+import functools
 from typing import Any, ClassVar
 
 import jax
@@ -17,9 +18,11 @@ from scipy.spatial.transform import Rotation
 
 from planner_jax.referee.arm_clearance import links_of, shield_pose
 from planner_jax.robot.arm import Arm
+from planner_jax.robot.arm_chain import ArmModel
 from planner_jax.robot.arm_file import irb1600
+from planner_jax.robot.arm_limits import limits_of
 from planner_jax.sims.model import World
-from planner_jax.sims.robot import Physics, Shape, Solid
+from planner_jax.sims.robot import Physics, Shape, Solid, rotation
 from planner_jax.sims.robots.arm.control import (
     Course,
     Gains,
@@ -28,7 +31,9 @@ from planner_jax.sims.robots.arm.control import (
     control,
     reference_at,
 )
-from planner_jax.sims.scenery import VISUAL, box_solid, capsule_solid, xml_numbers
+from planner_jax.sims.robots.arm.drives import TORQUES
+from planner_jax.sims.scenery import VISUAL, box_solid, capsule_solid, hull, xml_numbers
+from planner_jax.task.block.scene_file import shield_arm
 
 _THICKNESS = 0.01  # [m], thickness of the shield
 
@@ -42,29 +47,59 @@ def lanes_of(arm: Arm) -> dict[str, np.ndarray]:
     return {f"arm.{name}": np.asarray(getattr(arm, name), float)[None] for name in names}
 
 
+@functools.cache
+def _read(file: str | None, tip: str | None, shield: str | None) -> Arm:
+    if file is None and shield is None:
+        return irb1600(np.float64)
+    return jax.tree.map(lambda leaf: np.asarray(leaf, float), shield_arm(file, tip, shield))
+
+
 @dataclasses.dataclass(frozen=True)
 class ShieldArm:
-    """The simulated arm IRB 1600 with a shield; static under `jax.jit`."""
+    """A simulated arm with a shield, by default the IRB 1600; static under `jax.jit`.
+
+    Masses and inertias are those of the arm's file, without friction and rotor inertia.
+    """
 
     base_height: float = 0.0  # [m], height of the base frame above the ground
     gains: Gains = Gains()
+    file: str | None = None  # MJCF or URDF of another arm
+    tip: str | None = None  # body or site of this arm that carries the shield
+    shield: str | None = None  # outline of the shield, a text that `read_shield` reads
 
     WORDS: ClassVar[str] = (
         "an arm with limited torques that lag, computed-torque control from encoder measurements"
     )
-    num_pos: ClassVar[int] = 6
-    num_vel: ClassVar[int] = 6
-    noise_shape: ClassVar[tuple[int, ...]] = (2, 6)
 
     @property
     def arm(self) -> Any:
         """The `Arm` for which plans are made, with NumPy float64 leaves."""
-        return irb1600(np.float64)
+        return _read(self.file, self.tip, self.shield)
+
+    @property
+    def torques(self) -> tuple[float, ...]:
+        """The torque limits [N m] of the joints; infinite where the arm's file states none."""
+        if self.file is None:
+            return TORQUES
+        return tuple(limits_of(ArmModel(self.file, self.tip), None)["torque"].tolist())
+
+    @property
+    def num_pos(self) -> int:
+        """The number n of joints."""
+        return self.arm.num
+
+    num_vel = num_pos
+
+    @property
+    def noise_shape(self) -> tuple[int, ...]:
+        """Shape of the encoders' noise: angles and rates of n joints."""
+        return 2, self.num_pos
 
     def mjcf(self) -> tuple[str, str]:
         """Return two texts in MJCF, MuJoCo's format: the links with the shield, and the motors."""
         arm = self.arm
-        solids = {k: [] for k in range(-1, 6)}
+        num = arm.num
+        solids = {k: [] for k in range(-1, num)}
         for link, ends, radius in zip(
             arm.capsule_link, arm.capsule_ends, arm.capsule_radius, strict=True
         ):
@@ -75,20 +110,23 @@ class ShieldArm:
                 f'size="{xml_numbers(radius)}" rgba=".9 .6 .2 1" {VISUAL}/>'
             )
         middle, half = _box(arm.base_box)
-        solids[-1].append(
-            f'<geom type="box" pos="{xml_numbers(*middle)}" size="{xml_numbers(*half)}" '
-            f'rgba=".3 .3 .3 1" {VISUAL}/>'
-        )
+        if half.all():
+            solids[-1].append(
+                f'<geom type="box" pos="{xml_numbers(*middle)}" size="{xml_numbers(*half)}" '
+                f'rgba=".3 .3 .3 1" {VISUAL}/>'
+            )
         plate = [0.5 * _THICKNESS, *arm.shield_half]
-        behind = arm.shield_centre - [0.5 * _THICKNESS, 0.0, 0.0]
-        solids[5].append(
+        turn = rotation(arm.shield_turn, np)
+        behind = arm.shield_centre - 0.5 * _THICKNESS * turn[:, 0]
+        solids[num - 1].append(
             f'<geom name="shield" type="box" pos="{xml_numbers(*behind)}" '
+            f'quat="{xml_numbers(*arm.shield_turn)}" '
             f'size="{xml_numbers(*plate)}" rgba=".2 .5 .8 1" {VISUAL}/>'
         )
         base = f'<body name="base" pos="{xml_numbers(0.0, 0.0, self.base_height)}">'
-        chain = "".join(self._link(k) + "".join(solids[k]) for k in range(6))
-        motors = "".join(f'<motor joint="joint_{k + 1}"/>' for k in range(6))
-        return base + "".join(solids[-1]) + chain + 7 * "</body>", motors
+        chain = "".join(self._link(k) + "".join(solids[k]) for k in range(num))
+        motors = "".join(f'<motor joint="joint_{k + 1}"/>' for k in range(num))
+        return base + "".join(solids[-1]) + chain + (num + 1) * "</body>", motors
 
     def _link(self, k: int) -> str:
         arm = self.arm
@@ -108,19 +146,19 @@ class ShieldArm:
         return home, jnp.zeros_like(home), jnp.zeros(0, place.dtype)
 
     def drive(self, physics: Physics, command: Array, timestep: float) -> tuple[Array, Array]:
-        """Return the command unchanged, as joint torques (6,) [N m], and zero extra forces."""
+        """Return the command unchanged, as joint torques (n,) [N m], and zero extra forces."""
         return command, jnp.zeros_like(command)
 
     def state(self, physics: Physics) -> JointState:
         """Return the true joint angles and rates from the simulated physics."""
-        return JointState(angles=physics.qpos[:6], rates=physics.qvel[:6])
+        return JointState(angles=physics.qpos, rates=physics.qvel)
 
     def sense(self, state: JointState, noise: Array, stds: Any) -> JointState:
         """Return joint angles and rates as the encoders measure them.
 
         Args:
             state: the true state.
-            noise: (2, 6) standard normal.
+            noise: (2, n) standard normal.
             stds: (2,), standard deviations of an angle [rad] and of a rate [rad/s].
         """
         errors = jnp.asarray(stds, noise.dtype)[:, None] * noise
@@ -145,7 +183,7 @@ class ShieldArm:
     def command(
         self, state: JointState, reference: JointReference, world: World, mass_error: Any = 0.0
     ) -> Array:
-        """Return the torques (6,) [N m] that track a reference (a planned joint state).
+        """Return the torques (n,) [N m] that track a reference (a planned joint state).
 
         The controller's masses and inertias are the true ones times 1 + `mass_error`.
         """
@@ -156,32 +194,30 @@ class ShieldArm:
         return control(state, reference, believed, self.gains, world.gravity)
 
     def shapes(self) -> list[Shape]:
-        """Return the parts for drawing: base, links 1 to 6 with their capsules, and shield."""
+        """Return the parts for drawing: base, links 1 to n with their capsules, and shield."""
         arm = self.arm
-        solids: list[list[Solid]] = [[] for _ in range(7)]
-        solids[0].append(box_solid(*arm.base_box))
+        solids: list[list[Solid]] = [[] for _ in range(arm.num + 1)]
+        if np.ptp(arm.base_box, axis=0).all():
+            solids[0].append(box_solid(*arm.base_box))
         for link, ends, radius in zip(
             arm.capsule_link, arm.capsule_ends, arm.capsule_radius, strict=True
         ):
             solids[link + 1].append(capsule_solid(ends[0], ends[1], float(radius)))
-        ring = np.concatenate([arm.shield_corners, arm.shield_corners[:1]])
-        rim = arm.shield_centre + np.pad(ring, ((0, 0), (1, 0)))
+        turn, corners = rotation(arm.shield_turn, np), np.pad(arm.shield_corners, ((0, 0), (1, 0)))
+        face = arm.shield_centre + corners @ turn.T
+        plate = hull(np.concatenate([face, face - _THICKNESS * turn[:, 0]]))
+        rim = np.concatenate([face, face[:1]])
         return [
             *(Shape([], [], solids=tuple(each)) for each in solids),
-            Shape(
-                [rim],
-                [],
-                tool=True,
-                solids=(box_solid(rim.min(axis=0) - [_THICKNESS, 0, 0], rim.max(axis=0)),),
-            ),
+            Shape([rim], [], tool=True, solids=(plate,)),
         ]
 
     def places(self, pose: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
         """Return positions [m] and quaternions w x y z of base, links and shield.
 
-        `pose` are the joint angles (6,) [rad]; positions are in the world frame.
+        `pose` are the joint angles (n,) [rad]; positions are in the world frame.
         """
-        turns, places = links_of(lanes_of(self.arm), np.reshape(pose, (6, 1, 1)))
+        turns, places = links_of(lanes_of(self.arm), np.reshape(pose, (-1, 1, 1)))
         base = np.array([0.0, 0.0, self.base_height])
         found = [(base, np.array([1.0, 0.0, 0.0, 0.0]))]
         for turn, place in zip(turns, places, strict=True):
@@ -190,9 +226,9 @@ class ShieldArm:
         return [*found, found[-1]]
 
     def place(self, poses: np.ndarray) -> np.ndarray:
-        """Return the centre of the shield's face, (..., 3) [m], at joint angles (..., 6)."""
+        """Return the centre of the shield's face, (..., 3) [m], at joint angles (..., n)."""
         case = lanes_of(self.arm)
-        angles = np.moveaxis(np.reshape(poses, (1, -1, 6)), 2, 0)
+        angles = np.moveaxis(np.reshape(poses, (1, -1, self.num_pos)), 2, 0)
         middle = shield_pose(case, *links_of(case, angles))[1][:, 0].T
         return middle.reshape(*np.shape(poses)[:-1], 3) + [0.0, 0.0, self.base_height]
 

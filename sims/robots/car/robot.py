@@ -35,9 +35,7 @@ class Car:
     WORDS: ClassVar[str] = (
         "a car with tyre forces, lag and limits of drive and steering, path-tracking feedback"
     )
-    num_pos: ClassVar[int] = 3
-    num_vel: ClassVar[int] = 3
-    noise_shape: ClassVar[tuple[int, ...]] = (3,)
+    num_pos, num_vel, noise_shape = 3, 3, (3,)
 
     def mjcf(self) -> tuple[str, str]:
         """Return two MJCF texts: the body with wheels, and the actuators of drive and steering."""

@@ -31,9 +31,7 @@ class Quadrotor:
     gains: Gains = Gains()
 
     WORDS: ClassVar[str] = "rotors with lag, body-rate, attitude and position control"
-    num_pos: ClassVar[int] = 7
-    num_vel: ClassVar[int] = 6
-    noise_shape: ClassVar[tuple[int, ...]] = (4, 3)
+    num_pos, num_vel, noise_shape = 7, 6, (4, 3)
 
     @property
     def tool(self) -> Tool:
