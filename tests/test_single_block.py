@@ -9,6 +9,7 @@ from PIL import Image
 
 import planner_jax as pj
 from planner_jax.cli.main import main
+from planner_jax.sims import view
 from planner_jax.task.block.plan import make_empty_plan
 
 BALL = ["--pos", "9", "0.5", "0.3", "--vel", "-8", "-0.4", "5.4"]
@@ -33,6 +34,24 @@ def test_the_command_writes_plan_setpoints_and_picture(tmp_path, capsys):
         assert min(picture.size) > 400 and np.unique(np.asarray(picture)).size > 50
     with open(out / "setpoints.csv") as file:
         assert len(list(csv.reader(line for line in file if line[0] != "#"))) > 10
+
+
+def test_a_plan_is_played_in_a_browser(monkeypatch, capsys):
+    pytest.importorskip("viser")
+    shown = []
+    monkeypatch.setattr(view.Viewer, "run", lambda viewer: shown.append(viewer))
+    assert main(["plan", "block", *BALL, "--view"]) == 0
+    (viewer,) = shown
+    viewer.close()
+    printed = capsys.readouterr().out
+    assert f"Playing the plan at {viewer.url}" in printed
+    contact = float(printed.partition("Blocked at ")[2].partition(" s,")[0])
+    # The view shows the contact of a ball of 5 cm, one radius before its centre's.
+    speed = np.linalg.norm([-8.0, -0.4, 5.4 - 9.81 * contact])
+    assert viewer.recording.met[0, 0] == pytest.approx(contact - 0.05 / speed, abs=2e-3)
+    at = np.searchsorted(viewer.recording.time[0], contact) - 1
+    wanted = viewer.task.robot.place(viewer.recording.robot[0, at])
+    np.testing.assert_allclose(viewer.recording.contact[0, 0], wanted, atol=0.06)
 
 
 def test_a_ball_that_is_not_blocked_is_explained(capsys):

@@ -62,6 +62,7 @@ def _plan(task: Task, given: Options) -> int:
     print("\n".join(single.describe(answer)))
     if out is not None:
         _write_answer(single, answer, Path(out), rate)
+    single.play(answer)
     return 0 if answer.success else FAILED
 
 

@@ -27,7 +27,7 @@ from planner_jax.sims.execution import FRAME, TIMESTEP, Executed, execute
 from planner_jax.sims.launch import flight_keys
 from planner_jax.sims.model import World
 from planner_jax.sims.perception.receding import Decided
-from planner_jax.sims.robots.arm.control import Course
+from planner_jax.sims.robots.arm.control import Course, reference_at
 from planner_jax.sims.robots.arm.drives import IDEAL, Drives
 from planner_jax.sims.robots.arm.robot import ShieldArm
 from planner_jax.sims.task import FlightCases, Flights
@@ -135,6 +135,18 @@ def courses_of(cases: BlockCase, plans: BlockPlan) -> Course:
         durations=np.where(solved[:, None], plans.motion.durations, 0.0).astype(coeffs.dtype),
     )
     return Course(motion=motion, begin=cases.delay, braking=cases.limits.acceleration)
+
+
+def follow_plans(cases: BlockCase, plans: BlockPlan) -> BlockFlights:
+    """Return B flights in which the arms follow their plans exactly, without a simulation."""
+    courses, entry = courses_of(cases, plans), entry_times(cases)
+    end = np.max(np.maximum(np.where(np.isfinite(entry), entry, 0.0), plans.contact_time)) + _AFTER
+    times = FRAME * np.arange(int(np.ceil(end / FRAME)) + 1)
+    follow = jax.jit(jax.vmap(jax.vmap(reference_at, (None, 0)), (0, None)))
+    angles = np.asarray(follow(courses, times.astype(courses.begin.dtype)).angles, float)
+    none = np.zeros_like(angles[:, 0])
+    flown = Executed(times, angles, angles, np.zeros((len(none), 2)), *[none] * 6)
+    return score(cases, plans, flown, Budget(*[np.zeros(len(none))] * 6))
 
 
 def fly_blocks(

@@ -89,6 +89,9 @@ class Single(abc.ABC, Generic[SingleT]):
     def task_margins(self, answer: Answer) -> list[Margin]:
         """Return how close the plan comes to each limit that only this task has."""
 
+    def play(self, answer: Answer) -> None:
+        """Play the plan in a browser, if the task has this option and it is chosen."""
+
     def planner(self) -> Planner:
         """Make the planner that the command's options specify."""
         return self.task.planner(self.settings.planner, **self.settings.planner_options())

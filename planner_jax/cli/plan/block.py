@@ -1,5 +1,6 @@
 """The command `planner-jax plan block`: one thrown ball that an arm blocks with its shield."""
 
+import jax
 import numpy as np
 from jaxtyping import PyTree
 
@@ -67,3 +68,24 @@ class SingleBlock(Single[SingleBlockSettings]):
     def margins(self, answer: Answer) -> list[Margin]:
         """Return how close the plan comes to each limit of the arm."""
         return self.task_margins(answer)
+
+    def play(self, answer: Answer) -> None:
+        """Serve a 3-D view of ball and arm to a browser until Ctrl-C, if `view` is set."""
+        given = self.settings
+        if given.view:
+            from planner_jax.sims.settings import BlockFly
+            from planner_jax.sims.tasks.block_flights import Throws, follow_plans
+            from planner_jax.sims.view import Viewer
+
+            own = {name: vars(given)[name] for name in ("arm", "tip", "shield", "scene")}
+            task = BlockFly(num=1, suite="open" if given.no_pole else "pole", **own).flight()
+            cases, plans = (
+                jax.tree.map(lambda leaf: np.asarray(leaf)[None], each)
+                for each in (answer.case, answer.plan)
+            )
+            flights = follow_plans(cases, plans)
+            viewer = Viewer(
+                task, task.recording(Throws(np.zeros(1, int), cases), flights, [0]), port=0
+            )
+            print(f"Playing the plan at {viewer.url}; Ctrl-C stops.", flush=True)
+            viewer.run()

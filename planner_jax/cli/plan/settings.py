@@ -61,6 +61,7 @@ class SingleBlockSettings(ArmSettings, PlanSettings):
     regime: str = option("R2", "NAME", f"limits of the joints: {', '.join(REGIMES)}")
     wide: bool = option(False, "", "accept a ball 0.1 m from the shield's middle, at 30 degrees")
     no_pole: bool = option(False, "", "leave out the pole before the arm")
+    view: bool = option(False, "", "play the plan in a browser until Ctrl-C")
 
     RUN: ClassVar[str] = "planner_jax.cli.plan.block:SingleBlock"
 
