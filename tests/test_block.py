@@ -146,8 +146,9 @@ def test_balls_are_blocked_among_two_poles_a_box_a_sphere_a_cylinder_and_a_mesh(
 def test_a_ball_with_a_radius_and_a_rounded_body_are_touched_when_the_referee_says():
     usual = pj.block.draw(60, "open", 3)
     person = make_scene(protected_capsule=([(0.0, 0.0, 1.2), (0.0, 0.0, 0.3)], 0.3))
+    bent = make_scene(protected_capsule=([(0.3, 0.2, 1.1), (-0.2, -0.2, 0.3)], 0.2))
     of_flights = jax.jit(jax.vmap(flight_of))
-    for scene, radius in ((None, 0.05), (person, 0.0), (person, 0.04)):
+    for scene, radius in ((None, 0.05), (person, 0.0), (person, 0.04), (bent, 0.04)):
         ball = usual.ball
         cases = pj.block.case(ball.pos, ball.vel, scene=scene, ball_radius=radius)
         flight = of_flights(cases)
@@ -157,6 +158,9 @@ def test_a_ball_with_a_radius_and_a_rounded_body_are_touched_when_the_referee_sa
         np.testing.assert_array_equal(flight.comes, np.isfinite(entry))
         comes = np.asarray(flight.comes)
         assert comes.any() and np.all(comes) == (scene is None)
+        if scene is bent:  # throws at such a body meet it
+            aimed = pj.block.draw(60, "open", 3, scene=bent)
+            assert np.all(of_flights(dataclasses.replace(cases, ball=aimed.ball)).comes)
         np.testing.assert_allclose(np.asarray(flight.latest)[comes], entry[comes], atol=2e-4)
 
 

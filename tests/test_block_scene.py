@@ -71,8 +71,8 @@ def test_a_scene_file_lists_obstacles_and_the_protected_body(tmp_path):
         ),
         ("cylinders: [{ends: [[0, 0, 1], [0, 0, 1]], radius: 1}]", r".*ends must be two different"),
         (
-            "protected_capsule: {ends: [[0, 0, 0], [1, 0, 1]], radius: 0.2}",
-            r"a.yaml: the axis of protected_capsule must be parallel to a coordinate axis; use",
+            "protected_capsule: {ends: [[0, 0, 0], [1, 0, 1]], radius: 0}",
+            r"a.yaml: protected_capsule.radius must be > 0, got 0",
         ),
         ("[1]", "a.yaml must be fields with values"),
         ("meshes: [{scale: 2}]", r"a.yaml: meshes\[0\] must have the fields file, scale, pos"),

@@ -14,7 +14,7 @@ import numpy as np
 
 from planner_jax.referee import judging
 from planner_jax.referee.arm_clearance import KINDS, clearances, links_of, shield_pose
-from planner_jax.referee.solids import length, rotate_back
+from planner_jax.referee.solids import from_segment, length, rotate_back
 
 _SENTENCES = {
     "not finite": "the plan or its case is not finite",
@@ -172,6 +172,8 @@ def _read(cases, plans) -> dict[str, np.ndarray]:
     for kind, parts in _OBSTACLES.items():
         num_solids = (*np.shape(getattr(cases.scene, f"{kind}_{[*parts][-1]}")), 0, 0)[1]
         shapes |= {f"scene.{kind}_{name}": (num_solids, *of) for name, of in parts.items()}
+    if getattr(cases.scene, "inner_ends", None) is not None:
+        shapes["scene.inner_ends"] = (2, 3)
     if meshes := getattr(cases.scene, "meshes", None):
         shapes["scene.meshes.corners"] = np.shape(meshes.corners)[1:]
     leaves = {"plan.motion.coeffs": coeffs} | judging.read_leaves(cases, shapes, num_lanes)
@@ -406,7 +408,8 @@ def _tunnel(case: dict, contact: float) -> tuple:
 def entry_time(case: dict, within: float) -> np.ndarray:
     """Return when the balls of B cases get `within` [m] into the protected body, (B,) [s].
 
-    The body is the inner box with the points up to `inner_radius` and the ball's radius from it.
+    The body is the inner box, or the segment `inner_ends` in it, with the points up to
+    `inner_radius` and the ball's radius from it.
     A ball that never gets there has the time infinity.
     """
     radius = case["scene.inner_radius"] + case["ball_radius"] - within
@@ -422,7 +425,10 @@ def entry_time(case: dict, within: float) -> np.ndarray:
         pos, vel = (case[f"ball.{name}"][rounded].T[:, None, None] for name in ("pos", "vel"))
         lower, upper = (case[f"scene.inner.{side}"][rounded].T[:, None, None] for side in _SIDES)
         path = pos + vel * times - fall * times**2
-        near = length(path - np.clip(path, lower, upper)) <= radius[rounded] + 1e-12
+        away = length(path - np.clip(path, lower, upper))
+        if (ends := case.get("scene.inner_ends")) is not None:
+            away = from_segment(path, *np.moveaxis(ends[rounded], 0, 2)[:, :, None, None])
+        near = away <= radius[rounded] + 1e-12
         first = np.take_along_axis(times, near.argmax(axis=0)[None], axis=0)[0]
         entry[:, rounded] = np.where(near.any(axis=0) & ~never, first, np.inf)
     return entry.min(axis=0)

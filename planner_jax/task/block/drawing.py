@@ -84,9 +84,10 @@ def _draw_scene(axes: Axes, case: BlockCase, across: int, up: int) -> None:
     scene, arm = case.scene, case.arm
     base = Box(lower=arm.base_box[0], upper=arm.base_box[1])
     inner = Box(scene.inner.lower - scene.inner_radius, scene.inner.upper + scene.inner_radius)
+    around = "-" if scene.inner_ends is None else ":"  # the box around an oblique capsule
     for box, look in (
         (scene.outer, {"fill": False, "linestyle": ":", "edgecolor": style.GREY}),
-        (inner, {"fill": False, "edgecolor": style.GREEN}),
+        (inner, {"fill": False, "linestyle": around, "edgecolor": style.GREEN}),
         (base, {"facecolor": style.PALE}),
     ):
         corner, size = box.lower[[across, up]], (box.upper - box.lower)[[across, up]]

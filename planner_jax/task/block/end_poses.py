@@ -61,7 +61,8 @@ def flight_of(case: BlockCase) -> Flight:
     scene = case.scene
     earliest, enters = entry_time(scene.outer, case.ball, case.gravity)
     radius = scene.inner_radius + case.ball_radius
-    latest, hits = rounded_entry_time(scene.inner, radius, case.ball, case.gravity)
+    body = scene.inner, radius, case.ball, case.gravity, scene.inner_ends
+    latest, hits = rounded_entry_time(*body)
     return Flight(earliest=earliest, latest=latest, comes=enters & hits & (latest > earliest))
 
 

@@ -37,6 +37,7 @@ RIG_HEIGHT, RIG_RADIUS = -0.08, 0.0401  # [m], height of the beams' axes, and ra
 # Shapes and ranges that `pj.require_sound` checks for the obstacles of a case's scene.
 RULES: Table = (
     Field("scene.inner_radius", (), rules.NOT_NEGATIVE),
+    Field("scene.inner_ends", (2, 3)),
     Field("scene.capsule_ends", ("P", 2, 3)),
     Field("scene.capsule_radius", ("P",)),
     Field("scene.floor", ()),
@@ -90,6 +91,8 @@ class Scene:
     cylinder_ends: Array  # (L, 2, 3) [m], ends of the cylinders' axes
     cylinder_radius: Array  # (L,) [m]
     meshes: Meshes | None = None
+    # (2, 3) [m], ends of a protected capsule's oblique axis; `inner` is then the box around it
+    inner_ends: Array | None = None
 
     def without_meshes(self) -> "Scene":
         """Return the scene with the solids that enclose meshes instead of the meshes."""
@@ -165,8 +168,8 @@ def make_scene(
         floor: [m], height of the floor.
         protected_box: lowest and highest corner [m] of the box that blocks protect; by default the
             box of [Natarajan2024].
-        protected_capsule: instead of a box, the ends of a capsule's axis (2, 3) [m], which is
-            parallel to a coordinate axis, and the radius [m].
+        protected_capsule: instead of a box, the ends of a capsule's axis (2, 3) [m] and the radius
+            [m], > 0.
         outer: lowest and highest corner [m] of the box in which balls may be met; by default the
             box of [Natarajan2024].
     """
@@ -176,13 +179,13 @@ def make_scene(
         kind = f"spheres[{k}]" if k < len(spheres) else f"capsules[{k - len(spheres)}]"
         require(bool(radius >= 0.0), f"the radius of {kind}", ">= 0", radius)
     paper, capsule = paper_scene(), protected_capsule
-    body = protected_box
+    body, ends = protected_box, None
     if capsule is not None:
         body = np.sort(np.asarray(capsule[0], float), axis=0)
         require(protected_box is None, "protected_box", "left out beside protected_capsule", body)
-        is_straight = np.sum(np.ptp(body, axis=0) > 0.0) <= 1
-        rule = "parallel to a coordinate axis; use protected_box for other bodies"
-        require(bool(is_straight), "the axis of protected_capsule", rule, body.tolist())
+        require(bool(capsule[1] > 0.0), "the radius of protected_capsule", "> 0", capsule[1])
+        if np.sum(np.ptp(body, axis=0) > 0.0) > 1:
+            ends = host_leaf(capsule[0], np.float32)
 
     def box(corners: ArrayLike | None, usual: Box) -> Box:
         return usual if corners is None else Box(*host_leaf(corners, np.float32))
@@ -197,6 +200,7 @@ def make_scene(
         beam_radius=paper.beam_radius[:0],
         **_solids(rounded, boxes, cylinders),
         meshes=_enclose(meshes) if meshes else None,
+        inner_ends=ends,
     )
 
 
@@ -267,10 +271,11 @@ def entry_time(box: Box, ball: BallState, gravity: Array) -> tuple[Array, Array]
 
 
 def rounded_entry_time(
-    box: Box, radius: Array, ball: BallState, gravity: Array
+    box: Box, radius: Array, ball: BallState, gravity: Array, ends: Array | None = None
 ) -> tuple[Array, Array]:
     """Return the time at which a ball without drag gets to the distance `radius` from a box.
 
+    With the ends (2, 3) [m] of a segment in the box, the distance is the distance from the segment.
     The ball first enters the box enlarged by the radius. From there it advances by its distance
     divided by a bound of its speed, which never passes the rounded edges.
 
@@ -282,7 +287,12 @@ def rounded_entry_time(
 
     def gap(time: Array) -> Array:
         pos = drag_free_flight(ball, time, gravity).pos
-        away = pos - jnp.clip(pos, box.lower, box.upper)
+        if ends is None:
+            away = pos - jnp.clip(pos, box.lower, box.upper)
+        else:
+            span = ends[1] - ends[0]
+            share = jnp.sum((pos - ends[0]) * span) / jnp.sum(span * span)
+            away = pos - ends[0] - jnp.clip(share, 0.0, 1.0) * span
         return jnp.sqrt(jnp.maximum(jnp.sum(away**2), 1e-12)) - radius
 
     def advance(_: Array, time: Array) -> Array:
@@ -291,7 +301,8 @@ def rounded_entry_time(
         return time + jnp.maximum(gap(time), 0.0) / speed
 
     def search() -> tuple[Array, Array]:
-        there = lax.fori_loop(0, _ADVANCES, advance, time)
+        num = _ADVANCES if ends is None else 4 * _ADVANCES
+        there = lax.fori_loop(0, num, advance, time)
         return there, enters & (gap(there) < _REACHED)
 
     return lax.cond(radius > 0.0, search, lambda: (time, enters))

@@ -151,7 +151,10 @@ def _is_valid(
         later = np.arange(duration, duration + _PASSES, _STEP)[:, None]
         beyond = pos + vel * later - 0.5 * GRAVITY * later**2 * np.array([0.0, 0.0, 1.0])
         away = beyond - np.clip(beyond, scene.inner.lower, scene.inner.upper)
-        if np.min(np.linalg.norm(away, axis=1)) > scene.inner_radius:
+        gaps = np.linalg.norm(away, axis=1)
+        if (ends := scene.inner_ends) is not None:
+            gaps = solids.from_segment(beyond.T, *ends[..., None])
+        if np.min(gaps) > scene.inner_radius:
             return False
     is_outer, is_inner = (
         (path > box[0]).all(axis=1) & (path < box[1]).all(axis=1) for box in (outer, inner)
