@@ -39,8 +39,8 @@ import planner_jax as pj
 from planner_jax.benchmarks.run import Bench, argument_parser, begin, parse_names
 from planner_jax.referee.block import BlockVerdict
 from planner_jax.robot.arm import Arm
+from planner_jax.robot.arm_dynamics import inverse_dynamics
 from planner_jax.runs.timing import measure_plans
-from planner_jax.sims.robots.arm.dynamics import inverse_dynamics
 from planner_jax.sweep.block.settings import REGIMES
 from planner_jax.task.block.plan import BlockPlan
 from planner_jax.task.block.spec import SUITES

@@ -10,9 +10,9 @@ from jaxpr import assert_full_precision
 
 import planner_jax.robot
 from planner_jax.robot.arm import REGIMES, capsules, link_frames, shield_jacobian, shield_pose
+from planner_jax.robot.arm_dynamics import inverse_dynamics
 from planner_jax.robot.arm_file import irb1600, read_arm
 from planner_jax.robot.arm_ik import inverse_kinematics
-from planner_jax.sims.robots.arm.dynamics import inverse_dynamics
 
 FILE = Path(planner_jax.robot.__file__).parent / "models" / "irb1600.xml"
 IRB1600 = FILE.read_text("utf-8")

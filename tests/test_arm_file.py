@@ -1,6 +1,7 @@
 """Arms from MJCF and URDF files, compared with MuJoCo's own kinematics of the same files."""
 
 import dataclasses
+import functools
 import itertools
 
 import numpy as np
@@ -9,6 +10,7 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from planner_jax.core.errors import ArgumentError
+from planner_jax.referee.arm_torque import Dynamics
 from planner_jax.robot.arm_file import Shield, describe_arm, irb1600, read_arm
 from planner_jax.robot.capsule_fit import cover, measure_excess
 
@@ -62,7 +64,7 @@ WRIST = """
   <body name="four" pos="0 0 .3" euler="0 90 0">
     <joint name="d"/><geom type="ellipsoid" size=".05 .04 .08"/>
     <body name="five" pos="0 .05 .1" euler="-90 0 0">
-      <joint name="e"/><geom type="cylinder" size=".03 .05"/>
+      <joint name="e" armature=".2"/><geom type="cylinder" size=".03 .05"/>
       <body name="six" pos=".02 0 .1" euler="90 10 0">
         <joint name="f"/><geom size=".15"/>
         <body name="seven" pos="0 .04 .1">
@@ -165,7 +167,7 @@ def mass_matrix(arm, angles):
         speed, spin = np.cross(axes, off) * moves[:, None], axes * moves[:, None]
         total += arm.mass[k] * speed @ speed.T
         total += spin @ turn @ arm.inertia[k] @ turn.T @ spin.T
-    return total
+    return total + np.diag(np.zeros(arm.num) if arm.armature is None else arm.armature)
 
 
 def at_poses(path, arm, root, num):
@@ -190,6 +192,7 @@ def at_poses(path, arm, root, num):
 
 
 def compare_with_mujoco(path, arm, root):
+    rng, torques = np.random.default_rng(2), Dynamics(functools.partial(getattr, arm), 9.81).torques
     for angles, model, data, joints, (origin, base) in at_poses(path, arm, root, 200):
         for (place, turn), joint in zip(frames(arm, angles), joints, strict=True):
             body = model.jnt_bodyid[joint]
@@ -200,6 +203,12 @@ def compare_with_mujoco(path, arm, root):
     whole, rows = np.zeros((model.nv, model.nv)), model.jnt_dofadr[joints]
     mujoco.mj_fullM(model, data, whole)
     np.testing.assert_allclose(mass_matrix(arm, angles), whole[np.ix_(rows, rows)], atol=1e-9)
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
+    rates, rises = rng.normal(scale=(3.0, 20.0), size=(arm.num, 2)).T
+    data.qvel[rows], data.qacc[:], data.qacc[rows] = rates, 0.0, rises
+    mujoco.mj_inverse(model, data)
+    expected = data.qfrc_inverse[rows]
+    np.testing.assert_allclose(torques(np.stack([[angles, rates, rises]]))[0], expected, rtol=1e-9)
     return model
 
 
@@ -344,6 +353,10 @@ def test_bodies_that_touch_at_rest_are_left_out_and_named(folder, seven):
     assert not any({links[k], links[j]} == {5, 3} for k, j in seven.pairs)
     assert "Joints that stay there: l, r." in report
     assert "Greatest torques [N m]: inf, 70, inf, 15, inf, inf, inf." in report
+    np.testing.assert_array_equal(seven.limits.torque[:4], [np.inf, 70.0, np.inf, 15.0])
+    np.testing.assert_array_equal(seven.armature, np.where(np.arange(7) == 4, 0.2, 0.0))
+    free = read_arm(folder / "seven.xml", limits=RATES | {"torque": np.inf})
+    assert free.limits.torque is None and irb1600().limits.torque is None
     rows = {row.split()[0]: row.split()[1:] for row in report.splitlines()}
     assert rows["one"] == ["1", "0.0", "0.0"] and float(rows["two"][1]) > 1.0
 
@@ -430,6 +443,7 @@ SETTINGS = [
     ({"limits": {"speed": 1}}, "limits must have fields position, .*, got 'speed'"),
     ({"limits": RATES | {"velocity": [1, 2]}}, "limits: velocity must have one value for each"),
     ({"limits": RATES | {"velocity": {"q": 1}}}, "limits: velocity must be of the joints a, b"),
+    ({"limits": RATES | {"torque": 0}}, "torque of a must be a number > 0, got 0"),
     ({"limits": RATES | {"velocity": -1}}, "velocity of a must be a finite number > 0, got -1"),
     ({"limits": RATES | {"position": [[1, 0]] * 7}}, "position of a must be two finite numbers"),
     ({"limits": "gone.yaml"}, "limits must be a YAML file, got 'gone.yaml"),

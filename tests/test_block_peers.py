@@ -16,8 +16,8 @@ from planner_jax.baselines.parts.bang_bang import bang_bang
 from planner_jax.benchmarks.block_peers import motion_torques
 from planner_jax.core.errors import MissingExtra, install_line
 from planner_jax.robot.arm import REGIMES
+from planner_jax.robot.arm_dynamics import inverse_dynamics
 from planner_jax.robot.arm_file import irb1600
-from planner_jax.sims.robots.arm.dynamics import inverse_dynamics
 from planner_jax.sweep.block.settings import BlockSettings
 from planner_jax.sweep.block.sweep import BlockSweep
 from planner_jax.task.block.motion import least_times

@@ -96,7 +96,8 @@ def judge(leaves, capsule_link=ARM.capsule_link, **options) -> BlockVerdict:
     judged = tree(leaves)
     for name in ("pairs", "shield_pairs", "base_pairs", "joint_names"):
         setattr(judged.arm, name, getattr(ARM, name))
-    judged.arm.capsule_link = capsule_link
+    judged.arm.capsule_link, judged.arm.armature = capsule_link, None
+    vars(judged.limits).setdefault("torque", None)
     return referee_blocks(judged, judged.plan, **options)
 
 
@@ -153,6 +154,19 @@ def overshoot(**edits):
 
 PEAK = 2.0 * abs(CHANGE[STEEPEST])  # final rate x duration of a motion by FROM_REST
 JOINT = DELAY + PIECES[0]  # time at which the two pieces join
+
+
+def weight(angles, step=1e-5):
+    """Return the torque [N m] of joint 2 that holds the arm still, from its potential energy."""
+
+    def energy(turn):
+        bodies = zip(links(angles + turn * (np.arange(6) == 1)), ARM.mass, ARM.centre, strict=True)
+        return sum(GRAVITY * m * (place + turned @ c)[2] for (turned, place), m, c in bodies)
+
+    return (energy(step) - energy(-step)) / (2.0 * step)
+
+
+WEAK = np.where(np.arange(6) == 1, abs(weight(GOAL)) / 1.25, np.inf)
 TOP_ACCELERATION = 10.0 / np.sqrt(3.0) * abs(CHANGE[STEEPEST]) / SPAN**2
 STEEP, FAST = f"joint {STEEPEST + 1}", f"joint {FASTEST + 1}"
 
@@ -180,6 +194,9 @@ FAILURES = {
         part=FAST,
     ),
     "acceleration: 2/3": spoil({"limits.acceleration": TOP_ACCELERATION / 1.5}, 0.5, part=STEEP),
+    "torque: 4/5 of the weight": failure(
+        still(GOAL) | {"limits.torque": WEAK[None]}, 0.25, None, part="joint 2"
+    ),
     "rest: required": failure(good(FROM_REST, regime="R3"), PEAK / SPAN, part=STEEP),
     "rest: stops at once": failure(
         good(FROM_REST, regime="R1", durations=(0.2, 0.6)), PEAK / 0.8, 0.9, part=STEEP
@@ -517,8 +534,8 @@ def unequal_lanes():
 
 
 FAILED = ["", "tilt", "time", "self", "velocity", "velocity", ""]
-# For dynamics, the home pose, and the arm's own limits, which a case can replace.
-UNREAD = {"arm.home", "arm.mass", "arm.centre", "arm.inertia"}
+# The home pose, and the arm's own limits, which a case can replace.
+UNREAD = {"arm.home"}
 UNREAD |= {"arm.limits.velocity", "arm.limits.acceleration"}
 # The usual scene has no boxes and no cylinders.
 UNREAD |= {f"scene.box_{name}" for name in ("half", "middle", "turn")}

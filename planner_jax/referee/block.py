@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from planner_jax.referee import judging
+from planner_jax.referee import arm_torque, judging
 from planner_jax.referee.arm_clearance import KINDS, clearances, links_of, shield_pose
 from planner_jax.referee.solids import from_segment, length, rotate_back
 
@@ -25,6 +25,7 @@ _SENTENCES = {
     "position": "{failed_part} is {excess:.3g} rad beyond its limit at {time:.3f} s",
     "velocity": "{failed_part} is {excess:.2%} above its limit at {time:.3f} s",
     "acceleration": "{failed_part} is {excess:.2%} above its limit at {time:.3f} s",
+    "torque": "{failed_part} needs {excess:.2%} more torque than its limit at {time:.3f} s",
     "rest": "{failed_part} turns at {excess:.3g} rad/s when the motion ends, at {time:.3f} s; the "
     "arm must be at standstill there if the case requires it or the contact is later",
     "floor": "{failed_part} is {excess:.3g} m below the floor at {time:.3f} s",
@@ -60,8 +61,10 @@ _CASE_SHAPES: dict[str, tuple[int, ...]] = {
 _JOINT_SHAPES: dict[str, tuple[int, ...]] = {
     **{"angles": (), "rates": (), "arm.lower": (), "arm.upper": ()},
     **{"arm.origin": (3,), "arm.turn": (4,), "arm.axis": (3,)},
-    **{"limits.velocity": (), "limits.acceleration": ()},
+    **{"limits.velocity": (), "limits.acceleration": (), "limits.torque": ()},
+    **{"arm.mass": (), "arm.armature": (), "arm.centre": (3,), "arm.inertia": (3, 3)},
 }
+
 
 LONGEST_STEP = 0.002  # [s], greatest time between two samples of the arm's motion
 # [rad] Greatest change between two samples, as the norm of the joint angles' changes.
@@ -94,6 +97,7 @@ class BlockVerdict(judging.Verdict):
     execution_time: np.ndarray  # (B,) [s], duration of the arm's motion
     velocity_share: np.ndarray  # (B,) greatest ratio of a joint's |velocity| to its limit
     acceleration_share: np.ndarray  # (B,) greatest ratio of a joint's |acceleration| to its limit
+    torque_share: np.ndarray  # (B,) greatest ratio of a joint's |torque| to its limit, 0 without
     floor_clearance: np.ndarray  # (B,) [m], least distance of arm and shield from the floor
     obstacle_clearance: np.ndarray  # (B,) [m], least distance of arm and shield from obstacles
     rig_clearance: np.ndarray  # (B,) [m], least distance of arm and shield from the rig's beams
@@ -116,7 +120,9 @@ def referee_blocks(
 ) -> BlockVerdict:
     """Decide for every plan of a batch of blocks whether it succeeds.
 
-    Angles, rates and accelerations are tested at the ends of each piece and at their extrema.
+    Angles, rates and accelerations are tested at the ends of each piece and at their extrema. For
+    limits with torques, MuJoCo's inverse dynamics computes torques at the ends of each piece, and
+    at samples at most 5 ms apart. An arm that stays at the end must hold still there.
 
     Clearances are computed at the ends of the pieces and at samples between them. Samples are at
     most `LONGEST_STEP` and `LARGEST_TURN` apart, but not closer than 0.17 ms. At samples the
@@ -129,8 +135,8 @@ def referee_blocks(
         cases: object with the fields of `BlockCase`, for B cases; gravity > 0.
         plans: object with the fields of `BlockPlan`, for B plans of M polynomial pieces of degree
             D: coefficients (B, M, D + 1, n), durations (B, M).
-        tolerance: relative tolerance of velocities, accelerations, and the case's `offset` and
-            `tilt` at the contact; absolute tolerance of the start and of jumps between pieces
+        tolerance: relative tolerance of velocities, accelerations, torques, and the case's `offset`
+            and `tilt` at the contact; absolute tolerance of the start and of jumps between pieces
             [rad], [rad/s], and of joint angles beyond their limits [rad].
         contact_tolerance: [m], greatest distance of the ball from the shield's face at the
             contact, and greatest depth of the arm in an obstacle. The ball must be blocked inside
@@ -199,8 +205,11 @@ def _judge(case: dict, arm: Any, relative: float, contact: float) -> dict:
     measured, tests, parts = _judge_limits(case, motion, extremes, relative)
     found, more = _judge_contact(case, _final(motion, stays), relative, contact)
     measured, tests = measured | found, tests | more
-    rest, parts["rest"] = _rest(case, motion, stays)
-    tests["rest"] = rest
+    has_to = (case["ends_at_rest"] != 0.0) | (stays > judging.CONTACT_TIME_TOLERANCE)
+    tests["rest"], parts["rest"] = _rest(motion, has_to)
+    excess, time, parts["torque"] = _torques(case, motion, sound, has_to)
+    tests["torque"] = excess > relative, excess, time
+    measured["torque_share"] = excess + 1.0
     turning = np.sqrt((np.abs(extremes[1][0]).max(axis=0) ** 2).sum(axis=0))
     near = _clearances(case, arm, motion, turning)
     measured |= {f"{kind}_clearance": least for kind, (least, _, _) in near.items()}
@@ -293,12 +302,30 @@ def _judge_limits(case: dict, motion: _Motion, extremes: list, relative: float) 
     return measured, tests, parts
 
 
-def _rest(case: dict, motion: _Motion, stays: np.ndarray) -> tuple[tuple, np.ndarray]:
+def _torques(case: dict, motion: _Motion, sound: np.ndarray, stays: np.ndarray) -> tuple:
+    """Return each plan's greatest relative excess of a torque, its time [s], and the joint.
+
+    Without limits, and for plans that are not sound, the excess is -1. An arm that `stays` has to
+    hold still at the end of the motion.
+    """
+    worst, when, joint = -np.ones(sound.shape), np.zeros(sound.shape), np.zeros(sound.shape, int)
+    models: dict[bytes, arm_torque.Dynamics] = {}
+    for k in np.flatnonzero(sound & ("limits.torque" in case)).tolist():
+        own = {name: leaf[k] for name, leaf in case.items() if name[:4] in ("arm.", "grav")}
+        key = b"".join(leaf.tobytes() for leaf in own.values())
+        if key not in models:
+            leaf = lambda name, own=own: own.get(f"arm.{name}")  # noqa: E731
+            models[key] = arm_torque.Dynamics(leaf, float(own["gravity"]))
+        of_plan = motion.coeffs[:, :, k], motion.durations[k], case["limits.torque"][k], stays[k]
+        worst[k], when[k], joint[k] = models[key].compare(*of_plan)
+    return worst, motion.starts[:, 0] + when, np.char.add("joint ", (joint + 1).astype(str))
+
+
+def _rest(motion: _Motion, has_to_stay: np.ndarray) -> tuple[tuple, np.ndarray]:
     rates = np.abs(judging.derivative(motion.coeffs[..., -1], motion.durations[:, -1], 1))
-    has_to = (case["ends_at_rest"] != 0.0) | (stays > judging.CONTACT_TIME_TOLERANCE)
     time = motion.starts[:, -1] + motion.durations[:, -1]
     worst, time, joint = _worst(rates[None, ..., None], time[:, None])
-    return (has_to & (worst > REST), worst, time), joint
+    return (has_to_stay & (worst > REST), worst, time), joint
 
 
 def _final(motion: _Motion, stays: np.ndarray) -> np.ndarray:

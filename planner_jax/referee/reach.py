@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from planner_jax.referee import judging
+from planner_jax.referee.arm_torque import Dynamics
 
 _SENTENCES = {
     "not finite": "the plan or its case is not finite",
@@ -25,6 +26,7 @@ _SENTENCES = {
     "position": "{failed_part} is {excess:.3g} rad beyond its limit at {time:.3f} s",
     "velocity": "{failed_part} is {excess:.2%} above its limit at {time:.3f} s",
     "acceleration": "{failed_part} is {excess:.2%} above its limit at {time:.3f} s",
+    "torque": "{failed_part} needs {excess:.2%} more torque than its limit at {time:.3f} s",
     "goal": "{failed_part} ends {excess:.3g} rad or rad/s off standstill at the nearest goal",
     "obstacle": "{failed_part} are {excess:.3g} m inside each other at {time:.3f} s",
     "self": "{failed_part} are {excess:.3g} m inside each other at {time:.3f} s",
@@ -52,6 +54,7 @@ class ReachVerdict(judging.Verdict):
     duration: np.ndarray  # (B,) [s], of the motion
     velocity_share: np.ndarray  # (B,) greatest ratio of a joint's |velocity| to its limit
     acceleration_share: np.ndarray  # (B,) greatest ratio of a joint's |acceleration| to its limit
+    torque_share: np.ndarray  # (B,) greatest ratio of a joint's |torque| to its limit, 0 without
     obstacle_clearance: np.ndarray  # (B,) [m], least distance of the arm from obstacles and floor
     self_clearance: np.ndarray  # (B,) [m], least distance of the arm from its base and itself
 
@@ -67,14 +70,16 @@ def referee_reaches(
     """Decide for every plan of a batch of joint motions whether it succeeds.
 
     Distances are computed at samples at most `LONGEST_STEP` and `LARGEST_TURN` apart. Between
-    distant bodies they are bounded by spheres around the bodies. The motion must consist of pieces
+    distant bodies they are bounded by spheres around the bodies. For limits with torques, MuJoCo's
+    inverse dynamics computes torques at most 5 ms apart. The motion must consist of pieces
     of degree 2, whose rates and accelerations have their extremes at the ends of the pieces.
 
     Args:
         cases: object with the fields of `ReachCase`, for B cases.
         plans: object with the fields of `ReachPlan`, for B plans.
-        tolerance: relative tolerance of velocities and accelerations; absolute tolerance of start,
-            goal and jumps between pieces [rad], [rad/s], and of angles beyond limits [rad].
+        tolerance: relative tolerance of velocities, accelerations and torques; absolute tolerance
+            of start, goal and jumps between pieces [rad], [rad/s], and of angles beyond limits
+            [rad].
         contact_tolerance: [m], greatest depth of two bodies in each other.
 
     Raises:
@@ -103,7 +108,7 @@ def referee_reaches(
 
 
 _MEASURED = (
-    *("duration", "velocity_share", "acceleration_share"),
+    *("duration", "velocity_share", "acceleration_share", "torque_share"),
     *("obstacle_clearance", "self_clearance"),
 )
 
@@ -191,6 +196,13 @@ def _judge(
     number = np.arange(len(piece)) - np.repeat(np.cumsum(count) - count, count)
     time = np.append(begins[piece] + number / count[piece] * durations[piece], total)
     samples = state(time, np.append(piece, len(index) - 1), 0)
+    measured["torque_share"] = 0.0
+    if limits.torque is not None:
+        compare = Dynamics(functools.partial(getattr, arm), 9.81).compare
+        of_plan = coeffs.transpose(1, 2, 0), durations, limits.torque
+        excess, at, joint = compare(*of_plan, stays=True)
+        tests["torque"], parts["torque"] = (excess > relative, excess, at), names[joint]
+        measured["torque_share"] = excess + 1.0
     scene, hulls = case.scene, () if case.scene.meshes is None else case.scene.meshes.corners
     bodies = Bodies(case.arm, scene.cylinder_ends, scene.cylinder_radius, hulls, scene)
     for kind, (least, at, part) in bodies.clearances(samples).items():

@@ -20,10 +20,14 @@ from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
 
 @struct.dataclass
 class ArmLimits:
-    """Greatest magnitudes of joint velocities and accelerations; `Arm` has the limits of angles."""
+    """Greatest magnitudes of joint velocities, accelerations and torques.
+
+    `Arm` has the limits of angles. Programs for limits without torques do not compute torques.
+    """
 
     velocity: Array  # (n,) [rad/s]
     acceleration: Array  # (n,) [rad/s^2]
+    torque: Array | None = None  # (n,) [N m], infinite for a joint without a limit; None for none
 
 
 @struct.dataclass
@@ -36,7 +40,7 @@ class Arm:
     lower: Array  # (n,) [rad], least joint angles
     upper: Array  # (n,) [rad], greatest joint angles
     home: Array  # (n,) [rad], joint angles at which the arm waits
-    limits: ArmLimits  # greatest rates and accelerations of the joints
+    limits: ArmLimits  # greatest rates, accelerations and torques of the joints
     mass: Array  # (n,) [kg], of each link
     centre: Array  # (n, 3) [m], centre of mass of each link, in the link's frame
     inertia: Array  # (n, 3, 3) [kg m^2], of each link about its centre of mass, link's axes
@@ -66,6 +70,9 @@ class Arm:
     turns_in_plane: bool = struct.field(pytree_node=False)
     # Method of inverse kinematics, see `arm_ik.choose_ik`.
     ik: str = struct.field(pytree_node=False, default="spherical")
+    # (n,) [kg m^2], inertia of each motor's rotor, multiplied by the squared ratio of its gear;
+    # None if the arm's file has none.
+    armature: Array | None = None
 
     @property
     def num(self) -> int:

@@ -237,6 +237,8 @@ def _read(
     checked = _pairs(link, ends, radius, box, mount, poses)
     if checked.is_buried:
         raise model.error("the shield", "outside of the links; move it by shield=", "be")
+    armature = model.model.dof_armature[model.model.jnt_dofadr[model.joints]]
+    has_torques = bool(np.any(np.isfinite(stated["torque"])))
     off_axis = np.cross([mount.turn[:, 0], mount.centre], axis[-1])
     arrays = {name: host_leaf(leaf, dtype) for name, leaf in leaves.items()}
     arm = Arm(
@@ -244,7 +246,9 @@ def _read(
         limits=ArmLimits(
             velocity=host_leaf(stated["velocity"], dtype),
             acceleration=host_leaf(stated["acceleration"], dtype),
+            torque=host_leaf(stated["torque"], dtype) if has_torques else None,
         ),
+        armature=host_leaf(armature, dtype) if np.any(armature) else None,
         capsule_link=link,
         pairs=checked.pairs,
         base_pairs=checked.base_pairs,

@@ -29,7 +29,7 @@ def limits_of(model: ArmModel, limits: Limits) -> dict[str, np.ndarray]:
     """Return the limits of positions (n, 2) [rad], and of velocity, acceleration and torque (n,).
 
     Values that a YAML file or a dictionary states replace the values of the arm's file. A torque
-    without a limit is infinite.
+    without a limit is infinite, which a file may state, too.
 
     Raises:
         ArgumentError: a joint has no limit of its position, velocity or acceleration.
@@ -137,8 +137,10 @@ def _number(source: str, kind: str, joint: str, value: Any) -> Any:
         rule, is_sound = "two finite numbers in ascending order", len(numbers) == 2 and are_numbers
         is_sound = is_sound and all(map(math.isfinite, numbers)) and numbers[0] < numbers[1]
     else:
-        rule, is_sound = "a finite number > 0", len(numbers) == 1 and are_numbers
-        is_sound = is_sound and math.isfinite(numbers[0]) and numbers[0] > 0.0
+        may_be_infinite = kind == "torque"  # no limit
+        rule = "a number > 0" if may_be_infinite else "a finite number > 0"
+        is_sound = len(numbers) == 1 and are_numbers and numbers[0] > 0.0
+        is_sound = is_sound and (may_be_infinite or math.isfinite(numbers[0]))
     if not is_sound:
         raise ArgumentError(f"{source}: {kind} of {joint}", rule, value)
     return np.array(numbers, float) if kind == "position" else float(numbers[0])

@@ -16,6 +16,7 @@ from jax import Array
 from planner_jax.baselines.parts.bang_bang import bang_bang
 from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import Attempt, require_settings, select_first_solved, status_of
+from planner_jax.robot.arm_dynamics import measure_torques
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.clearance import least_clearances
 from planner_jax.task.block.end_poses import EndPoses, end_poses, flight_of
@@ -80,8 +81,8 @@ class DirectBlock(Planner):
     def plan_to(self, case: BlockCase, goal: Array, contact: Array, duration: Array) -> BlockPlan:
         """Return the bang-bang motion to one end pose as a plan.
 
-        The plan's violation is the excess [rad] over a position limit, or 100 times the lack [m] of
-        distance from obstacles, whichever is greater.
+        The plan's violation is the excess [rad] over a position limit, the relative excess over a
+        torque limit, or 100 times the lack [m] of distance from obstacles, whichever is greatest.
 
         Args:
             case: one case.
@@ -97,6 +98,9 @@ class DirectBlock(Planner):
         # A joint that moves at the start may overshoot its goal and a position limit.
         beyond = jnp.max(jnp.maximum(angles - case.arm.upper, case.arm.lower - angles))
         violation = jnp.maximum(100.0 * (self.margin - jnp.min(gaps)), beyond)
+        if case.limits.torque is not None:
+            of_case = case.arm, case.limits, case.gravity
+            violation = jnp.maximum(violation, measure_torques(*of_case, motion, self.samples)[0])
         return BlockPlan(
             motion=motion,
             contact_time=contact,

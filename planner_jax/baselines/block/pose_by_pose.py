@@ -28,10 +28,12 @@ from planner_jax.core.arithmetic import host_leaf
 from planner_jax.core.choices import require
 from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import Attempt, Status, require_settings, take
+from planner_jax.robot.arm_dynamics import measure_torques
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.plan import BlockPlan, explain_status, mark_blocked
 from planner_jax.trajectory.polynomial import PiecewisePolynomial
 
+_TORQUES = 96  # number of times, besides the ends of pieces, at which torques are computed
 Clock = Callable[[], float]  # returns the remaining search time [s]
 
 
@@ -136,6 +138,10 @@ class PoseByPose(Planner, abc.ABC):
         else:
             coeffs, durations, cost = motion.coeffs, motion.durations, motion.execution
             violation = cost / (np.asarray(contact) - case.delay) - 1.0
+            if case.limits.torque is not None:
+                path = PiecewisePolynomial(jnp.asarray(coeffs), jnp.asarray(durations))
+                of_case = case.arm, case.limits, case.gravity
+                violation = max(violation, float(measure_torques(*of_case, path, _TORQUES)[0]))
             status = Status.FEASIBLE if violation <= 0.0 else Status.INFEASIBLE
         rest = np.zeros((self.pieces - len(durations), self.degree + 1, case.arm.num))
         rest[:, 0] = sum(coeffs[-1, k] * durations[-1] ** k for k in range(self.degree + 1))

@@ -49,6 +49,7 @@ RULES: Table = (
     Field("arm.shield_corners", ("S", 2)),
     Field("limits.velocity", ("J",), rules.POSITIVE),
     Field("limits.acceleration", ("J",), rules.POSITIVE),
+    *(Field(f"{of}limits.torque", ("J",), rules.POSITIVE_OR_NONE) for of in ("", "arm.")),
     Field("ends_at_rest", (), kind=np.bool_),
     Field("offset", (), rules.POSITIVE),
     Field("tilt", (), rules.within(0.0, np.pi, "in [0, pi]")),
@@ -130,8 +131,8 @@ def case(
             velocity at the end. "R2", the default: speeds of the robot's data sheet and
             30 rad/s^2, at rest at the end. "R3": limits of "R1", at rest at the end. A regime is
             not allowed for another arm, whose motions end at rest.
-        limits: greatest joint rates and accelerations, without batch axes; by default the limits
-            of the regime, or else the limits of the arm.
+        limits: greatest joint rates, accelerations and torques, without batch axes; by default the
+            limits of the regime, or else the limits of the arm.
         wide: whether the ball may meet the shield up to 0.1 m from its middle and tilted by up to
             30 degrees, instead of 2 mm and half a degree.
         anywhere: whether the ball may meet the shield anywhere and at any angle. This suits motions

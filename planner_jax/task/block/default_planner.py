@@ -34,6 +34,7 @@ from planner_jax.core.protocol import (
 )
 from planner_jax.optimise import levenberg
 from planner_jax.optimise.levenberg import LevenbergConfig, LevenbergState, Model, continue_search
+from planner_jax.robot import arm_dynamics
 from planner_jax.task.block import motion
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.clearance import (
@@ -53,6 +54,7 @@ from planner_jax.task.block.end_poses import (
     thin_points,
 )
 from planner_jax.task.block.plan import BlockPlan, explain_status, make_empty_plan
+from planner_jax.trajectory.polynomial import PiecewisePolynomial
 
 if TYPE_CHECKING:
     from planner_jax.task.block.replan import ReplanBlock
@@ -63,6 +65,7 @@ _HIGHEST = lax.Precision.HIGHEST
 _COARSE, _CHECKS = 12, 3
 _EVERY = 3  # straight motions lead to the end poses of one in so many points of the ball's path
 _SETTLING = {"good": 24, "best": 48}  # effort -> number of steps that lower the cost
+_TORQUES = 24  # number of times, besides the knots of a motion, at which torques are computed
 _TURN = 5  # steps of least squares on a GPU before searches that have ended make room for others
 
 
@@ -410,6 +413,11 @@ class OnlineBlock(Planner):
             gaps = least_clearances(case.arm, case.scene, angles)
             least = jnp.min(gaps[: block * coarse].reshape(block, coarse), axis=1)
             found = (least >= self.margin) & (first + jnp.arange(block) < num)
+            if case.limits.torque is not None:
+                ranks = jnp.minimum(first + jnp.arange(block), len(order) - 1)
+                points = jax.vmap(lambda k: self.encode_straight(case, poses, order[k]))(ranks)
+                excess = jax.vmap(lambda point: self.torque_excess(case, point))(points)
+                found &= excess <= FEASIBILITY_TOLERANCE
             found = lax.dynamic_update_slice(free, found, (first,))
             point = self.encode_straight(case, poses, order[k])
             plan = self._plan_of(case, flight, point, jnp.zeros((), jnp.int32), angles, gaps)
@@ -543,13 +551,53 @@ class OnlineBlock(Planner):
         size = case.arm.num * pieces
         ends_free = jnp.where(case.ends_at_rest, 0.0, 1.0)
         free = jnp.ones(size + 1, dtype).at[size - case.arm.num : size].set(ends_free)
+        cost = joints.cost + jnp.sum(rows**2) + jnp.sum(short**2)
+        joint_excess = joints.excess
+        if case.limits.torque is not None:
+            (more, push, gram), torque_excess = self._torque_terms(case, point)
+            cost, gradient, curvature = cost + more, gradient + push, curvature + gram
+            joint_excess = jnp.maximum(joint_excess, torque_excess)
         too_near = near[0] - 0.3 * self.margin
         return Model(
-            cost=joints.cost + jnp.sum(rows**2) + jnp.sum(short**2),
+            cost=cost,
             gradient=gradient * free,
             curvature=curvature * free[:, None] * free[None],
-            violation=_combine_excess(joints.excess, contact_excess, too_near),
+            violation=_combine_excess(joint_excess, contact_excess, too_near),
         )
+
+    def _motion_of(self, case: BlockCase, point: Array) -> PiecewisePolynomial:
+        steps, first, duration = self.decode(case, point)
+        return motion.polynomial(case.angles, first, steps, duration)
+
+    def torque_excess(self, case: BlockCase, point: Array) -> Array:
+        """Return the greatest relative excess () of a torque over its limit, less a reserve."""
+        of_case, path = (case.arm, case.limits, case.gravity), self._motion_of(case, point)
+        return arm_dynamics.measure_torques(*of_case, path, _TORQUES)[0]
+
+    def _torque_terms(self, case: BlockCase, point: Array) -> tuple[tuple[Array, ...], Array]:
+        """Return cost, gradient and curvature of excess torques at the knots, and their excess ().
+
+        The derivatives are computed only if a torque exceeds its limit.
+        """
+        most = arm_dynamics.USED * jnp.asarray(case.limits.torque)[None]
+
+        def excess(point: Array) -> Array:
+            angles, rates, rises = arm_dynamics.sample_states(self._motion_of(case, point), 0)
+            at = jax.vmap(arm_dynamics.inverse_dynamics, (None, 0, 0, 0, None))
+            shares = at(case.arm, angles, rates, rises, case.gravity) / most
+            return jnp.abs(shares).reshape(-1) - 1.0
+
+        def derive() -> tuple[Array, ...]:
+            over = self.weights.limits * jnp.maximum(found + self.slack, 0.0)
+            slopes = self.weights.limits * jax.jacfwd(excess)(point)
+            slopes = jnp.where(over > 0.0, slopes.T, 0.0)  # (U, S)
+            push = jnp.matmul(slopes, over, precision=_HIGHEST)
+            return jnp.sum(over**2), push, jnp.matmul(slopes, slopes.T, precision=_HIGHEST)
+
+        found, num = excess(point), point.size
+        none = [jnp.zeros(shape, point.dtype) for shape in ((), (num,), (num, num))]
+        worst = jnp.max(found)
+        return lax.cond(worst > -self.slack, derive, lambda: tuple(none)), worst
 
     def finish(self, case: BlockCase, flight: Flight, point: Array, steps: Array) -> BlockPlan:
         """Return the plan of the unknowns `point`, which are joint rates and time of contact.
@@ -578,6 +626,8 @@ class OnlineBlock(Planner):
         beyond = jnp.max(jnp.abs(angles - middle[None]) / half[None]) - 1.0
         contact = contact_terms(case, flight, angles[-1], point[-1], self.weights)[2]
         joint_excess = jnp.maximum(joints.excess, beyond)
+        if case.limits.torque is not None:
+            joint_excess = jnp.maximum(joint_excess, self.torque_excess(case, point))
         excess = _combine_excess(joint_excess, contact, self.margin - jnp.min(gaps[1:]))
         violation = jnp.where(point[-1] > case.delay, excess, jnp.inf)
         status = status_of(joints.load, violation, violation > FEASIBILITY_TOLERANCE)
@@ -595,6 +645,12 @@ class OnlineBlock(Planner):
         most = 1.0 - self.slack
         rate, rise = most * case.limits.velocity, most * case.limits.acceleration
         path, pace = motion.speed_up(plan.motion, rate, rise)
+        if case.limits.torque is not None:
+            of_case = case.arm, case.limits, case.gravity
+            slower = arm_dynamics.measure_torques(*of_case, path, _TORQUES)[1]
+            # The slow motion keeps the limits, also where the arm could not stand still.
+            slower = jnp.minimum(slower, 1.0 / pace)
+            path, pace = arm_dynamics.stretch(path, slower), pace * slower
         rests = is_solved(plan.status) & case.ends_at_rest & jnp.all(case.rates == 0.0)
         plan = dataclasses.replace(plan, cost=duration)
         quick = dataclasses.replace(plan, motion=path, cost=pace * duration)

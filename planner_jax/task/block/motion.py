@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
+from planner_jax.robot.arm_dynamics import stretch
 from planner_jax.task.block.case import BlockCase
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
 
@@ -178,10 +179,7 @@ def speed_up(
     rises = 2.0 * motion.coeffs[:, 2] / acceleration[None]
     pace = jnp.maximum(jnp.max(jnp.abs(rates)), jnp.sqrt(jnp.max(jnp.abs(rises))))
     pace = jnp.clip(pace, 1e-3, 1.0)
-    return PiecewisePolynomial(
-        coeffs=motion.coeffs / (pace ** jnp.arange(3, dtype=pace.dtype))[None, :, None],
-        durations=pace * motion.durations,
-    ), pace
+    return stretch(motion, pace), pace
 
 
 def least_times(

@@ -29,6 +29,7 @@ RULES: Table = (
     Field("arm.capsule_radius", ("C",), rules.NOT_NEGATIVE),
     Field("limits.velocity", ("J",), rules.POSITIVE),
     Field("limits.acceleration", ("J",), rules.POSITIVE),
+    *(Field(f"{of}limits.torque", ("J",), rules.POSITIVE_OR_NONE) for of in ("", "arm.")),
     *scene_module.RULES,
 )
 
@@ -73,7 +74,8 @@ def case(
         angles: (n,) or (B, n) [rad], joint angles at the start; by default those at which the arm
             waits.
         arm: without batch axes; by default an IRB 1600 with a shield.
-        limits: greatest joint rates and accelerations, without batch axes; by default the arm's.
+        limits: greatest joint rates, accelerations and torques, without batch axes; by default the
+            limits of the arm.
         scene: obstacles, without batch axes, for example of `make_scene`; by default the pole, the
             floor and the beams of [Natarajan2024].
         dtype: type of every floating leaf.

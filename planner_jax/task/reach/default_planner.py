@@ -26,6 +26,7 @@ from planner_jax.core.protocol import (
     status_of,
 )
 from planner_jax.robot.arm import Arm, ArmPlan
+from planner_jax.robot.arm_dynamics import measure_torques, stretch
 from planner_jax.task.block.clearance import clearances
 from planner_jax.task.reach import motion, shortcut, tree
 from planner_jax.task.reach.case import ReachCase
@@ -35,6 +36,8 @@ from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
 # make faster. If the coarse distance misses a collision, the shortcuts are repeated with the other.
 _RESOLUTION, _COARSE = 0.02, 0.04
 _CHUNK = 16  # number of states that are checked together
+_TORQUES = 256  # number of times, besides the ends of pieces, at which torques are computed
+_GRAVITY = 9.81  # [m/s^2]
 _CUTS = 30  # number of attempts to shorten a path
 
 
@@ -240,6 +243,8 @@ class ReachPlanner(Planner):
     ) -> ReachPlan:
         """Return the plan of a motion with these knots, and check it for collisions.
 
+        A motion that exceeds a limit of torque is slowed down until it keeps the limit.
+
         Args:
             case: the case.
             rows: (R, 1 + G) [m], distances of R pairs of bodies at the start and at the goals.
@@ -248,9 +253,14 @@ class ReachPlanner(Planner):
             rates: (M + 1, n) [rad/s], joint rates at the knots.
         """
         path = motion.join_knots(case.angles, durations, rates)
-        duration = jnp.sum(durations)
+        weak = jnp.zeros_like(durations[0])
+        if case.limits.torque is not None:
+            _, factor, weak = measure_torques(case.arm, case.limits, _GRAVITY, path, _TORQUES)
+            path = stretch(path, factor)
+        duration = jnp.sum(path.durations)
         floors = self._floors(jnp.minimum(rows[:, 0], rows[:, 1 + goal]))
-        violation = 100.0 * jnp.maximum(-self._least_excess(case, floors, path, _RESOLUTION), 0.0)
+        gap = self._least_excess(case, floors, path, _RESOLUTION)
+        violation = jnp.maximum(jnp.maximum(-100.0 * gap, weak), 0.0)
         violation = jnp.where(jnp.isfinite(duration + jnp.sum(rates)), violation, jnp.inf)
         return ReachPlan(
             motion=path,

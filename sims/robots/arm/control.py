@@ -12,7 +12,7 @@ from flax import struct
 from jax import Array
 
 from planner_jax.robot.arm import Arm
-from planner_jax.sims.robots.arm.dynamics import inverse_dynamics
+from planner_jax.robot.arm_dynamics import inverse_dynamics
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate, total_duration
 
 

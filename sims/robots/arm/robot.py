@@ -8,6 +8,7 @@ collisions afterwards.
 
 import dataclasses
 import functools
+import math
 from typing import Any, ClassVar
 
 import jax
@@ -18,9 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from planner_jax.referee.arm_clearance import links_of, shield_pose
 from planner_jax.robot.arm import Arm
-from planner_jax.robot.arm_chain import ArmModel
 from planner_jax.robot.arm_file import irb1600
-from planner_jax.robot.arm_limits import limits_of
 from planner_jax.sims.model import World
 from planner_jax.sims.robot import Physics, Shape, Solid, rotation
 from planner_jax.sims.robots.arm.control import (
@@ -58,7 +57,7 @@ def _read(file: str | None, tip: str | None, shield: str | None) -> Arm:
 class ShieldArm:
     """A simulated arm with a shield, by default the IRB 1600; static under `jax.jit`.
 
-    Masses and inertias are those of the arm's file, without friction and rotor inertia.
+    Masses and inertias are those of the arm's file, without friction.
     """
 
     base_height: float = 0.0  # [m], height of the base frame above the ground
@@ -81,7 +80,8 @@ class ShieldArm:
         """The torque limits [N m] of the joints; infinite where the arm's file states none."""
         if self.file is None:
             return TORQUES
-        return tuple(limits_of(ArmModel(self.file, self.tip), None)["torque"].tolist())
+        torque = self.arm.limits.torque
+        return tuple(torque.tolist()) if torque is not None else (math.inf,) * self.arm.num
 
     @property
     def num_pos(self) -> int:
@@ -130,12 +130,13 @@ class ShieldArm:
 
     def _link(self, k: int) -> str:
         arm = self.arm
-        inertia = arm.inertia[k]
+        inertia, rotor = arm.inertia[k], 0.0 if arm.armature is None else arm.armature[k]
         full = [*np.diag(inertia), inertia[0, 1], inertia[0, 2], inertia[1, 2]]
         return (
             f'<body name="link_{k + 1}" pos="{xml_numbers(*arm.origin[k])}" '
             f'quat="{xml_numbers(*arm.turn[k])}">'
-            f'<joint name="joint_{k + 1}" type="hinge" axis="{xml_numbers(*arm.axis[k])}"/>'
+            f'<joint name="joint_{k + 1}" type="hinge" axis="{xml_numbers(*arm.axis[k])}" '
+            f'armature="{xml_numbers(rotor)}"/>'
             f'<inertial pos="{xml_numbers(*arm.centre[k])}" mass="{xml_numbers(arm.mass[k])}" '
             f'fullinertia="{xml_numbers(*full)}"/>'
         )
