@@ -111,7 +111,7 @@ tool.radius | ~ | tool.radius must be given, got nothing
 tool.kind | rackett | tool.kind must be net or racket, got 'rackett'; did you mean racket?
 masss | 1 kg | field must be one of FIELDS, got 'masss'; did you mean mass?
 tool.size | 1 m | tool field must be one of TOOL, got 'size'
-rotors.places | 1 m | rotors.places must be 8 or 12 or 16 numbers in m, cm, mm, got '1 m'
+rotors.places | 1 m | rotors.places must be x and y of 4, 6 or 8 rotors in m, cm, mm, got '1 m'
 rotors.count | 5 | rotors.count must be 4, 6 or 8, got 5
 rotors.diagonal | ~ | rotors.places or diagonal must be given, got nothing
 rotors.places | [[0, 1], [1, 1], [2, 1], [3, 1]] | rotors must have diagonal or places, not both

@@ -325,6 +325,7 @@ def parse_numbers(value: Value, kind: str, *counts: int, span: bool = False) -> 
     numbers = tuple(number for part in parts for number in _parse(part, kind, span))
     if len(numbers) not in counts:
         what = "a number" if counts == (1,) else f"{' or '.join(map(str, counts))} numbers"
+        what = "x and y of 4, 6 or 8 rotors" if counts == _COORDINATES else what
         raise QuantityError(f"must be {what} in {_list_units(kind)}, got {_shorten(value)}")
     return numbers
 
