@@ -51,7 +51,7 @@ def from_home(cases: Any, homes: np.ndarray) -> Any:
 
     def repeat(leaf: Any) -> np.ndarray:
         leaf = np.asarray(leaf)
-        return np.broadcast_to(leaf, (num, *leaf.shape)).reshape(-1, *leaf.shape[1:])
+        return np.tile(leaf, (num,) + (1,) * (leaf.ndim - 1))
 
     all_cases = jax.tree.map(repeat, cases)
     angles = np.repeat(homes, cases.batch_shape[0], axis=0).astype(all_cases.angles.dtype)

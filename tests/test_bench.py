@@ -12,6 +12,7 @@ from flax import struct
 
 import planner_jax as pj
 from planner_jax import benchmarks
+from planner_jax.benchmarks.block_home import from_home
 from planner_jax.benchmarks.block_rows import METHODS, ROWS
 from planner_jax.benchmarks.cost_gap import cost_gaps, gap_figures
 from planner_jax.benchmarks.first_plan import ROWS as FIRST_PLANS
@@ -51,6 +52,14 @@ def test_the_throws_that_are_kept_are_those_of_the_seed():
         np.testing.assert_array_equal(marks["union"], known | marks["long"])
         assert not (marks["long"] & known).any()
         assert (marks["planner"].sum(axis=0) >= 0.96 * marks["union"].sum(axis=0)).all()
+
+
+def test_every_throw_is_repeated_for_every_home():
+    cases, homes = pj.block.draw(2), np.linspace(0.1, 0.3, 3)[:, None] * np.ones(6)
+    many = from_home(cases, homes)
+    assert many.batch_shape == (6,)
+    np.testing.assert_array_equal(many.ball.pos, np.tile(cases.ball.pos, (3, 1)))
+    np.testing.assert_allclose(many.angles[:, 0], [0.1, 0.1, 0.2, 0.2, 0.3, 0.3], rtol=1e-6)
 
 
 def read(folder, name="manifest.json"):
