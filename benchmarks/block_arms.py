@@ -1,15 +1,15 @@
 """Measure how many throws arms from files block: `python -m benchmarks.block_arms FILE ...`.
 
     python -m benchmarks.block_arms FILE [FILE ...] [--tip NAME] [--limits FILE] [--num 200]
-        [--seed 977] [--suite open] [--wide] [--long]
+        [--seed 977] [--suite open] [--mass 0] [--wide] [--long]
 
 A file is an arm in MJCF or URDF that `pj.block.read_arm` reads; "irb1600" is the arm of the
-library. --tip is the body or site at which a shield of 0.30 m is mounted. --limits is a file with
-limits of the joints, by default `NAME.limits.yaml` beside the arm's file. --suite draws the throws.
-The scene is scaled to the reach of each arm. The referee, an independent check in float64, decides
-which balls are blocked. With --long, throws that the planner fails to block are planned again from
-192 starting points. The last column is then the share of blocks among the throws that one of both
-blocks.
+library. --tip is the body or site at which a shield of 0.30 m and --mass kg is mounted. --limits is
+a file with limits of the joints, by default `NAME.limits.yaml` beside the arm's file. --suite draws
+the throws. The scene is scaled to the reach of each arm. The referee, an independent check in
+float64, decides which balls are blocked. With --long, throws that the planner fails to block are
+planned again from 192 starting points. The last column is then the share of blocks among the throws
+that one of both blocks.
 """
 
 import argparse
@@ -30,6 +30,7 @@ def main() -> None:
     parser.add_argument("files", nargs="+", metavar="FILE")
     parser.add_argument("--tip")
     parser.add_argument("--limits")
+    parser.add_argument("--mass", type=float, default=0.0)
     parser.add_argument("--wide", action="store_true")
     parser.add_argument("--num", type=int, default=200)
     parser.add_argument("--seed", type=int, default=977)
@@ -47,7 +48,7 @@ def _row(file: str, options: argparse.Namespace) -> str:
         arm = irb1600()
     else:
         own = {"tip": options.tip, "limits": options.limits}
-        arm = pj.block.read_arm(file, shield=pj.block.Shield(), **own)
+        arm = pj.block.read_arm(file, shield=pj.block.Shield(mass=options.mass), **own)
     draw = {"arm": arm, "wide": options.wide}
     cases = pj.block.draw(options.num, options.suite, options.seed, **draw)
     planner, starts = pj.block.planner(), [time.perf_counter()]

@@ -132,6 +132,9 @@ def test_the_judge_names_the_limit_that_a_motion_breaks(name, change):
     assert pj.reach.judge(case, edit(plan, **change)).failed_limit == name
     other = dataclasses.replace(case, goals=case.goals + 0.1)
     assert pj.reach.judge(other, plan).failed_limit == "goal"
+    weak = dataclasses.replace(case.limits, torque=np.where(np.arange(6) == 1, 20.0, np.inf))
+    verdict = pj.reach.judge(dataclasses.replace(case, limits=weak), plan)
+    assert verdict.failed_limit == "torque" and verdict.failed_part == "joint_2"
 
 
 @pytest.mark.parametrize("side", ["start", "goal"])

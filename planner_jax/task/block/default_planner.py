@@ -551,13 +551,13 @@ class OnlineBlock(Planner):
         size = case.arm.num * pieces
         ends_free = jnp.where(case.ends_at_rest, 0.0, 1.0)
         free = jnp.ones(size + 1, dtype).at[size - case.arm.num : size].set(ends_free)
+        too_near = near[0] - 0.3 * self.margin
         cost = joints.cost + jnp.sum(rows**2) + jnp.sum(short**2)
         joint_excess = joints.excess
         if case.limits.torque is not None:
             (more, push, gram), torque_excess = self._torque_terms(case, point)
             cost, gradient, curvature = cost + more, gradient + push, curvature + gram
             joint_excess = jnp.maximum(joint_excess, torque_excess)
-        too_near = near[0] - 0.3 * self.margin
         return Model(
             cost=cost,
             gradient=gradient * free,
@@ -579,24 +579,28 @@ class OnlineBlock(Planner):
 
         The derivatives are computed only if a torque exceeds its limit.
         """
-        most = arm_dynamics.USED * jnp.asarray(case.limits.torque)[None]
+        most = arm_dynamics.USED * jnp.asarray(case.limits.torque)
+        sample = lambda point: arm_dynamics.sample_states(self._motion_of(case, point), 0)  # noqa: E731
 
-        def excess(point: Array) -> Array:
-            angles, rates, rises = arm_dynamics.sample_states(self._motion_of(case, point), 0)
-            at = jax.vmap(arm_dynamics.inverse_dynamics, (None, 0, 0, 0, None))
-            shares = at(case.arm, angles, rates, rises, case.gravity) / most
-            return jnp.abs(shares).reshape(-1) - 1.0
+        def share(angles: Array, rates: Array, rises: Array) -> Array:
+            return (
+                arm_dynamics.inverse_dynamics(case.arm, angles, rates, rises, case.gravity) / most
+            )
 
         def derive() -> tuple[Array, ...]:
-            over = self.weights.limits * jnp.maximum(found + self.slack, 0.0)
-            slopes = self.weights.limits * jax.jacfwd(excess)(point)
-            slopes = jnp.where(over > 0.0, slopes.T, 0.0)  # (U, S)
-            push = jnp.matmul(slopes, over, precision=_HIGHEST)
-            return jnp.sum(over**2), push, jnp.matmul(slopes, slopes.T, precision=_HIGHEST)
+            over = self.weights.limits * jnp.maximum(jnp.abs(shares) - 1.0 + self.slack, 0.0)
+            sign = jnp.where(over > 0.0, self.weights.limits * jnp.sign(shares), 0.0)
+            by_state = jax.vmap(jax.jacfwd(share, (0, 1, 2)))(*states)  # each (S, n, n)
+            lifts = zip(by_state, jax.jacfwd(sample)(point), strict=True)
+            slopes = sum(jnp.einsum("sij,sju->siu", *pair, precision=_HIGHEST) for pair in lifts)
+            slopes = (sign[:, :, None] * slopes).reshape(-1, num)
+            push = jnp.matmul(over.reshape(-1), slopes, precision=_HIGHEST)
+            return jnp.sum(over**2), push, jnp.matmul(slopes.T, slopes, precision=_HIGHEST)
 
-        found, num = excess(point), point.size
+        num, states = point.size, sample(point)
+        shares = jax.vmap(share)(*states)
         none = [jnp.zeros(shape, point.dtype) for shape in ((), (num,), (num, num))]
-        worst = jnp.max(found)
+        worst = jnp.max(jnp.abs(shares)) - 1.0
         return lax.cond(worst > -self.slack, derive, lambda: tuple(none)), worst
 
     def finish(self, case: BlockCase, flight: Flight, point: Array, steps: Array) -> BlockPlan:

@@ -253,14 +253,14 @@ class ReachPlanner(Planner):
             rates: (M + 1, n) [rad/s], joint rates at the knots.
         """
         path = motion.join_knots(case.angles, durations, rates)
-        weak = jnp.zeros_like(durations[0])
+        weak = None
         if case.limits.torque is not None:
             _, factor, weak = measure_torques(case.arm, case.limits, _GRAVITY, path, _TORQUES)
             path = stretch(path, factor)
         duration = jnp.sum(path.durations)
         floors = self._floors(jnp.minimum(rows[:, 0], rows[:, 1 + goal]))
-        gap = self._least_excess(case, floors, path, _RESOLUTION)
-        violation = jnp.maximum(jnp.maximum(-100.0 * gap, weak), 0.0)
+        violation = 100.0 * jnp.maximum(-self._least_excess(case, floors, path, _RESOLUTION), 0.0)
+        violation = violation if weak is None else jnp.maximum(violation, weak)
         violation = jnp.where(jnp.isfinite(duration + jnp.sum(rates)), violation, jnp.inf)
         return ReachPlan(
             motion=path,
