@@ -58,6 +58,11 @@ def test_hits_at_utm_coordinates_have_the_same_plans(cases, plans):
     np.testing.assert_array_equal(verdict.landing_point, usual.landing_point + away)
 
 
+def test_a_ball_that_lies_on_the_ground_is_too_far(cases):
+    ball = BallState(cases.ball.pos * np.float32([1.0, 1.0, 0.0]), 0.0 * cases.ball.vel)
+    assert (plan(FIRST_ROUND, cases.replace(ball=ball)).status == Status.TOO_FAR).all()
+
+
 def test_any_decision_vector_meets_the_ball_and_reaches_the_target(cases):
     lane = pj.take(cases, 3)
     context, guess = first_guess(lane)

@@ -75,6 +75,24 @@ def test_the_least_square_sum_on_a_line_beside_a_bound_and_a_row_that_the_line_d
 
 
 @float64
+@pytest.mark.parametrize("given", [0, GIVEN], ids=["no equalities", "equalities"])
+def test_a_linear_term_is_a_shift_of_the_unknowns(given):
+    square = HESSIAN + np.eye(UNKNOWNS)
+    linear, bounds = np.arange(UNKNOWNS) - 5.0, np.full(ROWS, 0.3)
+    shift = np.linalg.solve(square, linear)  # x' Q x / 2 + c' x with x = z - shift
+    right = EQUALITIES[:given] @ np.ones(UNKNOWNS)
+    with_term = qp_template(square, EQUALITIES[:given], MATRIX, linear=linear)
+    without = qp_template(square, EQUALITIES[:given], MATRIX)
+    found = solve_qp(with_term, jnp.asarray(right), jnp.asarray(-bounds), jnp.asarray(bounds))
+    moved = MATRIX @ shift
+    shifted = (right + EQUALITIES[:given] @ shift, moved - bounds, moved + bounds)
+    expected = solve_qp(without, *map(jnp.asarray, shifted))
+    assert expected.steps > 0 and found.status == expected.status == Status.CONVERGED
+    np.testing.assert_allclose(found.point, expected.point - shift, atol=1e-9)
+    np.testing.assert_allclose(found.cost, expected.cost - 0.5 * linear @ shift, atol=1e-9)
+
+
+@float64
 def test_multipliers_are_cost_slopes_and_gradients_match_differences(solved):
     k = int(np.argmax(solved.steps))
     given = tuple(each[k] for each in PROGRAMS)

@@ -179,6 +179,15 @@ def test_other_lengths_rates_and_batches_compile_nothing():
     np.testing.assert_allclose(last.pos, many.pos[69], rtol=1e-6, atol=1e-6)
 
 
+def test_batches_of_plans_with_recoveries_compile_nothing_more():
+    both = [curve(k).replace(recovery=curve(k + 9, 0.4).trajectory) for k in range(5)]
+    batch(*both[:2]).sample(20.0)
+    with CompileClock() as clock:
+        found = batch(*both).sample(30.0)
+    assert not clock.compiled
+    np.testing.assert_allclose(found.pos[3, :36], both[3].sample(30.0).pos[:36], rtol=1e-5)
+
+
 @pytest.mark.parametrize("rate", [10.0, 60.0, 100.0, 1000.0])
 def test_the_last_sample_is_the_end_where_the_end_is_one(rate):
     short = jax.tree.map(lambda x: x.astype(np.float32) if x.dtype == float else x, hover(0.7))

@@ -12,7 +12,7 @@ import test_referee_intercept
 from referees import assert_same, rows, stack
 
 from planner_jax.referee import judging
-from planner_jax.referee.judging import cut
+from planner_jax.referee.judging import NOT_FINITE, cut
 
 MODULES = (test_referee_block, test_referee_catch, test_referee_hit, test_referee_intercept)
 RUNS = [(module, options) for module in MODULES for options in getattr(module, "OPTIONS", ({},))]
@@ -50,7 +50,7 @@ def test_a_nan_fails_its_own_lane_and_no_other(judged):
     clean, broken = slice(1, None, 2), slice(0, None, 2)
     assert not verdict.success[broken].any()
     np.testing.assert_array_equal(verdict.failed_limit[broken], "not finite")
-    assert verdict.sentence(0) == "not finite: the plan or its case is not finite"
+    assert verdict.sentence(0) == f"not finite: {NOT_FINITE}"
     for name in getattr(tests, "UNKNOWN", ()):
         assert np.isnan(getattr(verdict, name)[broken]).all()
     assert_same(rows(judge(stack(*[lane] * len(names)))), rows(verdict, clean))

@@ -130,6 +130,24 @@ def test_leading_axes_become_axes_of_the_leaves_and_of_a_case():
     assert cases.batch_shape == (2,) and cases.num_targets == 3
 
 
+@pytest.mark.parametrize("given", [False, True], ids=["positions", "with velocities"])
+def test_a_table_of_traced_positions_equals_the_table_of_their_numbers(given, float64):
+    times = uneven(9)
+    values = [swing(times)] + [swing(times, 1)] * given
+    table = lambda *values: pj.table_path(times, *values, nodes=24, dtype=jnp.float64)  # noqa: E731
+    traced, usual = jax.jit(table)(*values), table(*values)
+    np.testing.assert_allclose(traced.pos, usual.pos, atol=1e-12)
+    np.testing.assert_allclose(traced.vel, usual.vel, atol=1e-12)
+
+
+def test_masked_positions_are_refused():
+    positions = np.ma.array(swing(uneven(9)), mask=False)
+    pj.table_path(uneven(9), positions)
+    positions[3, 1] = np.ma.masked
+    with pytest.raises(pj.ArgumentError, match="positions must be numbers, got masked_array"):
+        pj.table_path(uneven(9), positions)
+
+
 def test_the_path_can_be_differentiated_by_its_positions(float64):
     times = uneven(8)
 

@@ -1,5 +1,7 @@
 """Paths of targets through positions at given times, such as recorded or simulated motions."""
 
+from collections.abc import Callable
+
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -69,9 +71,9 @@ def table_path(
     if nodes is None:
         nodes = _fewest_nodes(times, values, error)
     require_size("nodes", nodes, 5)
-    resolution = times[-1] / (nodes - 3)
-    at = (np.arange(nodes) - 1) * resolution
-    pos, vel = (jnp.asarray(_evaluate(times, values, at, order), dtype) for order in (0, 1))
+    resolution, at = _nodes_at(times, nodes)
+    evaluate = _spline(times, values)
+    pos, vel = (jnp.asarray(evaluate(at, order), dtype) for order in (0, 1))
     pos = to_world(pos, away)
     return PathTable(pos, vel, jnp.full(pos.shape[:-2], resolution, dtype))
 
@@ -104,39 +106,55 @@ def _check_values(name: str, value: ArrayLike, num: int) -> Numbers:
     return value
 
 
-def _evaluate(times: np.ndarray, values: list[PyTree], at: np.ndarray, order: int) -> PyTree:
+def _nodes_at(times: np.ndarray, nodes: int) -> tuple[float, np.ndarray]:
+    """Return the time between two nodes [s], and the times of all nodes, (nodes,) [s]."""
+    resolution = float(times[-1]) / (nodes - 3)
+    return resolution, (np.arange(nodes) - 1) * resolution
+
+
+def _spline(times: np.ndarray, values: list[PyTree]) -> Callable[[np.ndarray, int], PyTree]:
+    """Return a function of times (N,) and an order that evaluates a derivative of the spline."""
+    if not any(isinstance(value, Tracer) for value in values):
+        make = CubicSpline if len(values) == 1 else CubicHermiteSpline
+        return make(times, *values, axis=-2)
+    # The spline is linear in its values, so that its weights for traced values are constant.
     units, none = np.eye(times.size), np.zeros((times.size, times.size))
     if len(values) == 1:
         splines = [CubicSpline(times, units)]
     else:
         splines = [CubicHermiteSpline(times, *pair) for pair in ((units, none), (none, units))]
-    parts = []
-    for spline, value in zip(splines, values, strict=True):
-        weights = spline(at, order)
-        if isinstance(value, Tracer):
-            weights = jnp.asarray(weights, value.dtype)
-            parts.append(jnp.matmul(weights, value, precision=lax.Precision.HIGHEST))
-        else:
-            parts.append(weights @ value)
-    return sum(parts[1:], parts[0])
+
+    def evaluate(at: np.ndarray, order: int) -> PyTree:
+        parts = [
+            jnp.matmul(
+                jnp.asarray(spline(at, order), jnp.result_type(value)),
+                value,
+                precision=lax.Precision.HIGHEST,
+            )
+            for spline, value in zip(splines, values, strict=True)
+        ]
+        return sum(parts[1:], parts[0])
+
+    return evaluate
 
 
 def _fewest_nodes(times: np.ndarray, values: list[PyTree], error: float) -> int:
     if any(isinstance(value, Tracer) for value in values):
         raise ArgumentError("nodes", "passed if positions are traced", shown="none")
     require_number("error", error, POSITIVE)
-    nodes, worst = 16, np.inf
+    evaluate, nodes, worst = _spline(times, values), 16, np.inf
+    rows = {share: np.asarray(convolution_weights(jnp.asarray(share))) for share in _CHECKED}
     while nodes <= MOST_NODES:
-        resolution = times[-1] / (nodes - 3)
-        at = (np.arange(nodes) - 1) * resolution
+        resolution, at = _nodes_at(times, nodes)
         worst = 0.0
         for order, allowed in ((0, error), (1, 10.0 * error)):
-            table = _evaluate(times, values, at, order)
-            for share in _CHECKED:
-                weights = np.asarray(convolution_weights(jnp.asarray(share)))
+            table = evaluate(at, order)
+            for share, weights in rows.items():
                 read = sum(weights[k] * table[..., k : nodes - 3 + k, :] for k in range(4))
-                exact = _evaluate(times, values, at[1:-2] + share * resolution, order)
+                exact = evaluate(at[1:-2] + share * resolution, order)
                 worst = max(worst, np.abs(read - exact).max(initial=0.0) / allowed)
+                if worst > 1.0:
+                    break
         if worst <= 1.0:
             return nodes
         nodes *= 2

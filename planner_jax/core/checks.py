@@ -73,7 +73,12 @@ _HOSTS = (np.ndarray, np.generic, float)
 
 
 def numeric(value: object) -> Numbers | None:
-    """Return numbers or bools as an array, jax arrays unchanged; None if the value is neither."""
+    """Return numbers or bools as an array, jax arrays unchanged; None if the value is neither.
+
+    An array with masked entries is neither, since its masked numbers would count like others.
+    """
+    if isinstance(value, np.ma.MaskedArray) and np.ma.is_masked(value):
+        return None
     try:
         if not isinstance(value, _HOSTS) and isinstance(value, Tracer | jax.Array):
             array: Numbers = value

@@ -17,7 +17,7 @@ from planner_jax.referee.arm_clearance import KINDS, clearances, links_of, shiel
 from planner_jax.referee.solids import from_segment, length, rotate_back
 
 _SENTENCES = {
-    "not finite": "the plan or its case is not finite",
+    "not finite": judging.NOT_FINITE,
     "time": "the contact at {time:.3f} s is off by {excess:.3g} s; it must not come before the arm "
     "may start nor before its motion ends nor after a minute, and no piece may last less than 0 s",
     "start": "{failed_part} starts {excess:.3g} rad or rad/s off the case",

@@ -23,7 +23,7 @@ _ORDER_OF_MOTION = (
     *("acceleration", "rotor low", "rotor high", "ground", "extra", "recovery"),
 )
 _SENTENCES = {
-    "not finite": "the plan or its case is not finite",
+    "not finite": judging.NOT_FINITE,
     "order": "{excess:.0f} wrong entries, the first at {time:.3f} s; caught targets must be named "
     "once, before the others",
     "catch time": "off by {excess:.3g} s at {time:.3f} s; catches must be at rising positive "

@@ -18,7 +18,7 @@ import numpy as np
 from planner_jax.referee import judging, quadrotor
 
 _SENTENCES = {
-    "not finite": "the plan or its case is not finite",
+    "not finite": judging.NOT_FINITE,
     "contact time": "off by {excess:.3g} s; it must be positive, the end of the trajectory "
     "({time:.3f} s), and before the ball lands",
     **quadrotor.MOTION_SENTENCES,

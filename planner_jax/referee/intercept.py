@@ -18,7 +18,7 @@ from planner_jax.referee.clearance import clearances, edges, greatest_speeds, se
 from planner_jax.referee.drive import LONGEST_PLAN, LONGEST_STEP, sample_poses
 
 _SENTENCES = {
-    "not finite": "the plan or its case is not finite",
+    "not finite": judging.NOT_FINITE,
     "time": "the plan ends at {time:.3f} s, off by {excess:.3g} s; it must end after time 0, and "
     "not after the case's time nor after an hour",
     "early": "the plan ends at {time:.3f} s, {excess:.3g} s before the earliest time",

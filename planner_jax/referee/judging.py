@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 # Text for the violation of an upper limit: `{excess}` is the relative excess, `{time}` its time.
+NOT_FINITE = "a number of the plan is not finite, or of its case, which pj.require_sound then names"
 ABOVE_LIMIT = "{excess:.2%} above its limit at {time:.3f} s"
 
 

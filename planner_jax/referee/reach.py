@@ -19,7 +19,7 @@ from planner_jax.referee import judging
 from planner_jax.referee.arm_torque import Dynamics
 
 _SENTENCES = {
-    "not finite": "the plan or its case is not finite",
+    "not finite": judging.NOT_FINITE,
     "time": "a piece lasts {excess:.3g} s less than 0 s, or the motion lasts longer than a minute",
     "start": "{failed_part} starts {excess:.3g} rad or rad/s off the case",
     "continuity": "{failed_part} jumps by {excess:.3g} rad or rad/s at {time:.3f} s",

@@ -304,7 +304,7 @@ class QuadrotorPlan(Plan, Located):
         """
         from planner_jax.robot.setpoints import sample_at_rate  # imported only if needed
 
-        path = jax.tree.map(np.asarray, self.whole)
+        path = jax.tree.map(np.asarray, self).whole
         ends = np.sum(path.durations, axis=-1)
         found = sample_at_rate(rate, ends, (path, self.gravity), setpoint_at)
         return QuadrotorSetpoints(**{**found, "pos": to_world(found["pos"], self.origin)})

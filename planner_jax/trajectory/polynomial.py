@@ -9,6 +9,8 @@ from flax import struct
 from jax import Array, lax
 from jaxtyping import PyTree
 
+from planner_jax.core.arithmetic import numpy_of
+
 
 @struct.dataclass
 class PiecewisePolynomial:
@@ -112,12 +114,14 @@ def join(first: PiecewisePolynomial, then: PiecewisePolynomial) -> PiecewisePoly
     """Join two trajectories, or two batches of trajectories, one after the other in time."""
     size = max(first.coeffs.shape[-2], then.coeffs.shape[-2])
 
-    def pad(coeffs: Array) -> Array:
-        missing = size - coeffs.shape[-2]
-        return jnp.pad(coeffs, [(0, 0)] * (coeffs.ndim - 2) + [(0, missing), (0, 0)])
+    xp = numpy_of(first.coeffs, then.coeffs)  # JAX would compile programs for each batch size
 
-    coeffs = jnp.concatenate([pad(first.coeffs), pad(then.coeffs)], axis=-3)
-    durations = jnp.concatenate([first.durations, then.durations], axis=-1)
+    def pad(coeffs: Array) -> PyTree:
+        missing = size - coeffs.shape[-2]
+        return xp.pad(coeffs, [(0, 0)] * (coeffs.ndim - 2) + [(0, missing), (0, 0)])
+
+    coeffs = xp.concatenate([pad(first.coeffs), pad(then.coeffs)], axis=-3)
+    durations = xp.concatenate([first.durations, then.durations], axis=-1)
     return PiecewisePolynomial(coeffs=coeffs, durations=durations)
 
 

@@ -1,13 +1,14 @@
 """Batches of convex quadratic programs that share their matrices, each solved exactly.
 
-    minimise x' Q x / 2   subject to   E x = e,   lower <= R x <= upper
+    minimise x' Q x / 2 + c' x   subject to   E x = e,   lower <= R x <= upper
 
-The matrices Q, E and R are constant; e, lower and upper differ between programs. All work that
-depends only on the matrices is done once, in double precision on the host. With the substitution
-x = base e + Z y, where Z' Q Z = 1, the program is to find the shortest vector y between pairs of
-parallel planes. The start y = 0 is the optimum without bounds. The dual method of [Goldfarb1983]
-adds one violated bound (plane) after another to its working set, and drops planes that are no more
-active. Steps are matrix products without factorisations, which a batch computes together.
+The matrices Q, E and R and the vector c are constant; e, lower and upper differ between programs.
+All work that depends only on the matrices is done once, in double precision on the host. With the
+substitution x = base e + Z y, where Z' Q Z = 1, the program is to find the shortest vector y
+between pairs of parallel planes. The start y = 0 is the optimum without bounds. The dual method of
+[Goldfarb1983] adds one violated bound (plane) after another to its working set, and drops planes
+that are no more active. Steps are matrix products without factorisations, which a batch computes
+together.
 """
 
 import dataclasses
@@ -64,28 +65,36 @@ class QpConfig:
 
 
 def qp_template(
-    hessian: ArrayLike, equalities: ArrayLike, rows: ArrayLike, zeros: ArrayLike | None = None
+    hessian: ArrayLike,
+    equalities: ArrayLike,
+    rows: ArrayLike,
+    zeros: ArrayLike | None = None,
+    linear: ArrayLike | None = None,
 ) -> QpTemplate:
     """Compute the arrays that all programs with these matrices share, in double precision.
 
-    The cost x' Q x / 2 of n unknowns x is minimised. A linear term of the cost can be written as
-    the product with an unknown that an equality fixes to 1.
-
     Args:
         hessian: (n, n), the matrix Q, symmetric and positive definite where the equalities hold.
-        equalities: (q, n), left sides of q independent equalities.
+        equalities: (q, n), left sides of q independent equalities; q may be 0.
         rows: (M, n), matrix whose product with x is bounded.
         zeros: (z, n), left sides of z more equalities, whose right sides are always 0.
+        linear: (n,), vector c of a linear term c' x of the cost.
 
     Raises:
         ArgumentError: the equalities are not independent, or the minimum is not unique.
     """
     q, e, r = (np.asarray(each, np.float64) for each in (hessian, equalities, rows))
-    given = len(e)
+    num, given = len(q), len(e)
+    if linear is not None:  # the product with another unknown, which an equality fixes to 1
+        c = np.asarray(linear, np.float64)[:, None]
+        q, r = np.block([[q, c], [c.T, np.zeros((1, 1))]]), np.pad(r, [(0, 0), (0, 1)])
+        e, given = np.vstack([np.pad(e, [(0, 0), (0, 1)]), np.eye(num + 1)[-1]]), given + 1
     if zeros is not None:
-        e = np.concatenate([e, np.asarray(zeros, np.float64)])
+        zeros = np.asarray(zeros, np.float64)
+        e = np.concatenate([e, np.pad(zeros, [(0, 0), (0, len(q) - num)])])
     _, singular, axes = np.linalg.svd(e)
-    if e.shape[0] > e.shape[1] or not singular.min() > 1e-12 * singular.max():
+    least = singular.min(initial=np.inf)
+    if e.shape[0] > e.shape[1] or not least > 1e-12 * singular.max(initial=0.0):
         raise ArgumentError(
             "equalities", "independent", shown=f"singular values from {singular[-1]}"
         )
@@ -104,9 +113,9 @@ def qp_template(
     is_decided = scales <= 1e-9 * scales.max(initial=0.0)
     normals[is_decided], scales[is_decided] = 0.0, 1.0
     return QpTemplate(
-        base=base,
+        base=base[:num],
         base_cost=0.5 * base.T @ q @ base,
-        directions=directions,
+        directions=directions[:num],
         reach=r @ base,
         normals=normals / scales[:, None],
         scales=scales,
@@ -158,6 +167,8 @@ def solve_qp(
     """
     dtype = lower.dtype
     t: QpTemplate = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), template)
+    if t.base.shape[1] > right_side.shape[0]:  # of an unknown that is fixed to 1
+        right_side = jnp.append(right_side, jnp.ones((), dtype))
     unbounded = _product(t.reach, right_side)
     # `low` and `high` bound (unit normal) @ point for each row; `slack` is for rounding errors.
     low, high = (lower - unbounded) / t.scales, (upper - unbounded) / t.scales

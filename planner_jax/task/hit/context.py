@@ -12,6 +12,7 @@ from planner_jax.robot.quadrotor import ALLOWED, beyond_reach, greatest_speed
 from planner_jax.task.hit.case import HitCase
 from planner_jax.task.hit.plan import Stroke
 
+_SHORTEST = 0.01  # [s], least duration of the ball's table; a ball on the ground lands at once
 _SLACK = 0.02  # [m], in `is_too_far`, far more than the errors of contacts that the referee accepts
 
 
@@ -30,7 +31,7 @@ def prepare_hit(case: HitCase, num_nodes: int) -> HitContext:
     The table extends to 1.1 times the time at which a ball without drag would land.
     """
     fall, _ = drag_free_fall_time(case.ball, jnp.zeros_like(case.drag), case.gravity)
-    horizon = lax.stop_gradient(1.1 * fall)
+    horizon = lax.stop_gradient(jnp.maximum(1.1 * fall, _SHORTEST))
     path = predict_path(case.ball, horizon, case.drag, case.gravity, num_nodes=num_nodes)
     node = jnp.maximum(jnp.sum(path.pos[1:, 2] > 0.0), 1)
     # Landing time: after the last tabulated time at which the ball is above the ground, its rate
