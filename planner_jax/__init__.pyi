@@ -1,3 +1,4 @@
+from . import ball as ball
 from . import live as live
 from .ball.flight import BallState as BallState
 from .ball.flight import fly as fly

@@ -1,0 +1,420 @@
+"""Estimate of a ball's flight from one's own recording, and its prediction with uncertainty.
+
+The unknowns are position and velocity at the first observation, logarithm of the drag K_D, lift
+vector l, and restitution and friction of the plane, 12 numbers. Gauss-Newton steps find their most
+probable values. The errors of positions have Student's t distribution, so that outliers have small
+weights. Errors along the path exceed errors across it by the error of a time stamp, multiplied by
+the speed. The residuals yield both standard deviations and the correlation of neighbouring errors.
+"""
+
+import functools
+import math
+from collections.abc import Callable
+from dataclasses import astuple, dataclass
+from typing import Any, Self
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+from numpy.typing import ArrayLike
+from scipy.special import stdtrit
+
+from planner_jax.ball.spin import SpinningBall, Surroundings, spin_acceleration, spin_flight
+from planner_jax.core.arithmetic import at_least
+from planner_jax.core.checks import require_number, shape_of
+from planner_jax.core.choices import require, require_one_of
+from planner_jax.core.errors import CaseError
+from planner_jax.core.rules import POSITIVE
+
+_TAIL = 4.0  # degrees of freedom of Student's t distribution of the errors
+_WEIGHT = 4.0  # number of observations that the assumed noise counts for
+_ROUNDS = 3  # number of linearisations of the flight
+_WEIGHINGS = 3  # number of weighted least-squares problems for each linearisation
+_LEAST = 4  # least number of observations
+_BOUNCES = 2  # number of bounces that are simulated
+# Pairs of observations, of which each yields a first guess of the flight: the first observation and
+# the time between both, as fractions of the recording. The fractions are quasi-random numbers.
+_PAIRS = 0.6 * (np.arange(1, 17)[:, None] * [0.618034, 0.754878] % 1.0)
+_SHORT = 0.25  # [s], greatest duration of a flight that is integrated in 4 steps instead of 12
+_FAR = 25.0  # squared distance, in standard deviations, from which an observation is an outlier
+_MOST_OUTLIERS = 0.45  # greatest share of outliers of a recording
+_MOST_NOISE = 0.1  # greatest error of an observation along the path, as a share of its extent
+_MOST_LIFT = 8.0  # greatest length of the lift vector, in standard deviations
+
+
+@dataclass(frozen=True)
+class Ball:
+    """What is known about a ball, and about the plane on which it bounces, before its flight.
+
+    The default is an unknown ball. The model of a bounce is [Nakashima2010].
+    """
+
+    drag: float = 0.06  # [1/m], median of K_D
+    drag_spread: float = 1.0  # standard deviation of log K_D
+    # Standard deviations of the lift vector, in units of K_D |v|: along the flight, horizontal
+    # and across the flight (topspin, backspin), and perpendicular to both (sidespin).
+    lift_spread: tuple[float, float, float] = (0.4, 0.4, 0.4)
+    reach: float = 20.0  # [m], speed of the ball's surface, divided by the lift vector's length
+    restitution: tuple[float, float] = (0.8, 0.1)  # e, mean and standard deviation
+    friction: tuple[float, float] = (0.3, 0.1)  # mu, mean and standard deviation
+    grip: float = 0.4  # 2/5 for a hollow ball, 2/7 for a solid ball
+    density: float = 0.01  # [m^2/s^3], power spectral density of accelerations not in the model
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            for each in np.atleast_1d(value):
+                require_number(name, float(each), POSITIVE)
+
+    @classmethod
+    def sphere(cls, mass: float, diameter: float, *, air: float = 1.2) -> Self:
+        """Describe a smooth sphere by its mass [kg] and diameter [m]; `air` is in kg/m^3.
+
+        The drag coefficient C_d is 0.47, with a standard deviation of 20 %. The lift coefficient is
+        0.4 r omega / |v|.
+        """
+        for name, value in (("mass", mass), ("diameter", diameter), ("air", air)):
+            require_number(name, value, POSITIVE)
+        unit = air * math.pi * diameter**2 / (8.0 * mass)  # [1/m]
+        return cls(drag=0.47 * unit, drag_spread=0.2, reach=1.0 / (0.4 * unit))
+
+
+# Drag, spin and bounces of "table tennis" were measured on recordings of two laboratories.
+_TABLE_TENNIS = Ball(0.147, 0.1, (0.3, 0.3, 0.15), 9.0, (0.93, 0.05), (0.22, 0.08))
+BALLS = {"unknown": Ball(), "table tennis": _TABLE_TENNIS}
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """Positions and velocities of a ball at T times, or at (B, T) times of B balls."""
+
+    pos: np.ndarray  # (T, 3) [m]
+    vel: np.ndarray  # (T, 3) [m/s]
+    covariance: np.ndarray  # (T, 3, 3) [m^2], of the true position
+    observed_covariance: np.ndarray  # (T, 3, 3) [m^2], of an observed position
+    freedom: np.ndarray  # (T,), degrees of freedom of Student's t distribution of the errors
+
+    def interval(
+        self, probability: float = 0.9, *, observed: bool = False
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return bounds (T, 3) [m] between which each coordinate is with the probability.
+
+        With `observed`, the coordinates are those of an observation, with its noise.
+        """
+        require(0.0 < probability < 1.0, "probability", "> 0 and < 1", probability)
+        covariance = self.observed_covariance if observed else self.covariance
+        half = np.sqrt(np.einsum("...ii->...i", covariance))
+        half = half * stdtrit(self.freedom, 0.5 + 0.5 * probability)[..., None]
+        return self.pos - half, self.pos + half
+
+
+@dataclass(frozen=True)
+class FlightFit:
+    """Estimated flight of one ball, or of B balls, whose arrays have a leading axis (B,)."""
+
+    start: np.ndarray  # () [s], time of the first observation
+    pos: np.ndarray  # (3,) [m], position at that time
+    vel: np.ndarray  # (3,) [m/s], velocity at that time
+    drag: np.ndarray  # () K_D [1/m]
+    lift: np.ndarray  # (3,) [1/s], lift vector l before the first bounce
+    noise: np.ndarray  # () [m], standard deviation of an observed coordinate across the path
+    stamp_noise: np.ndarray  # () [s], standard deviation of a time stamp
+    outliers: np.ndarray  # () share of observations that are far from the flight
+    # (12, 12), of position, velocity, log K_D, lift vector, restitution and friction
+    covariance: np.ndarray
+    _data: tuple[Any, ...]  # times of observations, origin, and inputs of the program of `predict`
+
+    def predict(self, times: ArrayLike) -> Prediction:
+        """Predict the ball at times (T,), or (B, T) for a batch, on the recording's clock [s].
+
+        Raises:
+            ArgumentError: a time is before the first observation, or the shape is another one.
+        """
+        shape, batch = shape_of("times", times), self.start.shape
+        fits = 0 not in shape and len(shape) in {1, 1 + len(batch)}
+        require(fits, "times", "of the shape (T,) or (B, T)", shape)
+        times = np.broadcast_to(np.asarray(times, np.float64), (*batch, shape[-1]))
+        after = times - self.start[..., None]
+        require(bool(np.all(after >= 0.0)), "times", "at or after the first one", shown="another")
+        return self._predict(after)
+
+    def smooth(self) -> Prediction:
+        """Return the ball at the times of the observations; absent times are the first one."""
+        return self._predict(np.nan_to_num(self._data[0] - self.start[..., None]))
+
+    def _predict(self, after: np.ndarray) -> Prediction:
+        _, origin, freedom, fitted, numbers, bounces = self._data
+        rows = after.reshape(-1, after.shape[-1])
+        fill = _next_size(after.shape[-1]) - after.shape[-1], len(fitted[0]) - len(rows)
+        padded = np.pad(rows, ((0, fill[1]), (0, fill[0])), mode="edge").astype(np.float32)
+        program = _program(_forecast, bounces, _num_steps(padded))
+        shape = (*after.shape, 3)
+        pos, vel, sure, seen = (
+            np.asarray(leaf, np.float64)[: len(rows), : after.shape[-1]].reshape(
+                shape + leaf.shape[3:]
+            )
+            for leaf in program(fitted, padded, numbers)
+        )
+        freedom = np.broadcast_to(freedom[..., None], after.shape)
+        return Prediction(pos + origin[..., None, :], vel, sure, seen, freedom)
+
+
+def fit(
+    times: ArrayLike,
+    positions: ArrayLike,
+    *,
+    ball: Ball | str = "unknown",
+    floor: float | None = None,
+    gravity: float = 9.81,
+    wind: ArrayLike = (0.0, 0.0, 0.0),
+    noise: float = 0.002,
+) -> FlightFit:
+    """Estimate a ball's flight from observed positions: state, drag, lift, and their covariance.
+
+    Outliers have little influence if more than half of the observations are good. Origin and first
+    time are subtracted in double precision, so that times may be seconds of the epoch and positions
+    UTM coordinates.
+
+    Args:
+        times: (N,) [s], or (B, N) for a batch of B recordings, increasing.
+        positions: (N, 3) [m], or (B, N, 3), z up. An observation is absent if its time or its
+            position is NaN or masked.
+        ball: a `Ball`, or "table tennis" or "unknown".
+        floor: [m], height of the ball's centre at its bounces, such as the height of a table plus
+            the ball's radius; None if there is no plane. Two bounces are simulated.
+        gravity: [m/s^2], magnitude.
+        wind: (3,) [m/s], constant velocity of the air.
+        noise: [m], expected standard deviation of a coordinate. It counts as four observations.
+
+    Raises:
+        ArgumentError: a shape does not match, or a number is out of range.
+        CaseError: times do not increase, a recording has fewer than four observations, no single
+            flight explains more than half of it, or its lift is far greater than `ball` allows.
+    """
+    if not isinstance(ball, Ball):
+        require_one_of(BALLS, "ball", ball)
+        ball = BALLS[ball]
+    for name, value in (("gravity", gravity), ("noise", noise)):
+        require_number(name, value, POSITIVE)
+    times, positions = (
+        np.ma.filled(each.astype(float), np.nan) if isinstance(each, np.ma.MaskedArray) else each
+        for each in (times, positions)
+    )
+    shape = shape_of("positions", positions)
+    is_shape = len(shape) in (2, 3) and shape[-1] == 3
+    require(is_shape, "positions", "of the shape (N, 3) or (B, N, 3)", shape)
+    for name, value, rule in (("times", times, shape[:-1]), ("wind", wind, (3,))):
+        require(shape_of(name, value) == rule, name, f"of the shape {rule}", np.shape(value))
+    batch, num = shape[:-2], shape[-2]
+    clock = np.asarray(times, np.float64).reshape(-1, num)
+    points = np.asarray(positions, np.float64).reshape(-1, num, 3)
+    rows = np.concatenate([clock[..., None], points], axis=-1)
+    present = np.asarray(np.isfinite(rows).all(axis=-1))
+    _require(present.sum(axis=-1) >= _LEAST, batch, "positions", "of at least 4 observations")
+    rows = np.where(present[..., None], rows, np.nan)
+    rows = np.take_along_axis(rows, np.argsort(~present, axis=-1, kind="stable")[..., None], 1)
+    falls = np.sum(np.diff(rows[:, :, 0]) <= 0.0, axis=-1)
+    _require(falls == 0, batch, "times", "strictly increasing")
+    first, lanes = rows[:, 0].copy(), 1 if len(rows) == 1 else _next_size(len(rows), 64)
+    padded = np.full((lanes, _next_size(num), 4), np.nan, np.float32)
+    padded[: len(rows), :num] = rows - first[:, None]
+    padded[len(rows) :] = padded[0]
+    bounces, observed, floors = 0, 0, np.zeros(lanes, np.float32)
+    if floor is not None:
+        require_number("floor", floor)
+        floors[: len(rows)] = floor - first[:, 3]
+        low, high = np.nanmin(rows[..., 3], axis=-1), np.nanmax(rows[..., 3], axis=-1)
+        bounces = _BOUNCES
+        observed = _BOUNCES if np.any(low - floor < 0.5 * (high - low)) else 0
+    packed = [float(x) for each in astuple(ball) for x in np.atleast_1d(each)]
+    numbers = np.array([*packed, gravity, *np.asarray(wind, float), noise], np.float32)
+    program = _program(_estimate, observed, _num_steps(padded[..., 0]))
+    fitted, found = program((padded, floors), numbers)
+    state, covariance, scales, outliers, size = (
+        np.asarray(leaf, np.float64)[: len(rows)].reshape(batch + leaf.shape[1:])
+        for leaf in (*fitted[:3], *found)
+    )
+    moved = np.nan_to_num(rows - first[:, None])[..., 1:]
+    extent = np.linalg.norm(np.max(moved, axis=1) - np.min(moved, axis=1), axis=-1)
+    sound = np.isfinite(covariance).all(axis=(-2, -1)) & (outliers <= _MOST_OUTLIERS)
+    error = scales[..., 0] + scales[..., 1] * np.sum(state[..., 3:6] ** 2, axis=-1)
+    sound &= (np.sqrt(error) <= _MOST_NOISE * extent.reshape(batch)) & (size <= _MOST_LIFT)
+    rule = "of one flight in one frame, with the lift of `ball`, except for less than half"
+    _require(sound, batch, "positions", rule)
+    first = first.reshape((*batch, 4))
+    freedom = (3.0 * present.sum(axis=-1) - 9.0 + _WEIGHT).reshape(batch)
+    pos, vel, drag, lift = np.split(state[..., :10], (3, 6, 7), axis=-1)
+    start, origin = first[..., 0], first[..., 1:]
+    pos, drag, errors = pos + origin, np.exp(drag[..., 0]), np.sqrt(scales)
+    data = clock.reshape(shape[:-1]), origin, freedom, fitted, numbers, bounces
+    across, stamps = errors[..., 0], errors[..., 1]
+    return FlightFit(start, pos, vel, drag, lift, across, stamps, outliers, covariance, data)
+
+
+def _require(holds: ArrayLike, batch: tuple[int, ...], name: str, rule: str) -> None:
+    if not np.all(holds):
+        index = int(np.argmin(holds)) if batch else None
+        raise CaseError(name, rule, index=index, shown="", more=np.size(holds) - np.sum(holds) - 1)
+
+
+def _next_size(num: int, least: int = 16) -> int:
+    return max(least, 1 << (num - 1).bit_length())
+
+
+def _num_steps(times: np.ndarray) -> int:
+    return 4 if np.nanmax(times) <= _SHORT else 12
+
+
+@functools.cache
+def _program(function: Callable, bounces: int, steps: int) -> Callable:
+    """Compile a function of one lane (recording) for a batch of lanes."""
+
+    @jax.jit
+    @jax.default_matmul_precision("highest")
+    def program(*arguments: Any) -> Any:
+        *lanes, numbers = arguments
+        if function is _forecast:
+            return jax.vmap(lambda a, b: _forecast(a, b, numbers, (bounces, steps)))(*lanes)
+        return jax.vmap(lambda a: _estimate(a, numbers, (bounces, steps)))(*lanes)
+
+    return program
+
+
+def _air(numbers: Array, floor: Array, state: Array) -> Surroundings:
+    return Surroundings(
+        numbers[12], numbers[13:16], floor, state[10], state[11], numbers[10], numbers[5]
+    )
+
+
+def _positions(
+    state: Array, times: Array, numbers: Array, floor: Array, counts: tuple[int, int]
+) -> tuple[Array, tuple[Array, Array]]:
+    """Return positions (N, 3), and positions with velocities as further results of `jacfwd`."""
+    ball = SpinningBall(state[:3], state[3:6], jnp.exp(state[6]), state[7:10])
+    air = _air(numbers, floor, state)
+    found = spin_flight(ball, times, air, bounces=counts[0], steps=counts[1])
+    return found[0], found
+
+
+def _estimate(
+    observed: tuple[Array, Array], numbers: Array, counts: tuple[int, int]
+) -> tuple[tuple[Array, ...], tuple[Array, Array]]:
+    """Estimate one flight from rows (N, 4) of time [s] and position [m]; absent rows are NaN."""
+    rows, floor = observed
+    present = jnp.isfinite(rows[:, 0])
+    num = jnp.sum(present, dtype=rows.dtype)
+    last = jnp.max(jnp.where(present, rows[:, 0], 0.0))
+    times, seen = (
+        jnp.where(present, rows[:, 0], last),
+        jnp.where(present[:, None], rows[:, 1:], 0.0),
+    )
+    drag, spread, noise = numbers[0], numbers[1], numbers[16]
+    means = jnp.stack([jnp.log(drag), *jnp.zeros(3), numbers[6], numbers[8]])
+
+    def positions(state: Array) -> tuple[Array, tuple[Array, Array]]:
+        return _positions(state, times, numbers, floor, counts)
+
+    def guess(pair: Array) -> tuple[Array, ...]:
+        i = jnp.floor(pair[0] * (num - 1.0))
+        j = jnp.minimum(i + 1.0 + jnp.floor(pair[1] * num), num - 1.0).astype(jnp.int32)
+        i = i.astype(jnp.int32)
+        span = times[j] - times[i]
+        # The mean velocity between two observations is the velocity in the middle of their times.
+        air = _air(numbers, floor, jnp.zeros(12))
+        ball = SpinningBall(seen[i], (seen[j] - seen[i]) / span, drag, jnp.zeros(3))
+        acc = spin_acceleration(ball, air)
+        vel = ball.vel - (0.5 * span + times[i]) * acc
+        pos = ball.pos - times[i] * (vel + 0.5 * times[i] * acc)
+        state = jnp.concatenate([pos, vel, means])
+        away = jnp.sum((positions(state)[0] - seen) ** 2, axis=1)
+        # A sum of roots depends little on outliers.
+        return state, away, jnp.sum(jnp.where(present, jnp.sqrt(jnp.sqrt(away)), 0.0))
+
+    states, away, misfits = jax.vmap(guess)(jnp.asarray(_PAIRS, rows.dtype))
+    best = jnp.argmin(jnp.where(jnp.isfinite(misfits), misfits, jnp.inf))
+    state, error = (
+        states[best],
+        jnp.sort(jnp.where(present, away[best], jnp.inf))[(0.5 * num).astype(jnp.int32)],
+    )
+    # Prior of the unknowns after position and velocity; the lift's frame is that of the flight.
+    speed = jnp.sqrt(at_least(jnp.sum(state[3:6] ** 2), 1e-6))
+    forward = state[3:6] / speed
+    side = jnp.stack([-forward[1], forward[0] + 1e-6, jnp.zeros_like(speed)])
+    side = side / jnp.linalg.norm(side)
+    frame = jnp.stack([forward, side, jnp.cross(forward, side)])
+    scaled = frame / (numbers[2:5] * drag * speed)[:, None]
+    prior = jnp.diag(
+        jnp.stack([*jnp.zeros(6), 1 / spread**2, *jnp.zeros(3), *(1 / numbers[7:10:2] ** 2)])
+    )
+    prior = prior.at[7:10, 7:10].set(scaled.T @ scaled)
+
+    def linearise(carry: tuple[Array, ...], _: None) -> tuple[tuple[Array, ...], tuple]:
+        state, *others = carry
+        slopes, (pos, vel) = jax.jacfwd(positions, has_aux=True)(state)
+        squared = at_least(jnp.sum(vel * vel, axis=1), 1e-6)
+        direction = (vel * lax.rsqrt(squared)[:, None])[..., None]
+        # Errors and their slopes in one array (N, 3, 13); parts across and along the path.
+        whole = jnp.concatenate([slopes, (seen - pos)[..., None]], axis=2)
+        along = direction * jnp.sum(direction * whole, axis=1, keepdims=True)
+        known = (state - jnp.concatenate([jnp.zeros(6), means])).at[:6].set(0.0)
+        mean_squared = jnp.sum(jnp.where(present, squared, 0.0)) / num
+
+        def weigh(carry: tuple[Array, ...], _: None) -> tuple[tuple[Array, ...], tuple]:
+            change, scales, overlap = carry
+            variance = scales[0] + scales[1] * squared  # along the path
+            white = (whole - along) * lax.rsqrt(scales[0])
+            white = white + along * lax.rsqrt(variance)[:, None, None]
+            left = white[..., 12] - white[..., :12] @ change
+            distance = jnp.sum(left * left, axis=1)
+            weight = jnp.where(present, (_TAIL + 3.0) / (_TAIL + distance), 0.0)
+            rows = (jnp.sqrt(weight * overlap)[:, None, None] * white).reshape(-1, 13)
+            matrix, errors = rows[:, :12], rows[:, 12]
+            normal = matrix.T @ matrix + prior
+            # Scaled unknowns, so that the matrix is well conditioned in single precision.
+            unit = lax.rsqrt(jnp.diag(normal))
+            factor = jax.scipy.linalg.cho_factor(normal * jnp.outer(unit, unit))
+            covariance = jax.scipy.linalg.cho_solve(factor, jnp.diag(unit)) * unit[:, None]
+            change = covariance @ (errors @ matrix - prior @ known)
+            left = (errors - matrix @ change).reshape(-1, 3)
+            ahead = jnp.sum(left * direction[..., 0], axis=1) ** 2
+            # Numbers of unknowns that all errors, and errors along the path, determine.
+            spent = 12.0 - jnp.sum(prior * covariance)
+            inner = jnp.sum(direction * matrix.reshape(-1, 3, 12), axis=1)
+            spent_along = jnp.sum((inner @ covariance) * inner)
+            # Errors of neighbours may be correlated; N observations count as (1 - r) / (1 + r) N.
+            alike = jnp.sum(left[1:] * left[:-1]) / jnp.sum(left * left) + spent / (3.0 * num)
+            alike = jnp.clip(alike, 0.0, 0.6)
+            sums = jnp.stack(
+                [(jnp.sum(left * left) - jnp.sum(ahead)) * scales[0], jnp.sum(ahead * variance)]
+            )
+            nums = jnp.stack([2.0 * num - (spent - spent_along), num - spent_along])
+            across, variance = (sums / overlap + _WEIGHT * noise**2) / (
+                jnp.maximum(nums, 1.0) + _WEIGHT
+            )
+            scales = jnp.stack([across, jnp.maximum(variance - across, 0.0) / mean_squared])
+            far = jnp.sum(present & (distance > _FAR), dtype=num.dtype) / num
+            return (change, scales, (1.0 - alike) / (1.0 + alike)), (covariance, far)
+
+        begun = (jnp.zeros_like(state), *others)
+        (change, *others), found = lax.scan(weigh, begun, None, length=_WEIGHINGS)
+        return (state + change, *others), jax.tree.map(lambda leaf: leaf[-1], found)
+
+    scales = jnp.stack([jnp.maximum(0.6 * error, noise**2), jnp.zeros_like(noise)])
+    begun = state, scales, jnp.ones_like(noise)
+    (state, scales, _), (covariance, far) = lax.scan(linearise, begun, None, length=_ROUNDS)
+    size = jnp.linalg.norm(scaled @ state[7:10])
+    return (state, covariance[-1], scales, floor, last), (far[-1], size)
+
+
+def _forecast(
+    fitted: tuple[Array, ...], times: Array, numbers: Array, counts: tuple[int, int]
+) -> tuple[Array, ...]:
+    """Return positions, velocities, and covariances of true and observed positions at times."""
+    state, covariance, scales, floor, span = fitted
+    slopes, (pos, vel) = jax.jacfwd(_positions, has_aux=True)(state, times, numbers, floor, counts)
+    sure = jnp.einsum("nik,kl,njl->nij", slopes, covariance, slopes)
+    after = jnp.maximum(times - 0.5 * span, 0.0)
+    eye = jnp.eye(3, dtype=pos.dtype)[None]
+    sure = sure + (numbers[11] * after**3 / 3.0)[:, None, None] * eye
+    stamps = scales[1] * jnp.einsum("ni,nj->nij", vel, vel)
+    return pos, vel, sure, sure + scales[0] * eye + stamps

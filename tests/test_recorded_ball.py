@@ -1,0 +1,166 @@
+"""`pj.ball.fit`: flights of spinning balls, their estimates from recordings, and predictions."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import planner_jax as pj
+from planner_jax.ball.spin import SpinningBall, Surroundings, spin_bounce, spin_flight
+
+NUM, LANES = 20, 64  # Observations and recordings: all fits share two compiled programs.
+BALL = pj.ball.Ball.sphere(0.0027, 0.04)
+
+
+def air(height=0.0, gravity=9.81, restitution=0.9, friction=0.2, wind=(0.0, 0.0, 0.0)):
+    numbers = (gravity, wind, height, restitution, friction, 0.4, 9.0)
+    return Surroundings(*(jnp.asarray(x, float) for x in numbers))
+
+
+def ball(pos, vel, drag=0.0, lift=(0.0, 0.0, 0.0)):
+    return SpinningBall(*(jnp.asarray(x, float) for x in (pos, vel, drag, lift)))
+
+
+def flights(noise=0.001, seed=0, bounces=0, span=0.12):
+    """Generate times, observed positions, and true drag, lift and position 0.2 s later."""
+    rng = np.random.default_rng(seed)
+    times = np.sort(rng.uniform(0.0, span, (LANES, NUM)), axis=1)
+    vel = rng.normal([7.0, 0.0, 1.0], 0.7, (LANES, 3))
+    drag = BALL.drag * np.exp(0.1 * rng.normal(size=LANES))
+    lift = 0.3 * drag[:, None] * 7.0 * rng.normal(size=(LANES, 3))
+    pos = np.broadcast_to([0.0, 0.0, 1.0], (LANES, 3))
+
+    def one(pos, vel, drag, lift, times):
+        after = jnp.concatenate([times, jnp.asarray([span + 0.2])])
+        return spin_flight(SpinningBall(pos, vel, drag, lift), after, air(), bounces=0, steps=20)[0]
+
+    with jax.enable_x64(True):
+        truth = np.asarray(jax.vmap(one)(pos, vel, drag, lift, times))
+    return times, truth[:, :-1] + rng.normal(0.0, noise, (LANES, NUM, 3)), drag, lift, truth[:, -1]
+
+
+def test_without_drag_the_flight_is_a_parabola(float64):
+    times = jnp.linspace(0.0, 0.8, 7)
+    found, vel = spin_flight(ball([1, 2, 3], [4, 5, 6]), times, air(-9.0), bounces=1, steps=4)
+    t = np.asarray(times)[:, None]
+    np.testing.assert_allclose(
+        found, [1, 2, 3] + t * [4, 5, 6] - t**2 * [0, 0, 4.905], rtol=0, atol=1e-12
+    )
+    np.testing.assert_allclose(vel[-1], [4, 5, 6 - 9.81 * 0.8], rtol=0, atol=1e-12)
+
+
+def test_a_vertical_fall_with_drag_and_a_steady_wind_have_closed_forms(float64):
+    times, drag, wind = jnp.linspace(0.0, 1.0, 9), 0.14, np.array([3.0, -1.0, 0.0])
+    # A ball that moves with the wind falls through the air as a ball at rest in still air does.
+    still = ball([0, 0, 0], wind, drag)
+    found, _ = spin_flight(still, times, air(-99.0, wind=wind), bounces=0, steps=20)
+    terminal = np.sqrt(9.81 / drag)
+    fall = -(terminal**2) / 9.81 * np.log(np.cosh(9.81 * np.asarray(times) / terminal))
+    np.testing.assert_allclose(found, np.outer(times, wind) + np.outer(fall, [0, 0, 1]), atol=1e-6)
+
+
+def test_lift_without_drag_turns_the_velocity_at_a_constant_rate(float64):
+    times = jnp.linspace(0.0, 0.5, 5)
+    start = ball([0, 0, 0], [2, 0, 0], lift=[0, 0, 3])
+    _, vel = spin_flight(start, times[-1:], air(gravity=0.0), bounces=0, steps=40)
+    np.testing.assert_allclose(vel[-1], [2 * np.cos(1.5), 2 * np.sin(1.5), 0], atol=1e-6)
+
+
+def test_a_bounce_slides_or_ends_without_slip(float64):
+    slow, fast = (spin_bounce(ball([0, 0, 0], [x, 0, -3]), air()) for x in (0.5, 9.0))
+    np.testing.assert_allclose(fast.vel, [9 - 0.2 * 1.9 * 3, 0, 2.7])
+    np.testing.assert_allclose(slow.vel, [0.6 * 0.5, 0, 2.7])
+    assert slow.vel[0] - 9.0 * slow.lift[1] == pytest.approx(0.0, abs=1e-12)  # the slip
+    rolling = spin_bounce(ball([0, 0, 0], [0.9, 0, -3], lift=[0, 0.1, 0]), air())
+    np.testing.assert_allclose(rolling.vel, [0.9, 0, 2.7])
+
+
+def test_a_ball_that_is_dropped_returns_to_its_height_times_the_squared_restitution(float64):
+    fall = np.sqrt(2.0 / 9.81)
+    times = jnp.asarray([fall, fall * 1.9, fall * 2.8, fall * (2.8 + 0.81)])
+    found, vel = spin_flight(ball([0, 0, 1], [0, 0, 0]), times, air(), bounces=2, steps=8)
+    np.testing.assert_allclose(found[:, 2], [0, 0.81, 0, 0.81**2], atol=1e-9)
+
+
+def test_gradients_through_a_bounce_equal_finite_differences(float64):
+    def height(x):
+        start = SpinningBall(x[:3], x[3:6], x[6], x[7:10])
+        numbers = air(restitution=x[10], friction=x[11])
+        return spin_flight(start, jnp.asarray([0.3, 0.6]), numbers, bounces=1, steps=6)[0]
+
+    x = jnp.asarray([0.1, 0.2, 0.5, 5.0, 1.0, -1.0, 0.14, 0.1, -0.2, 0.3, 0.9, 0.2])
+    slopes = jax.jacfwd(height)(x)
+    for k in range(12):
+        step = jnp.zeros(12).at[k].set(1e-6)
+        difference = (height(x + step) - height(x - step)) / 2e-6
+        np.testing.assert_allclose(slopes[..., k], difference, rtol=1e-5, atol=1e-7)
+
+
+def test_fit_recovers_drag_and_lift_of_long_precise_recordings():
+    times, seen, drag, lift, _ = flights(noise=1e-4, span=0.6)
+    found = pj.ball.fit(times, seen, ball=BALL, noise=1e-4)
+    assert np.median(np.abs(found.drag / drag - 1.0)) < 0.01
+    across = np.cross(found.lift - lift, [1.0, 0.0, 0.0])
+    assert np.median(np.linalg.norm(across, axis=1)) < 0.02
+    assert np.median(found.noise) == pytest.approx(1e-4, rel=0.3)
+
+
+def test_predictions_are_near_and_within_their_intervals_as_often_as_stated():
+    times, seen, _, _, truth = flights()
+    found = pj.ball.fit(times, seen, ball=BALL).predict(np.full((LANES, 1), 0.32))
+    assert np.median(np.linalg.norm(found.pos[:, 0] - truth, axis=1)) < 0.03
+    low, high = found.interval(0.9)
+    assert 0.85 < np.mean((low[:, 0] < truth) & (truth < high[:, 0])) < 0.99
+
+
+def test_a_batch_equals_its_flights_and_origin_and_clock_do_not_matter():
+    times, seen, *_ = flights()
+    many = pj.ball.fit(times, seen, ball=BALL)
+    far = np.array([5e5, 4e6, 100.0])
+    one = pj.ball.fit(times[3] + 1.7e9, seen[3] + far, ball=BALL)
+    np.testing.assert_allclose(one.pos - far, many.pos[3], atol=1e-4)
+    np.testing.assert_allclose(one.vel, many.vel[3], atol=5e-3)
+    then = one.predict([1.7e9 + 0.3]).pos[0] - far
+    np.testing.assert_allclose(then, many.predict([0.3]).pos[3, 0], atol=2e-3)
+
+
+def test_outliers_that_come_first_and_absent_observations_do_no_harm():
+    times, seen, _, _, truth = flights(seed=1)
+    seen[:, :5] = [0.3, 0.3, 0.3]  # a reflection, seen before the ball
+    times[:, 8] = np.nan
+    found = pj.ball.fit(
+        times, np.ma.masked_where(np.isnan(times)[..., None] & [True] * 3, seen), ball=BALL
+    )
+    assert found.outliers == pytest.approx(5 / 19)
+    off = np.linalg.norm(found.predict([0.32]).pos[:, 0] - truth, axis=1)
+    assert np.median(off) < 0.06
+    smooth = found.smooth()
+    assert smooth.pos.shape == (LANES, NUM, 3)
+    assert np.median(np.abs(smooth.pos - seen)[:, 9:]) < 0.001
+
+
+def test_fit_refuses_what_is_no_recording_of_one_flight():
+    times, seen, *_ = flights()
+    t, p = times[0], seen[0]
+    swapped, equal = t.copy(), t.copy()
+    swapped[[3, 4]], equal[4] = t[[4, 3]], t[3]
+    for wrong in (swapped, equal):
+        with pytest.raises(pj.CaseError, match="times must be strictly increasing"):
+            pj.ball.fit(wrong, p)
+    with pytest.raises(pj.CaseError, match="positions must be of at least 4 observations"):
+        pj.ball.fit(np.where(np.arange(NUM) < 3, t, np.nan), p)
+    mixed = np.where(np.arange(NUM)[:, None] % 2, p[:, [1, 0, 2]] + 3.0, p)
+    with pytest.raises(pj.CaseError, match="positions must be of one flight in one frame"):
+        pj.ball.fit(t, mixed, ball=BALL)
+    turning = np.stack([0.1 * np.sin(60 * t), 0.1 * np.cos(60 * t), 1 - 4.905 * t**2], axis=1)
+    with pytest.raises(pj.CaseError, match="in one frame, with the lift of `ball`"):
+        pj.ball.fit(t, turning, ball=BALL)
+    seen[5, :17] = np.nan
+    with pytest.raises(pj.CaseError, match="at least 4 observations in lane 5"):
+        pj.ball.fit(times, seen)
+    with pytest.raises(pj.ArgumentError, match="ball must be one of unknown, table tennis"):
+        pj.ball.fit(t, p, ball="golf")
+    with pytest.raises(pj.ArgumentError, match="times must be at or after the first one"):
+        pj.ball.fit(t, p).predict([-1.0])
+    with pytest.raises(pj.ArgumentError, match="mass must be finite and > 0"):
+        pj.ball.Ball.sphere(0.0, 0.04)
