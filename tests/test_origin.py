@@ -1,4 +1,4 @@
-"""Cases far from (0, 0): positions relative to an origin, errors, and samples in the world."""
+"""Starts of quadrotors, and cases far from (0, 0): origins, errors, and samples in the world."""
 
 import dataclasses
 
@@ -143,3 +143,34 @@ def test_moving_batches_and_states_moves_their_positions_only(float64):
     np.testing.assert_array_equal(moved[:, 0, :2], states[:, 0, :2] + by)
     rows = jnp.zeros((2, 5, 3))
     np.testing.assert_array_equal(to_world(rows, by)[1], [[0.0, -200.0, 0.0]] * 5)
+
+
+@pytest.mark.parametrize("tilt", [0.0, 0.4, 2.0, np.pi])
+def test_the_thrust_at_the_start_is_the_weight_along_the_attitude(tilt):
+    half, axis = 0.5 * tilt, np.array([0.6, 0.8, 0.0])
+    attitude = 3.0 * np.array([np.cos(half), *(np.sin(half) * axis)])
+    found = hit(start_velocity=(1.0, 0.0, -2.0), start_attitude=attitude, gravity=3.7)
+    up = np.cross(axis, [0.0, 0.0, 1.0]) * np.sin(tilt) + [0.0, 0.0, np.cos(tilt)]
+    expected = [START, [1.0, 0.0, -2.0], 3.7 * (up - [0.0, 0.0, 1.0]), np.zeros(3)]
+    np.testing.assert_allclose(found.head_state, expected, atol=1e-6)
+    given = catch(ball_path(), start_velocity=(1.0, 0.0, 0.0), start_acceleration=(0.0, 2.0, 0.0))
+    np.testing.assert_array_equal(given.head_state[1:], np.eye(3) * [[1.0], [2.0], [0.0]])
+
+
+@pytest.mark.parametrize(
+    ("start", "says"),
+    [
+        ({"start_attitude": (0.0, 0.0, 0.0, 0.0)}, "start_attitude must be a quaternion, got 0"),
+        ({"start_attitude": (1.0, 0.0, 0.0)}, "start_attitude must have the shape"),
+        ({"start_velocity": "fast"}, "start_velocity must be numbers"),
+        ({"start_velocity": (np.nan, 0.0, 0.0)}, "start must be finite"),
+        (
+            {"start_attitude": (1.0, 0.0, 0.0, 0.0), "start_acceleration": (1.0, 0.0, 0.0)},
+            "start_attitude must be left out beside start_acceleration",
+        ),
+    ],
+)
+def test_a_start_that_cannot_be_is_an_error_of_one_line(start, says):
+    with pytest.raises(pj.ArgumentError, match=says) as caught:
+        hit(**start)
+    assert "\n" not in str(caught.value)

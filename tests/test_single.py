@@ -147,6 +147,7 @@ def test_several_balls_are_caught_one_after_another(capsys):
         (f"hit {HIT} --min-apex 9", "--min-apex must be < --max-apex, got 9"),
         (f"hit {HIT} --pos 4 0 -2", "--pos must be at a height >= 0 m, got -2"),
         (f"hit {HIT} --start 0 0 0", "--start must be at a height >= min_height, got 0"),
+        (f"hit {HIT} --start-attitude 0 0 0 0", "--start-attitude must be a quaternion, got 0"),
         (f"hit {HIT} --robot racer-net", "--robot must carry a racket, got 'racer-net' with a net"),
         (f"catch {CATCH} --robot x500", "--robot must carry a net, got 'x500' with a racket"),
         (f"hit {HIT} --rate 5", "--rate must be left out without --out, got 5"),

@@ -54,10 +54,36 @@ def require_tool(robot: object, kind: str) -> Tool:
     return robot.tool
 
 
-def hover_at(start: object, batch: tuple[int, ...], dtype: DTypeLike) -> Array:
-    """Return states (*batch, 4, 3): position `start` [m]; zero velocity, acceleration and jerk."""
+def start_state(
+    start: object,
+    velocity: object,
+    acceleration: object,
+    attitude: object,
+    gravity: object,
+    batch: tuple[int, ...],
+    dtype: DTypeLike,
+) -> Array:
+    """Return states (*batch, 4, 3) at time 0 from arguments of `case`, which are named `start...`.
+
+    The rows are the position [m], the velocity [m/s], the acceleration [m/s^2], and a jerk of 0. An
+    `attitude` (4,), a quaternion w x y z, replaces the acceleration: the thrust is along body z,
+    and equal to the weight. Its heading has no effect.
+    """
     head = np.zeros(batch + (4, 3))
-    head[..., 0, :] = numbers_of("start", start, batch, (3,))
+    rows = {"start": start, "start_velocity": velocity, "start_acceleration": acceleration}
+    for k, (name, value) in enumerate(rows.items()):
+        head[..., k, :] = numbers_of(name, value, batch, (3,))
+    if attitude is not None:
+        if head[..., 2, :].any():
+            raise ArgumentError(
+                "start_attitude", "left out beside start_acceleration", shown="both"
+            )
+        w, x, y, z = np.moveaxis(numbers_of("start_attitude", attitude, batch, (4,)), -1, 0)
+        square = np.asarray(w * w + x * x + y * y + z * z, float)
+        rules.require_rule("start_attitude", square, square > 0.0, "a quaternion", batch)
+        axis = 2.0 * np.stack([w * y + x * z, y * z - w * x, -x * x - y * y], axis=-1)
+        weight = np.asarray(numbers_of("gravity", gravity, batch, ()), float)
+        head[..., 2, :] = weight[..., None] * axis / square[..., None]  # weight * (body z - e_3)
     return jnp.asarray(head, dtype)
 
 

@@ -84,7 +84,16 @@ class SingleSettings(PlanSettings):
     A number that is not finite, or an unknown name, raises `ArgumentError`.
     """
 
-    start: tuple[float, ...] | None = option(None, "X Y Z", "where the quadrotor hovers [m]")
+    start: tuple[float, ...] | None = option(None, "X Y Z", "where the quadrotor starts [m]")
+    start_velocity: tuple[float, ...] | None = option(
+        None, "X Y Z", "of the quadrotor at the start [m/s] (default: none)"
+    )
+    start_acceleration: tuple[float, ...] | None = option(
+        None, "X Y Z", "of the quadrotor at the start [m/s^2] (default: none)"
+    )
+    start_attitude: tuple[float, ...] | None = option(
+        None, "W X Y Z", "at the start, instead of the acceleration, with a thrust of the weight"
+    )
     speed: float | None = option(None, "V", f"greatest speed [m/s] {_OWN}")
     body_rate: float | None = option(None, "W", f"greatest body rate [rad/s] {_OWN}")
     min_thrust: float | None = option(None, "A", f"least thrust over mass [m/s^2] {_OWN}")

@@ -120,6 +120,9 @@ def case(
     present: ArrayLike = True,
     robot: QuadrotorModel = PAPER_CATCHER,
     start=START,
+    start_velocity=(0.0, 0.0, 0.0),
+    start_acceleration=(0.0, 0.0, 0.0),
+    start_attitude=None,
     gravity: ArrayLike = GRAVITY,
     net_height=None,
     net_radius=None,
@@ -149,7 +152,9 @@ def case(
     * `net_height`, `net_radius`: height l above the propeller plane and radius of the net [m].
     * `max_angle`: theta_safe [rad], greatest angle between net's axis and ball's reversed velocity.
     * `optional`: whether targets may be left out. The number of caught targets is then maximised.
-    * `start`: (..., 3) [m], hover position at time 0; `gravity`: [m/s^2], magnitude.
+    * `start`, `start_velocity`, `start_acceleration`: (..., 3), of the quadrotor at time 0; or
+      `start_attitude`: (..., 4), quaternion w x y z from body to world, instead of the
+      acceleration, for a thrust equal to the weight; `gravity`: [m/s^2], magnitude.
     * `speed` [m/s], `body_rate` [rad/s]: greatest values; `min_height` [m] of the propeller plane;
       `min_thrust`, `max_thrust` [m/s^2], per unit mass.
     * `extras`: further constraints and costs such as `pj.KeepOut`; `dtype`: type of the numbers.
@@ -176,7 +181,15 @@ def case(
         horizon=leaf("horizon", horizon, num),
         order=jnp.asarray(np.broadcast_to(np.arange(num, dtype=np.int32), shape), jnp.int32),
         times=leaf("horizon", shares * np.asarray(horizon)[..., :1], num),
-        head_state=quadrotor.hover_at(near("start", start), batch, dtype),
+        head_state=quadrotor.start_state(
+            near("start", start),
+            start_velocity,
+            start_acceleration,
+            start_attitude,
+            gravity,
+            batch,
+            dtype,
+        ),
         gravity=leaf("gravity", gravity),
         net=Net(
             height=leaf("net_height", tool.height if net_height is None else net_height),

@@ -93,6 +93,9 @@ def case(
     *,
     robot: QuadrotorModel = PAPER_HITTER,
     start=START,
+    start_velocity=(0.0, 0.0, 0.0),
+    start_acceleration=(0.0, 0.0, 0.0),
+    start_attitude=None,
     drag=DRAG,
     gravity=GRAVITY,
     restitution=None,
@@ -118,7 +121,11 @@ def case(
         ball_vel: (..., 3) [m/s], velocity of the ball at time 0.
         target: (..., 3) [m], required landing point of the returned ball.
         robot: quadrotor with a racket. It supplies the numbers of arguments that are None.
-        start: (3,) or (..., 3) [m], hover position of the quadrotor.
+        start: (3,) or (..., 3) [m], position of the quadrotor at time 0.
+        start_velocity: (3,) or (..., 3) [m/s], its velocity at time 0.
+        start_acceleration: (3,) or (..., 3) [m/s^2], its acceleration at time 0.
+        start_attitude: (4,) or (..., 4), quaternion w x y z from body to world at time 0, instead
+            of the acceleration, for a thrust equal to the weight. Its heading has no effect.
         drag: [1/m], coefficient K_D of quadratic drag. The drag and every following number is one
             value for all cases, or one value for each case.
         gravity: [m/s^2], magnitude.
@@ -161,7 +168,15 @@ def case(
         ball=BallState(
             pos=leaf("ball_pos", near("ball_pos", ball_pos), 3), vel=leaf("ball_vel", ball_vel, 3)
         ),
-        head_state=quadrotor.hover_at(near("start", start), batch, dtype),
+        head_state=quadrotor.start_state(
+            near("start", start),
+            start_velocity,
+            start_acceleration,
+            start_attitude,
+            gravity,
+            batch,
+            dtype,
+        ),
         target=leaf("target", near("target", target), 3),
         drag=leaf("drag", drag),
         gravity=leaf("gravity", gravity),
