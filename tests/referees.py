@@ -17,7 +17,8 @@ def tree(leaves, root="", **optional):
 
 def flight(leaves, **optional):
     case = tree(leaves, extras=(), **optional)
-    limits = dict.fromkeys(("acceleration", "min_thrust", "max_thrust", "rotors"))
+    limits = dict.fromkeys(("acceleration", "min_thrust", "max_thrust", "rotors", "max_tilt"))
+    limits["recovery_tilt"] = None
     case.limits = SimpleNamespace(**limits | vars(case.limits))
     case.trajectory = SimpleNamespace(coeffs=case.coeffs, durations=case.durations)
     case.recovery = None

@@ -1,6 +1,7 @@
 """Penalty shapes, quadrature weights, and how far limits are exceeded."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -94,6 +95,13 @@ ACC, JERK = np.array([10.0, -5.0, 10.0]), np.array([0.0, 4.0 * GRAVITY, 0.0])
 AT_LIMIT = {
     "speed": lambda k: quadrotor.speed_excess(k * np.array([3.0, 0.0, 4.0]), limits()),
     "acceleration": lambda k: quadrotor.acceleration_excess(k * ACC, limits()),
+    # 2 sin^2(theta / 2) = 1 - cos(theta) = k^2 / 2, and the limit is 60 degrees.
+    "tilt": lambda k: quadrotor.tilt_excess(
+        3.0 * jnp.array([jnp.sqrt(k**2 - 0.25 * k**4), 0.0, 1.0 - 0.5 * k**2])
+        - np.array([0.0, 0.0, GRAVITY]),
+        GRAVITY,
+        limits().replace(max_tilt=np.array(np.pi / 3.0)),
+    ),
     "body rate": lambda k: quadrotor.body_rate_excess(np.zeros(3), k * JERK, GRAVITY, limits()),
 }
 

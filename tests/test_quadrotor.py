@@ -48,6 +48,25 @@ def test_the_thrust_carries_the_weight_and_the_body_axis_follows_it():
     np.testing.assert_allclose(axis(acc, GRAVITY), expected, atol=1e-15)
 
 
+def test_recoveries_tilt_by_40_degrees_unless_the_limits_or_the_start_say_otherwise():
+    numbers = {"speed": 5.0, "body_rate": 5.0, "min_height": 0.25}
+    limits = pj.QuadrotorLimits(**{name: np.full(3, value) for name, value in numbers.items()})
+    start = np.tile(np.array([np.sqrt(3.0), 0.0, 1.0]), (3, 1))  # a thrust tilted by 60 degrees
+    start = start * np.array([[0.0], [1.0], [-1.0]]) + (1e-9 - GRAVITY) * UP
+    gravity = np.full(3, GRAVITY)
+    for fields, usual in (
+        ({}, 40.0),
+        ({"recovery_tilt": 80.0}, 80.0),
+        ({"max_tilt": 35.0}, 35.0),
+        ({"recovery_tilt": 80.0, "max_tilt": 70.0}, 70.0),
+    ):
+        of = limits.replace(**{name: np.full(3, np.radians(x)) for name, x in fields.items()})
+        found = of.of_recovery(start, gravity)
+        expected = np.maximum([0.0, 60.0, 120.0], usual)
+        np.testing.assert_allclose(np.degrees(found.max_tilt), expected, rtol=1e-6)
+        assert found.recovery_tilt is None and found.speed is limits.speed
+
+
 def test_singular_attitudes_are_finite_the_axis_in_free_fall_and_the_basis_straight_down():
     x, y = basis(np.array([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]], np.float32))
     np.testing.assert_array_equal([x[0], y[0]], [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])

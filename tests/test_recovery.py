@@ -18,6 +18,8 @@ from planner_jax.recovery.after_plan import append_recovery, is_rested
 from planner_jax.recovery.case import RecoveryCase, end_state
 from planner_jax.referee.block import referee_blocks
 from planner_jax.referee.intercept import referee_intercepts
+from planner_jax.referee.quadrotor import RECOVERY_TILT
+from planner_jax.robot import quadrotor_model
 from planner_jax.robot.arm import ArmPlan
 from planner_jax.robot.car import CarPlan
 from planner_jax.runs.run_folder import RunFolder
@@ -94,6 +96,18 @@ def test_a_recovery_that_does_not_rest_fails_by_name(hits, braked):
     verdict = pj.hit.judge(hits, dataclasses.replace(braked, recovery=moving))
     assert (verdict.failed_limit == "recovery").all()
     assert "does not end at standstill" in verdict.sentence(0)
+
+
+def test_the_tilt_of_recoveries_is_limited(hits, braked):
+    assert RECOVERY_TILT == quadrotor_model.RECOVERY_TILT
+    tilt = pj.hit.judge(hits, braked).max_tilt
+    assert (tilt <= RECOVERY_TILT * 1.001).all() and (tilt > 0.3).all()
+    strict = hits.limits.replace(recovery_tilt=np.float32(0.5) * tilt.astype(np.float32))
+    verdict = pj.hit.judge(dataclasses.replace(hits, limits=strict), braked)
+    starts = np.stack([end_state(pj.take(braked.trajectory, k))[2] for k in range(NUM)])
+    at_start = np.arctan2(np.hypot(*starts.T[:2]), starts[:, 2] + hits.gravity)
+    np.testing.assert_array_equal(verdict.failed_limit == "tilt", tilt > at_start * 1.001)
+    assert (verdict.failed_limit == "tilt").any()
 
 
 def test_limits_apply_to_the_recovery(hits, braked):

@@ -141,6 +141,22 @@ def test_a_lowered_limit_fails_by_name_time_and_excess(name, values):
         assert verdict.max_body_rate[0] == pytest.approx(sizes.max(), rel=1e-5)
 
 
+def tilts(leaves):
+    times, acc = dense(leaves, 2)
+    return times, np.arccos(hopf_rotations(acc)[:, 2, 2])
+
+
+def test_a_tilt_limit_fails_by_name_where_the_tilt_is_greatest():
+    leaves = volley()
+    assert np.isnan(judge(leaves).max_tilt[0])  # neither a limit nor a recovery
+    times, angles = tilts(leaves)
+    leaves["limits.max_tilt"] = 2.0 * np.arcsin(np.sin(0.5 * angles.max(keepdims=True)) / 1.25)
+    found = {"excess": 0.25, "rel": 4e-5, "time": times[angles.argmax()], "apart": 1e-3}
+    verdict = assert_fails(leaves, "tilt", **found)
+    assert verdict.max_tilt[0] == pytest.approx(angles.max(), rel=1e-6)
+    assert_good(leaves | {"limits.max_tilt": angles.max(keepdims=True)})
+
+
 def test_ground_fails_where_the_trajectory_is_lowest():
     leaves = volley()
     times, pos = dense(leaves, 0)

@@ -118,6 +118,8 @@ rotors.places | [[0, 1], [1, 1], [2, 1], [3, 1]] | rotors must have diagonal or 
 rotors.max_thrust | 1 N | 4 x rotors.max_thrust must be > the weight of 7.85 N, got 4 N
 rotors.max_thrust | 2.06 N | limits.rotor_share must HOVER, 90% of RANGE
 limits.body_rate | 3 deg | limits.body_rate must be in RATES, got '3 deg'; did you mean deg/s?
+limits.max_tilt | 0 deg | limits.max_tilt must be in (0, 3.14159], got 0
+limits.recovery_tilt | 190 deg | limits.recovery_tilt must be in (0, 3.14159], got 3.31613
 limits.speed | '~' | limits.speed must be in m/s, cm/s, km/h, got '~'
 inertia | 3 3 5 0 0 4 g m^2 | inertia must be OF_A_BODY, got (0.003, 0.003, 0.005, 0.0, 0.0, 0.004)
 inertia | 1 1 9 g m^2 | inertia must be OF_A_BODY, got (0.001, 0.001, 0.009)

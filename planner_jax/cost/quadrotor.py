@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import PyTree
 
-from planner_jax.core.arithmetic import Components, components, reciprocal
+from planner_jax.core.arithmetic import Components, at_least, components, inverse_sqrt, reciprocal
 from planner_jax.cost.along import Along, greatest_along
 from planner_jax.cost.extras import Extra, extra_excess, extra_rate, greatest_extras, num_limits
 from planner_jax.robot.quadrotor import QuadrotorLimits, body_rate_squared, rotor_thrusts
@@ -77,6 +77,18 @@ def thrust_excess(
     x, y, z = components(acc)
     squared = _size_squared((x, y, z + gravity))
     return 1.0 - squared * reciprocal(least) ** 2, squared * reciprocal(most) ** 2 - 1.0
+
+
+def tilt_excess(acc: Components, gravity: Array, limits: QuadrotorLimits) -> Array:
+    """Return sin^2(theta / 2) / sin^2(theta_max / 2) - 1 for the tilt theta of the thrust.
+
+    The cosine of the tilt is  z_z = tau_z / |tau| , and  2 sin^2(theta / 2) = 1 - z_z .
+    """
+    assert limits.max_tilt is not None
+    x, y, z = components(acc)
+    up = z + gravity
+    cosine = up * inverse_sqrt(at_least(_size_squared((x, y, up)), 1e-4))
+    return (1.0 - cosine) * reciprocal(1.0 - jnp.cos(limits.max_tilt)) - 1.0
 
 
 class QuadrotorCase(Protocol):
@@ -173,7 +185,13 @@ _KINDS = (
     _Kind(
         "min_height", (_PLAIN,), lambda motion, _, own: (ground_excess(motion.height, own),), (0,)
     ),
-    _Kind("rotors", (_PLAIN,) * 2, _rotor_excess, (2, 3, 4)),  # for one rotor
+    _Kind(
+        "max_tilt",
+        (_ABOVE,),
+        lambda motion, gravity, own: (tilt_excess(motion.acc, gravity, own),),
+        (2,),
+    ),
+    _Kind("rotors", (_PLAIN,) * 2, _rotor_excess, (2, 3, 4)),  # of one rotor; the last
 )
 
 

@@ -39,7 +39,7 @@ def with_recovery(
 ) -> tuple[Course, bool]:
     """Append a trajectory to standstill to a plan's path; return both, and if the limits hold."""
     state: Any = state_on(path, np.sum(path.durations))
-    case = RecoveryCase(state, state[0], gravity, limits)
+    case = RecoveryCase(state, state[0], gravity, limits.of_recovery(state[2], gravity))
     rest: QuadrotorPlan = solve_one(_REST, case, _REST.rounds[0])
     return Course(_join(path, rest.trajectory), gravity), bool(is_solved(rest.status))
 

@@ -60,13 +60,15 @@ def append_recovery(case: PyTree, found: Plan, to: str) -> Plan:
 
 def _end_flight(case: PyTree, found: QuadrotorPlan, to: str) -> QuadrotorPlan:
     cases, plans = jax.tree.map(lambda leaf: np.asarray(leaf)[None], (case, found))
-    rest = plan(RecoveryPlanner(to=to), recovery_cases(cases, plans))
+    rest_case = recovery_cases(cases, plans)
+    rest = plan(RecoveryPlanner(to=to), rest_case)
     if is_solved(rest.status[0]):
         return take(dataclasses.replace(plans, recovery=rest.trajectory), 0)
     motion = sample_pieces(take(rest.trajectory, 0), _NODES)
-    flown = relative_excess(case.limits, flight_excess(motion, case.gravity, case.limits))
+    limits = take(rest_case.limits, 0)
+    flown = relative_excess(limits, flight_excess(motion, case.gravity, limits))
     worst = [float(np.max(excess)) for excess in flown]
     k = int(np.argmax(worst))
     if worst[k] > 0.0:
-        raise NoRecovery(f"{flight_names(case.limits)[k]}: {worst[k]:.2%} above its limit")
+        raise NoRecovery(f"{flight_names(limits)[k]}: {worst[k]:.2%} above its limit")
     raise NoRecovery(f"a limit is exceeded by {float(rest.violation[0]):.2%}")

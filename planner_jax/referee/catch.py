@@ -20,7 +20,7 @@ from planner_jax.referee import judging, quadrotor
 
 _ORDER_OF_MOTION = (
     *("head state", "continuity", "speed", "thrust low", "thrust high", "body rate"),
-    *("acceleration", "rotor low", "rotor high", "ground", "extra", "recovery"),
+    *("acceleration", "rotor low", "rotor high", "tilt", "ground", "extra", "recovery"),
 )
 _SENTENCES = {
     "not finite": judging.NOT_FINITE,

@@ -79,6 +79,9 @@ class FlightVerdict(Verdict):
     max_thrust: np.ndarray  # (B,) [m/s^2], per unit mass
     min_rotor_thrust: np.ndarray  # (B,) [N], of one rotor; NaN if the case does not limit rotors
     max_rotor_thrust: np.ndarray  # (B,) [N], of one rotor; NaN if the case does not limit rotors
+    # Greatest angle between thrust and vertical in the recovery, and in the trajectory if its tilt
+    # is limited; NaN without a recovery and a limit.
+    max_tilt: np.ndarray  # (B,) [rad]
     # Greatest jump of the state between two pieces, and error of the state at time 0; an error of
     # velocity, acceleration or jerk counts as the displacement that it causes in a piece.
     continuity_error: np.ndarray  # (B,) [m]

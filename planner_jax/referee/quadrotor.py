@@ -35,10 +35,10 @@ class Pieces:
     starts: np.ndarray  # (B, M) [s]
     flown: np.ndarray  # (B, M) bool, whether a piece is used
 
-    def of(self, lanes: slice) -> "Pieces":
-        """Return the pieces of some trajectories of the batch, in the slice `lanes`."""
-        others = (part[lanes] for part in (self.durations, self.starts, self.flown))
-        return Pieces(self.coeffs[:, lanes], *others)
+    def of(self, lanes: slice, pieces: slice = slice(None)) -> "Pieces":
+        """Return some `pieces`, by default all, of some trajectories of the batch."""
+        others = (part[lanes, pieces] for part in (self.durations, self.starts, self.flown))
+        return Pieces(self.coeffs[:, lanes, pieces], *others)
 
 
 def pieces_of(coeffs: np.ndarray, durations: np.ndarray, flown: np.ndarray | None = None) -> Pieces:
@@ -89,6 +89,7 @@ MOTION_SENTENCES = {
     "thrust high": "{excess:.2%} above the greatest thrust at {time:.3f} s",
     "rotor low": "a rotor's thrust is {excess:.2%} of the greatest below the least at {time:.3f} s",
     "rotor high": "{excess:.2%} above the greatest thrust of a rotor at {time:.3f} s",
+    "tilt": "sin(tilt / 2) is {excess:.2%} above its limit at {time:.3f} s",
     "ground": "{excess:.2%} below the least height at {time:.3f} s",
     "extra": "{excess:.2%} beyond extras[{worst_extra}] of the case at {time:.3f} s",
     "recovery": "the recovery trajectory does not end at standstill: velocity, acceleration or "
@@ -99,6 +100,7 @@ MOTION_UNBOUNDED = {"body rate": "no thrust or upside down, so without attitude,
 # [s] An error e of the n-th derivative of the position counts as the displacement |e| h^n / n!,
 # where h is the mean duration of a piece, but at least this number.
 SHORTEST_PIECE = 0.1
+RECOVERY_TILT = math.radians(40.0)  # [rad], greatest tilt of recoveries if their case states none
 _INTERVALS = 400  # least number of intervals between samples, from contact to contact
 _FEWEST_INTERVALS = 16  # least number of intervals between samples in one polynomial piece
 # Greatest number of multiplications in one matrix product, and of plans whose maxima are searched
@@ -128,6 +130,7 @@ def read_flight(cases, plans) -> dict[str, np.ndarray]:
     leaves["durations"] = check_leaf("durations", durations, (num_lanes, num_pieces))
     limits = ("speed", "acceleration", "body_rate", "min_thrust", "max_thrust", "min_height")
     shapes = {"gravity": ()} | {f"limits.{name}": () for name in limits}
+    shapes |= {f"limits.{name}": () for name in ("max_tilt", "recovery_tilt")}
     leaves |= read_leaves(cases, shapes, num_lanes)
     if (rotors := cases.limits.rotors) is not None:
         shapes = dict.fromkeys(("mass", "min_thrust", "max_thrust"), ())
@@ -158,6 +161,13 @@ def _motion(pieces: Pieces, u: np.ndarray) -> list:
 
 def _norm_squared(vector: np.ndarray) -> np.ndarray:
     return vector[0] ** 2 + vector[1] ** 2 + vector[2] ** 2
+
+
+def _tilt(gravity, acc: np.ndarray) -> np.ndarray:
+    """Return sin^2(theta / 2) for the angle theta between thrust and vertical; 1 without thrust."""
+    up, squared = acc[2] + gravity, _thrust_squared(gravity, acc)
+    cosine = np.where(squared > 0.0, up / np.sqrt(squared), -1.0)
+    return np.maximum(0.5 - 0.5 * cosine, 0.0)
 
 
 def _thrust_squared(gravity, acc: np.ndarray) -> np.ndarray:
@@ -235,9 +245,10 @@ def _peaks(pieces: Pieces, gravity: np.ndarray, u: np.ndarray) -> dict[str, tupl
     )
     peaks = {
         name: _greater(
-            _search(name, pieces, gravity, likeliest[i], u), (greatest[i], _time(pieces, top[i], u))
+            _search(measure, pieces, gravity, likeliest[i], u),
+            (greatest[i], _time(pieces, top[i], u)),
         )
-        for i, name in enumerate(_MEASURES)
+        for i, (name, measure) in enumerate(_MEASURES.items())
     }
     peaks["body rate"] = _greater(peaks["body rate"], (turn, _time(pieces, sharpest, u)))
     return peaks
@@ -260,8 +271,8 @@ def _time(pieces: Pieces, index: np.ndarray, u: np.ndarray) -> np.ndarray:
     return pieces.starts[lanes, piece] + pieces.durations[lanes, piece] * u[sample]
 
 
-def _search(name: str, pieces: Pieces, gravity, likeliest, u: np.ndarray) -> tuple:
-    orders, measure = _MEASURES[name]
+def _search(measured: tuple, pieces: Pieces, gravity, likeliest, u: np.ndarray) -> tuple:
+    orders, measure = measured
     piece, sample = np.divmod(likeliest, len(u))
     lanes = np.arange(len(piece))
     coeffs = np.ascontiguousarray(pieces.coeffs[:, lanes, piece].transpose(2, 0, 1))[:, :, None]
@@ -391,7 +402,33 @@ def judge_motion(
         measured, tests = measured | of_rotors, tests | rotor_tests
     else:
         measured |= dict.fromkeys(("min_rotor_thrust", "max_rotor_thrust"), np.full(num, np.nan))
-    return measured, tests | _judge_rest(case, pieces, continuity)
+    measured["max_tilt"], found_tilt = _judge_tilt(case, pieces, u, relative)
+    return measured, tests | found_tilt | _judge_rest(case, pieces, continuity)
+
+
+def _judge_tilt(case: dict, pieces: Pieces, u: np.ndarray, relative: float) -> tuple:
+    """Measure the greatest tilt [rad] of the parts of B flights that have a limit, and test it."""
+    tilt, gravity, tests = np.full(len(case["gravity"]), np.nan), case["gravity"], []
+    limit = case.get("limits.max_tilt", np.full(tilt.shape, np.inf))
+    parts = [(pieces, limit)] if "limits.max_tilt" in case else []
+    if "recovery.coeffs" in case:
+        num = case["recovery.durations"].shape[1]
+        rest = pieces.of(slice(None), slice(-num, None))
+        start = derivative(np.moveaxis(rest.coeffs[:, :, 0], -1, 0), np.zeros(tilt.shape), 2)
+        usual = np.minimum(case.get("limits.recovery_tilt", RECOVERY_TILT), limit)
+        parts.append((rest, np.maximum(usual, 2.0 * np.arcsin(_tilt(gravity, start) ** 0.5))))
+    for part, limit in parts:
+        top, greatest, likeliest = _tops(_tilt(gravity[:, None, None], _motion(part, u)[2]))
+        found = _search(((2,), _tilt), part, gravity, likeliest, u)
+        sine, at = _greater(found, (greatest, _time(part, top, u)))
+        sine = np.sqrt(np.minimum(sine, 1.0))
+        tilt = np.fmax(tilt, 2.0 * np.arcsin(sine))
+        tests.append(above(sine, np.sin(0.5 * np.minimum(limit, math.pi)), relative, at))
+    if not tests:
+        return tilt, {}
+    failed, excess, at = (np.array(each) for each in zip(*tests, strict=True))
+    worst, lanes = excess.argmax(axis=0), np.arange(len(tilt))
+    return tilt, {"tilt": (failed.any(axis=0), excess[worst, lanes], at[worst, lanes])}
 
 
 def _judge_rest(case: dict, pieces: Pieces, continuity: float) -> dict:

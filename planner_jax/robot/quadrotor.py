@@ -13,9 +13,17 @@ import numpy as np
 from flax import struct
 from jax import Array
 
-from planner_jax.core.arithmetic import Components, at_least, components, inverse_sqrt, reciprocal
+from planner_jax.core.arithmetic import (
+    Components,
+    at_least,
+    components,
+    inverse_sqrt,
+    numpy_of,
+    reciprocal,
+)
 from planner_jax.core.origin import Located, to_world
 from planner_jax.core.protocol import Plan
+from planner_jax.robot.quadrotor_model import RECOVERY_TILT
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate, join
 
 # Factor on the limits when `beyond_reach` computes how far a quadrotor can fly. Solved plans exceed
@@ -52,6 +60,8 @@ class QuadrotorLimits:
     min_thrust: Array | None = None
     max_thrust: Array | None = None  # () [m/s^2], greatest thrust per unit mass
     rotors: RotorLimits | None = None
+    max_tilt: Array | None = None  # () [rad], greatest tilt: angle between thrust and vertical
+    recovery_tilt: Array | None = None  # () [rad], greatest tilt of recoveries; None: 40 degrees
 
     @property
     def thrust_bounds(self) -> tuple[Array, Array]:
@@ -69,6 +79,20 @@ class QuadrotorLimits:
             limits["min_thrust"] = jnp.maximum(gravity + factor * (self.min_thrust - gravity), 0.0)
             limits["max_thrust"] = gravity + factor * (self.max_thrust - gravity)
         return dataclasses.replace(self, **limits)
+
+    def of_recovery(self, acc: Array, gravity: Array) -> "QuadrotorLimits":
+        """Return the limits of a recovery that starts at an acceleration (..., 3) [m/s^2].
+
+        The greatest tilt is the lesser of `recovery_tilt` and `max_tilt`, or the tilt at the start
+        if the latter is greater.
+        """
+        xp = numpy_of(acc, gravity)
+        start = xp.arctan2(xp.hypot(acc[..., 0], acc[..., 1]), acc[..., 2] + gravity)
+        tilt = RECOVERY_TILT if self.recovery_tilt is None else self.recovery_tilt
+        if self.max_tilt is not None:
+            tilt = xp.minimum(tilt, self.max_tilt)
+        tilt = xp.maximum(start, tilt).astype(start.dtype)
+        return dataclasses.replace(self, max_tilt=tilt, recovery_tilt=None)
 
 
 def net_thrust(acc: Array, gravity: Array) -> Array:

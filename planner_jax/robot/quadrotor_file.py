@@ -124,6 +124,8 @@ _FIELDS: dict[str, dict[str, _Quantity | None]] = {
         "acceleration": _Quantity("acceleration", optional=True),
         "thrust": _Quantity("acceleration", (2,), span=True, optional=True),
         "rotor_share": _Quantity("share", optional=True),
+        "max_tilt": _Quantity("angle", optional=True),
+        "recovery_tilt": _Quantity("angle"),
     },
 }
 

@@ -17,6 +17,8 @@ from planner_jax.core.errors import ArgumentError
 
 GRAVITY = 9.81  # [m/s^2], used to check that the quadrotor can hover
 
+RECOVERY_TILT = math.radians(40.0)  # [rad], default of `FlightLimits.recovery_tilt`
+
 NET, RACKET = "net", "racket"
 COUNTS = (4, 6, 8)  # numbers of rotors
 
@@ -124,6 +126,9 @@ class FlightLimits:
     # Fraction of the range of a rotor's thrust that plans may use. The remainder is a reserve for
     # the controller. None: plans do not limit the thrusts of single rotors.
     rotor_share: float | None = 0.9
+    # [rad], greatest tilt (angle between thrust and vertical) of the whole flight; None: no limit
+    max_tilt: float | None = None
+    recovery_tilt: float = RECOVERY_TILT  # [rad], greatest tilt of recovery trajectories
 
     def __post_init__(self) -> None:
         _require("limits.speed", self.speed, *_POSITIVE)
@@ -137,6 +142,9 @@ class FlightLimits:
             _require("limits.thrust, the greatest,", most, f"> {least:g}", lambda x: x > least)
         if self.rotor_share is not None:
             _require("limits.rotor_share", self.rotor_share, "in (0, 1]", lambda x: 0.0 < x <= 1.0)
+        for name in ("max_tilt", "recovery_tilt"):
+            if (tilt := vars(self)[name]) is not None or name == "recovery_tilt":
+                _require(f"limits.{name}", tilt, "in (0, 3.14159]", lambda x: 0.0 < x <= math.pi)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -143,4 +143,8 @@ def _summarise(model: QuadrotorModel) -> dict[str, str]:
         "tool": f"{model.tool.kind} of {model.tool.radius:g} m",
         "speed [m/s]": f"{limits.speed:g}",
         "body rate [rad/s]": f"{limits.body_rate:g}",
+        "tilt, recovery [deg]": ", ".join(
+            "-" if tilt is None else f"{math.degrees(tilt):.3g}"
+            for tilt in (limits.max_tilt, limits.recovery_tilt)
+        ),
     }

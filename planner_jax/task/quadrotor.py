@@ -14,7 +14,7 @@ from planner_jax.core.checks import numbers_of
 from planner_jax.core.errors import ArgumentError, ArgumentTypeError
 from planner_jax.core.rules import Field, Table
 from planner_jax.robot.quadrotor import QuadrotorLimits, RotorLimits
-from planner_jax.robot.quadrotor_model import NET, QuadrotorModel, Tool
+from planner_jax.robot.quadrotor_model import NET, RECOVERY_TILT, QuadrotorModel, Tool
 
 _MOMENTS = rules.Rule("> 0", lambda x, _: (x > 0.0) | (np.arange(x.shape[-1]) > 2))
 # Shapes and ranges of the quadrotor's limits, for the cases of hits and of catches.
@@ -25,6 +25,8 @@ FLIGHT_RULES: Table = (
     Field("limits.min_thrust", (), rules.NOT_NEGATIVE),
     Field("limits.min_thrust", (), rules.below("limits.max_thrust")),
     Field("limits.max_thrust", (), rules.POSITIVE_OR_NONE),
+    Field("limits.max_tilt", (), rules.POSITIVE),
+    Field("limits.recovery_tilt", (), rules.POSITIVE),
     Field("limits.rotors.mass", (), rules.POSITIVE),
     Field("limits.rotors.inertia", ("I",), _MOMENTS),
     Field("limits.rotors.mixer", ("R", 4)),
@@ -113,8 +115,10 @@ def limits_of(
     """
     own = robot.limits
     least, most = robot.thrust_bounds if robot.tool.kind == NET else own.thrust or (None, None)
-    names = ("speed", "body_rate", "min_height", "acceleration")
+    names = ("speed", "body_rate", "min_height", "acceleration", "max_tilt")
     values = {name: vars(own)[name] for name in names}
+    if own.recovery_tilt != RECOVERY_TILT:
+        values["recovery_tilt"] = own.recovery_tilt
     values |= {"min_thrust": least, "max_thrust": most}
     values |= {name: value for name, value in given.items() if value is not None}
     # If only one bound of the thrust is specified, the other is 0 (lower) or infinite (upper).
