@@ -61,7 +61,7 @@ def test_the_sentence_on_one_plan_needs_no_index_and_on_a_batch_an_index(judged)
     lanes = tests.unequal_lanes()
     batch = judge(stack(*lanes))
     one = type(batch)(**{name: value[0] for name, value in vars(batch).items()})
-    assert one.sentence() == one.sentence(0) == batch.sentence(0)
+    assert one.sentence() == one.sentence(0) == batch.sentence(0) == batch.sentence(np.int64(0))
     with pytest.raises(IndexError, match=r"a single plan has the index 0, got k = 1$"):
         one.sentence(1)
     with pytest.raises(IndexError, match=rf"on {len(lanes)} plans needs its index, got k = None$"):

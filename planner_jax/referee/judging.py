@@ -48,7 +48,7 @@ class Verdict:
         """
         shape = np.shape(self.success)
         at = () if k is None or (k == 0 and shape == ()) else k
-        if (at == ()) != (shape == ()):
+        if isinstance(at, tuple) != (shape == ()):
             which = (
                 f"{shape[0]} plans needs its index" if shape else "a single plan has the index 0"
             )
