@@ -172,6 +172,38 @@ def test_derivatives_and_attitude_are_those_of_the_flown_path(float64):
     np.testing.assert_allclose(found.body_rate[1:-1], rates, atol=1e-4)
 
 
+@pytest.mark.parametrize(
+    ("acc", "jerk", "attitude"),
+    [
+        ((0.0, 0.0, -GRAVITY), (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)),
+        ((0.0, 0.0, -GRAVITY), (20.0, 0.0, 5.0), (1.0, 0.0, 0.0, 0.0)),
+        ((0.0, 0.0, -2.0 * GRAVITY), (0.0, 30.0, 0.0), (0.0, 0.0, 1.0, 0.0)),
+        ((0.0, 3.0, -GRAVITY), (0.0, 0.0, -2.0), (0.5**0.5, -(0.5**0.5), 0.0, 0.0)),
+        ((1e-4, 0.0, -GRAVITY - 3.0), (-1.0, 0.5, 0.0), None),
+    ],
+)
+def test_in_free_fall_and_upside_down_attitudes_are_unit_and_rates_finite(acc, jerk, attitude):
+    coeffs = hover().trajectory.coeffs.astype(np.float32)
+    coeffs[:, 2], coeffs[:, 3] = 0.5 * np.float32(acc), np.float32(jerk) / 6.0
+    found = plan_of(coeffs, np.float32([0.2, 0.3])).sample(100.0)
+    np.testing.assert_allclose(np.linalg.norm(found.quat_wxyz, axis=1), 1.0, atol=1e-6)
+    assert all(np.isfinite(getattr(found, name)).all() for name in FIELDS)
+    up = matrices(found.quat_wxyz)[:, :, 2]
+    np.testing.assert_allclose(up * found.thrust[:, None], found.acc + GRAVITY * UP, atol=1e-4)
+    if attitude is not None:
+        np.testing.assert_allclose(found.quat_wxyz[0], attitude, atol=1e-6)
+
+
+def test_yaws_of_other_conventions_follow_from_the_attitude():
+    R = np.moveaxis(hopf_rotations(axis(acceleration(0.1)[None], GRAVITY))[0], 1, 0)
+    seen, ahead = np.arctan2(R[0, 1], R[0, 0]), np.arctan2(-R[1, 0], R[1, 1])
+    x = np.cross([-np.sin(seen), np.cos(seen), 0.0], R[2])  # of PX4
+    y = np.cross(R[2], [np.cos(ahead), np.sin(ahead), 0.0])  # of [Lee2010]
+    for found, own in ((x, R[0]), (y, R[1])):
+        np.testing.assert_allclose(found / np.linalg.norm(found), own, atol=1e-6)
+    assert abs(seen) > 0.01 and abs(seen - ahead) > 0.02
+
+
 def test_each_plan_of_a_batch_is_sampled_up_to_its_own_end():
     plans = batch(curve(0, 0.8), curve(1, 0.35))
     together = plans.sample(20.0)

@@ -198,24 +198,45 @@ def tangent_basis(normal: Array) -> tuple[Array, Array]:
 
 
 def flat_attitude(acc: Array, jerk: Array, gravity: Array) -> tuple[Array, Array]:
-    """Return rotation (3, 3) from body to world, and body rate (3,) [rad/s], at zero heading."""
-    z = body_z(acc, gravity)
+    """Return rotation (3, 3) from body to world, and body rate (3,) [rad/s], at zero heading.
+
+    Without thrust the body is upright. The rate is bounded there and near upside down, where the
+    rate of the Hopf fibration has no limit.
+    """
+    w, x, y, _ = components(tilt_quaternion(acc, gravity))
+    axes = (
+        jnp.stack([1.0 - 2.0 * y * y, 2.0 * x * y, -2.0 * w * y]),
+        jnp.stack([2.0 * x * y, 1.0 - 2.0 * x * x, 2.0 * w * x]),
+        jnp.stack([2.0 * w * y, -2.0 * w * x, w * w - x * x - y * y]),
+    )
+    z = axes[2]
     size = jnp.sqrt(jnp.maximum(jnp.sum(net_thrust(acc, gravity) ** 2), 1e-2))
     z_dot = (jerk - jnp.sum(jerk * z) * z) / size
-    x, y = tangent_basis(z)
     twist = (z[1] * z_dot[0] - z[0] * z_dot[1]) / jnp.maximum(1.0 + z[2], 1e-2)
-    rate = jnp.stack([-jnp.sum(y * z_dot), jnp.sum(x * z_dot), twist])
-    return jnp.stack([x, y, z], axis=1), rate
+    rate = jnp.stack([-jnp.sum(axes[1] * z_dot), jnp.sum(axes[0] * z_dot), twist])
+    return jnp.stack(axes, axis=1), rate
 
 
-def tilt_quaternion(normal: Array) -> Array:
-    """Return the attitude quaternion (4,) w x y z at zero heading for a body z axis (x, y, z).
+def tilt_quaternion(acc: Array, gravity: Array) -> Array:
+    """Return the attitude at zero heading, a unit quaternion (4,) w x y z, for an acceleration.
 
-    It is the shortest rotation from upright: (1 + z, -y, x, 0) / sqrt(2 (1 + z)).
+    It is the shortest rotation from upright to the thrust direction z [Watterson2020]:
+    (1 + z_z, -z_y, z_x, 0) / sqrt(2 (1 + z_z)). Below the horizontal the equal expression
+    (|z_xy|, -(1 - z_z) z_y / |z_xy|, (1 - z_z) z_x / |z_xy|, 0) / sqrt(2 (1 - z_z)) has no small
+    denominator. Exactly upside down every horizontal axis is shortest, and the y axis is selected.
+    Without thrust the attitude is upright.
     """
+    normal = body_z(acc, gravity)
     x, y, z = components(normal)
-    w = jnp.sqrt(0.5 * at_least(1.0 + z, 1e-6))
-    return jnp.stack([w, -0.5 * y / w, 0.5 * x / w, jnp.zeros_like(w)])
+    z = jnp.where(jnp.any(normal != 0.0), z, 1.0)
+    across = x * x + y * y
+    has_side = across > 0.0
+    side = jnp.sqrt(jnp.where(has_side, across, 1.0))
+    half = jnp.sqrt(0.5 + 0.5 * jnp.abs(z))  # the greater one of sine and cosine of half the tilt
+    less = jnp.where(has_side, 0.5 * side / half, 0.0)
+    cosine, sine = jnp.where(z < 0.0, less, half), jnp.where(z < 0.0, half, less)
+    turn_x, turn_y = jnp.where(has_side, -y / side, 0.0), jnp.where(has_side, x / side, 1.0)
+    return jnp.stack([cosine, sine * turn_x, sine * turn_y, jnp.zeros_like(z)])
 
 
 def greatest_speed(head_state: Array, limits: QuadrotorLimits) -> Array:
@@ -298,7 +319,9 @@ class QuadrotorSetpoints:
     vel: np.ndarray  # (K, 3) [m/s]
     acc: np.ndarray  # (K, 3) [m/s^2]
     jerk: np.ndarray  # (K, 3) [m/s^3]
-    quat_wxyz: np.ndarray  # (K, 4), body to world, at zero heading of the Hopf fibration
+    # (K, 4), unit quaternions, body to world, at zero heading of the Hopf fibration: the shortest
+    # rotation from upright to the thrust, so that z is always 0
+    quat_wxyz: np.ndarray
     body_rate: np.ndarray  # (K, 3) [rad/s], body frame
     thrust: np.ndarray  # (K,) [m/s^2], per unit mass
 
@@ -343,7 +366,7 @@ def setpoint_at(leaves: tuple[PiecewisePolynomial, Array], time: Array) -> dict[
         "vel": vel,
         "acc": acc,
         "jerk": jerk,
-        "quat_wxyz": tilt_quaternion(body_z(acc, gravity)),
+        "quat_wxyz": tilt_quaternion(acc, gravity),
         "body_rate": flat_attitude(acc, jerk, gravity)[1],
         "thrust": jnp.sqrt(jnp.sum(net_thrust(acc, gravity) ** 2)),
     }
