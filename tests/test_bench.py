@@ -3,6 +3,7 @@ import dataclasses
 import importlib
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +18,7 @@ from planner_jax.benchmarks.block_rows import METHODS, ROWS
 from planner_jax.benchmarks.cost_gap import cost_gaps, gap_figures
 from planner_jax.benchmarks.first_plan import ROWS as FIRST_PLANS
 from planner_jax.benchmarks.first_plan import plan_in_new_process
+from planner_jax.benchmarks.flown_by_rotorpy import model_of, track
 from planner_jax.benchmarks.run import Bench
 from planner_jax.benchmarks.throughput import report
 from planner_jax.core import registry
@@ -31,6 +33,39 @@ def test_what_a_benchmark_imports_is_there(path):
     if path.stem in NEEDS:
         pytest.importorskip(NEEDS[path.stem])
     importlib.import_module(f"planner_jax.benchmarks.{path.stem}")
+
+
+PEER = {
+    **{"mass": 0.5, "Ixx": 0.003, "Iyy": 0.004, "Izz": 0.006, "tau_m": 0.02},
+    **{"k_eta": 1e-6, "k_m": 2e-8, "rotor_speed_max": 2000.0},
+    "rotor_pos": {
+        f"r{k}": np.array([x, y, 0.0]) / 8.0
+        for k, (x, y) in enumerate(((1, 1), (1, -1), (-1, -1), (-1, 1)), 1)
+    },
+}
+
+
+def test_a_robot_of_rotorpy_has_the_thrusts_of_its_plan_and_turns_to_the_feedback():
+    robot = model_of("peer", PEER, 5.0, pj.Tool("net", 0.1, 0.1))
+    assert [place[0] * place[1] > 0.0 for place in robot.rotors.places] == [True, False] * 2
+    assert robot.rotors.max_thrust == pytest.approx(4.0) and robot.rotors.torque_ratio == 0.02
+    inertia = np.diag(robot.inertia)
+    own = SimpleNamespace(kp_pos=6.0, kd_pos=4.0, kp_att=300.0, kd_att=50.0, TM_to_f=np.eye(4))
+    own.mass, own.inertia = robot.mass, inertia
+    turned = np.array([0.0, np.sin(0.2), 0.0, np.cos(0.2)])  # x y z w, by 0.4 rad about y
+    rate, turning = np.array([1.0, -2.0, 0.5]), np.array([3.0, 4.0, 5.0])
+    state = {"x": np.ones(3), "v": np.zeros(3), "q": turned, "w": rate}
+    at = SimpleNamespace(pos=np.ones(3), vel=np.zeros(3), quat_xyzw=turned, thrust=12.0)
+    at.rate, at.turning = rate, turning
+    torque = inertia @ turning + np.cross(rate, inertia @ rate)
+    np.testing.assert_allclose(track(own, state, at), [6.0, *torque], rtol=1e-9)
+    at.rate = state["w"] = np.zeros(3)
+    low = track(own, state | {"x": np.array([1.0, 1.0, 0.9])}, at)
+    up = np.array([np.sin(0.4), 0.0, np.cos(0.4)])
+    force = 12.0 * up + [0.0, 0.0, 0.6]  # with the feedback 6 / s^2 times 0.1 m
+    sine = np.cross(up, force)[1] / np.linalg.norm(force)  # of the turn about y to the force
+    expected = [0.5 * force @ up, 0.009, 0.004 * (4.0 + 300.0 * sine), 0.03]
+    np.testing.assert_allclose(low, expected, rtol=1e-9)
 
 
 def test_the_throws_that_are_kept_are_those_of_the_seed():
