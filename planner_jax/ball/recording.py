@@ -24,19 +24,21 @@ from planner_jax.ball.spin import SpinningBall, Surroundings, spin_acceleration,
 from planner_jax.core.arithmetic import at_least
 from planner_jax.core.checks import require_number, shape_of
 from planner_jax.core.choices import require, require_one_of
+from planner_jax.core.compiled import QUICK_OPTIONS
 from planner_jax.core.errors import CaseError
 from planner_jax.core.rules import POSITIVE
 
 _TAIL = 4.0  # degrees of freedom of Student's t distribution of the errors
 _WEIGHT = 4.0  # number of observations that the assumed noise counts for
-_ROUNDS = 3  # number of linearisations of the flight
+_ROUNDS = (2, 4)  # numbers of linearisations of a short and of a longer flight
 _WEIGHINGS = 3  # number of weighted least-squares problems for each linearisation
 _LEAST = 4  # least number of observations
 _BOUNCES = 2  # number of bounces that are simulated
 # Pairs of observations, of which each yields a first guess of the flight: the first observation and
 # the time between both, as fractions of the recording. The fractions are quasi-random numbers.
 _PAIRS = 0.6 * (np.arange(1, 17)[:, None] * [0.618034, 0.754878] % 1.0)
-_SHORT = 0.25  # [s], greatest duration of a flight that is integrated in 4 steps instead of 12
+# Numbers of Runge-Kutta steps of a flight, and greatest products of drag and distance for them.
+_STEPS = ((2, 0.25), (4, 1.0), (12, math.inf))
 _FAR = 25.0  # squared distance, in standard deviations, from which an observation is an outlier
 _MOST_OUTLIERS = 0.45  # greatest share of outliers of a recording
 _MOST_NOISE = 0.1  # greatest error of an observation along the path, as a share of its extent
@@ -80,7 +82,7 @@ class Ball:
 
 
 # Drag, spin and bounces of "table tennis" were measured on recordings of two laboratories.
-_TABLE_TENNIS = Ball(0.147, 0.1, (0.3, 0.3, 0.15), 9.0, (0.93, 0.05), (0.22, 0.08))
+_TABLE_TENNIS = Ball(0.152, 0.15, (0.6, 0.3, 0.18), 7.0, (0.93, 0.05), (0.22, 0.08))
 BALLS = {"unknown": Ball(), "table tennis": _TABLE_TENNIS}
 
 
@@ -144,19 +146,17 @@ class FlightFit:
 
     def _predict(self, after: np.ndarray) -> Prediction:
         _, origin, freedom, fitted, numbers, bounces = self._data
-        rows = after.reshape(-1, after.shape[-1])
-        fill = _next_size(after.shape[-1]) - after.shape[-1], len(fitted[0]) - len(rows)
-        padded = np.pad(rows, ((0, fill[1]), (0, fill[0])), mode="edge").astype(np.float32)
-        program = _program(_forecast, bounces, _num_steps(padded))
-        shape = (*after.shape, 3)
-        pos, vel, sure, seen = (
-            np.asarray(leaf, np.float64)[: len(rows), : after.shape[-1]].reshape(
-                shape + leaf.shape[3:]
-            )
-            for leaf in program(fitted, padded, numbers)
-        )
+        rows, num = after.reshape(-1, after.shape[-1]), after.shape[-1]
+        lanes = np.minimum(np.arange(len(fitted)), len(rows) - 1)
+        padded = rows[lanes[:, None], np.minimum(np.arange(_next_size(num)), num - 1)]
+        distance = after.max() * np.abs(self.vel).max()
+        program = _program(_forecast, bounces, _num_steps(numbers[0] * distance))
+        found = np.asarray(program(fitted, padded.astype(np.float32), numbers), np.float64)
+        found = found[: len(rows), :num].reshape((*after.shape, 24))
+        sure, seen = (found[..., k : k + 9].reshape((*after.shape, 3, 3)) for k in (6, 15))
         freedom = np.broadcast_to(freedom[..., None], after.shape)
-        return Prediction(pos + origin[..., None, :], vel, sure, seen, freedom)
+        pos = found[..., :3] + origin[..., None, :]
+        return Prediction(pos, found[..., 3:6], sure, seen, freedom)
 
 
 def fit(
@@ -211,8 +211,9 @@ def fit(
     rows = np.concatenate([clock[..., None], points], axis=-1)
     present = np.asarray(np.isfinite(rows).all(axis=-1))
     _require(present.sum(axis=-1) >= _LEAST, batch, "positions", "of at least 4 observations")
-    rows = np.where(present[..., None], rows, np.nan)
-    rows = np.take_along_axis(rows, np.argsort(~present, axis=-1, kind="stable")[..., None], 1)
+    if not present.all():  # absent observations are the last ones
+        order = np.argsort(~present, axis=-1, kind="stable")[..., None]
+        rows = np.take_along_axis(np.where(present[..., None], rows, np.nan), order, axis=1)
     falls = np.sum(np.diff(rows[:, :, 0]) <= 0.0, axis=-1)
     _require(falls == 0, batch, "times", "strictly increasing")
     first, lanes = rows[:, 0].copy(), 1 if len(rows) == 1 else _next_size(len(rows), 64)
@@ -226,29 +227,27 @@ def fit(
         low, high = np.nanmin(rows[..., 3], axis=-1), np.nanmax(rows[..., 3], axis=-1)
         bounces = _BOUNCES
         observed = _BOUNCES if np.any(low - floor < 0.5 * (high - low)) else 0
-    packed = [float(x) for each in astuple(ball) for x in np.atleast_1d(each)]
-    numbers = np.array([*packed, gravity, *np.asarray(wind, float), noise], np.float32)
-    program = _program(_estimate, observed, _num_steps(padded[..., 0]))
-    fitted, found = program((padded, floors), numbers)
-    state, covariance, scales, outliers, size = (
-        np.asarray(leaf, np.float64)[: len(rows)].reshape(batch + leaf.shape[1:])
-        for leaf in (*fitted[:3], *found)
-    )
-    moved = np.nan_to_num(rows - first[:, None])[..., 1:]
-    extent = np.linalg.norm(np.max(moved, axis=1) - np.min(moved, axis=1), axis=-1)
-    sound = np.isfinite(covariance).all(axis=(-2, -1)) & (outliers <= _MOST_OUTLIERS)
-    error = scales[..., 0] + scales[..., 1] * np.sum(state[..., 3:6] ** 2, axis=-1)
-    sound &= (np.sqrt(error) <= _MOST_NOISE * extent.reshape(batch)) & (size <= _MOST_LIFT)
+    numbers = _pack(ball, (float(gravity), *map(float, np.asarray(wind)), float(noise)))
+    distance = np.nanmax(np.abs(padded[..., 1:]))
+    program = _program(_estimate, observed, _num_steps(ball.drag * distance))
+    fitted = np.asarray(program(padded, floors, numbers))
+    state = fitted[: len(rows)].reshape((*batch, -1)).astype(np.float64)
+    sound = state[..., 161] > 0.0
     rule = "of one flight in one frame, with the lift of `ball`, except for less than half"
     _require(sound, batch, "positions", rule)
-    first = first.reshape((*batch, 4))
+    start, origin = first[:, 0].reshape(batch), first[:, 1:].reshape((*batch, 3))
     freedom = (3.0 * present.sum(axis=-1) - 9.0 + _WEIGHT).reshape(batch)
-    pos, vel, drag, lift = np.split(state[..., :10], (3, 6, 7), axis=-1)
-    start, origin = first[..., 0], first[..., 1:]
-    pos, drag, errors = pos + origin, np.exp(drag[..., 0]), np.sqrt(scales)
+    pos, drag, errors = state[..., :3] + origin, np.exp(state[..., 6]), np.sqrt(state[..., 156:158])
+    covariance = state[..., 12:156].reshape((*batch, 12, 12))
     data = clock.reshape(shape[:-1]), origin, freedom, fitted, numbers, bounces
-    across, stamps = errors[..., 0], errors[..., 1]
-    return FlightFit(start, pos, vel, drag, lift, across, stamps, outliers, covariance, data)
+    beside = errors[..., 0], errors[..., 1], state[..., 160], covariance, data
+    return FlightFit(start, pos, state[..., 3:6], drag, state[..., 7:10], *beside)
+
+
+@functools.lru_cache
+def _pack(ball: Ball, others: tuple[float, ...]) -> np.ndarray:
+    packed = [float(x) for each in astuple(ball) for x in np.atleast_1d(each)]
+    return np.array([*packed, *others], np.float32)
 
 
 def _require(holds: ArrayLike, batch: tuple[int, ...], name: str, rule: str) -> None:
@@ -261,21 +260,18 @@ def _next_size(num: int, least: int = 16) -> int:
     return max(least, 1 << (num - 1).bit_length())
 
 
-def _num_steps(times: np.ndarray) -> int:
-    return 4 if np.nanmax(times) <= _SHORT else 12
+def _num_steps(exponent: float) -> int:
+    return next(steps for steps, most in _STEPS if exponent <= most)
 
 
 @functools.cache
 def _program(function: Callable, bounces: int, steps: int) -> Callable:
     """Compile a function of one lane (recording) for a batch of lanes."""
 
-    @jax.jit
+    @functools.partial(jax.jit, compiler_options=QUICK_OPTIONS)
     @jax.default_matmul_precision("highest")
-    def program(*arguments: Any) -> Any:
-        *lanes, numbers = arguments
-        if function is _forecast:
-            return jax.vmap(lambda a, b: _forecast(a, b, numbers, (bounces, steps)))(*lanes)
-        return jax.vmap(lambda a: _estimate(a, numbers, (bounces, steps)))(*lanes)
+    def program(first: Array, second: Array, numbers: Array) -> Array:
+        return jax.vmap(lambda a, b: function(a, b, numbers, (bounces, steps)))(first, second)
 
     return program
 
@@ -296,11 +292,12 @@ def _positions(
     return found[0], found
 
 
-def _estimate(
-    observed: tuple[Array, Array], numbers: Array, counts: tuple[int, int]
-) -> tuple[tuple[Array, ...], tuple[Array, Array]]:
-    """Estimate one flight from rows (N, 4) of time [s] and position [m]; absent rows are NaN."""
-    rows, floor = observed
+def _estimate(rows: Array, floor: Array, numbers: Array, counts: tuple[int, int]) -> Array:
+    """Estimate one flight from rows (N, 4) of time [s] and position [m]; absent rows are NaN.
+
+    The result (162,) has the unknowns, their covariance, squared errors of positions and of time
+    stamps, last time, floor, share of outliers, and whether the flight explains the rows.
+    """
     present = jnp.isfinite(rows[:, 0])
     num = jnp.sum(present, dtype=rows.dtype)
     last = jnp.max(jnp.where(present, rows[:, 0], 0.0))
@@ -309,6 +306,7 @@ def _estimate(
         jnp.where(present[:, None], rows[:, 1:], 0.0),
     )
     drag, spread, noise = numbers[0], numbers[1], numbers[16]
+    is_short = counts[1] == _STEPS[0][0]
     means = jnp.stack([jnp.log(drag), *jnp.zeros(3), numbers[6], numbers[8]])
 
     def positions(state: Array) -> tuple[Array, tuple[Array, Array]]:
@@ -326,7 +324,11 @@ def _estimate(
         vel = ball.vel - (0.5 * span + times[i]) * acc
         pos = ball.pos - times[i] * (vel + 0.5 * times[i] * acc)
         state = jnp.concatenate([pos, vel, means])
-        away = jnp.sum((positions(state)[0] - seen) ** 2, axis=1)
+        if is_short and not counts[0]:  # a parabola is near enough to a short flight
+            path = pos[None] + jnp.outer(times, vel) + jnp.outer(0.5 * times**2, acc)
+        else:
+            path = positions(state)[0]
+        away = jnp.sum((path - seen) ** 2, axis=1)
         # A sum of roots depends little on outliers.
         return state, away, jnp.sum(jnp.where(present, jnp.sqrt(jnp.sqrt(away)), 0.0))
 
@@ -342,7 +344,10 @@ def _estimate(
     side = jnp.stack([-forward[1], forward[0] + 1e-6, jnp.zeros_like(speed)])
     side = side / jnp.linalg.norm(side)
     frame = jnp.stack([forward, side, jnp.cross(forward, side)])
-    scaled = frame / (numbers[2:5] * drag * speed)[:, None]
+    spreads = numbers[2:5] * drag * speed
+    # The lift along a short flight has no effect before a bounce: it is not estimated, and only its
+    # uncertainty counts.
+    scaled = frame / spreads.at[0].multiply(0.05 if is_short else 1.0)[:, None]
     prior = jnp.diag(
         jnp.stack([*jnp.zeros(6), 1 / spread**2, *jnp.zeros(3), *(1 / numbers[7:10:2] ** 2)])
     )
@@ -401,20 +406,33 @@ def _estimate(
 
     scales = jnp.stack([jnp.maximum(0.6 * error, noise**2), jnp.zeros_like(noise)])
     begun = state, scales, jnp.ones_like(noise)
-    (state, scales, _), (covariance, far) = lax.scan(linearise, begun, None, length=_ROUNDS)
+    (state, scales, _), (covariance, far) = lax.scan(
+        linearise, begun, None, length=_ROUNDS[not is_short]
+    )
     size = jnp.linalg.norm(scaled @ state[7:10])
-    return (state, covariance[-1], scales, floor, last), (far[-1], size)
+    axial = jnp.concatenate([jnp.zeros(7), spreads[0] * forward, jnp.zeros(2)])
+    covariance = covariance[-1] + (jnp.outer(axial, axial) if is_short else 0.0)
+    # The error along the path must be small beside the extent of the recording.
+    extent = jnp.max(seen, axis=0) - jnp.min(seen, axis=0)
+    error = scales[0] + scales[1] * jnp.sum(state[3:6] ** 2)
+    sound = (error <= _MOST_NOISE**2 * jnp.sum(extent**2)) & (size <= _MOST_LIFT)
+    sound &= jnp.isfinite(jnp.sum(covariance)) & (far[-1] <= _MOST_OUTLIERS)
+    others = jnp.stack([*scales, last, floor, far[-1], sound.astype(rows.dtype)])
+    return jnp.concatenate([state, covariance.reshape(-1), others])
 
 
-def _forecast(
-    fitted: tuple[Array, ...], times: Array, numbers: Array, counts: tuple[int, int]
-) -> tuple[Array, ...]:
-    """Return positions, velocities, and covariances of true and observed positions at times."""
-    state, covariance, scales, floor, span = fitted
+def _forecast(fitted: Array, times: Array, numbers: Array, counts: tuple[int, int]) -> Array:
+    """Predict one flight at times (T,) after a result of `_estimate`.
+
+    The result (T, 24) has positions, velocities, and covariances of true and observed positions.
+    """
+    state, covariance = fitted[:12], fitted[12:156].reshape(12, 12)
+    scales, span, floor = fitted[156:158], fitted[158], fitted[159]
     slopes, (pos, vel) = jax.jacfwd(_positions, has_aux=True)(state, times, numbers, floor, counts)
     sure = jnp.einsum("nik,kl,njl->nij", slopes, covariance, slopes)
     after = jnp.maximum(times - 0.5 * span, 0.0)
     eye = jnp.eye(3, dtype=pos.dtype)[None]
     sure = sure + (numbers[11] * after**3 / 3.0)[:, None, None] * eye
     stamps = scales[1] * jnp.einsum("ni,nj->nij", vel, vel)
-    return pos, vel, sure, sure + scales[0] * eye + stamps
+    seen = sure + scales[0] * eye + stamps
+    return jnp.concatenate([pos, vel, sure.reshape(-1, 9), seen.reshape(-1, 9)], axis=1)
