@@ -100,6 +100,8 @@ MOTION_UNBOUNDED = {"body rate": "no thrust or upside down, so without attitude,
 # [s] An error e of the n-th derivative of the position counts as the displacement |e| h^n / n!,
 # where h is the mean duration of a piece, but at least this number.
 SHORTEST_PIECE = 0.1
+# [rad], at least this much more than the tilt at its start is allowed to a recovery
+MORE_TILT = math.radians(10.0)
 RECOVERY_TILT = math.radians(40.0)  # [rad], greatest tilt of recoveries if their case states none
 _INTERVALS = 400  # least number of intervals between samples, from contact to contact
 _FEWEST_INTERVALS = 16  # least number of intervals between samples in one polynomial piece
@@ -409,14 +411,14 @@ def judge_motion(
 def _judge_tilt(case: dict, pieces: Pieces, u: np.ndarray, relative: float) -> tuple:
     """Measure the greatest tilt [rad] of the parts of B flights that have a limit, and test it."""
     tilt, gravity, tests = np.full(len(case["gravity"]), np.nan), case["gravity"], []
-    limit = case.get("limits.max_tilt", np.full(tilt.shape, np.inf))
-    parts = [(pieces, limit)] if "limits.max_tilt" in case else []
+    parts = [(pieces, case["limits.max_tilt"])] if "limits.max_tilt" in case else []
     if "recovery.coeffs" in case:
         num = case["recovery.durations"].shape[1]
         rest = pieces.of(slice(None), slice(-num, None))
         start = derivative(np.moveaxis(rest.coeffs[:, :, 0], -1, 0), np.zeros(tilt.shape), 2)
-        usual = np.minimum(case.get("limits.recovery_tilt", RECOVERY_TILT), limit)
-        parts.append((rest, np.maximum(usual, 2.0 * np.arcsin(_tilt(gravity, start) ** 0.5))))
+        usual = case.get("limits.recovery_tilt", RECOVERY_TILT)
+        start_tilt = 2.0 * np.arcsin(_tilt(gravity, start) ** 0.5)
+        parts.append((rest, np.maximum(usual, start_tilt + MORE_TILT)))
     for part, limit in parts:
         top, greatest, likeliest = _tops(_tilt(gravity[:, None, None], _motion(part, u)[2]))
         found = _search(((2,), _tilt), part, gravity, likeliest, u)

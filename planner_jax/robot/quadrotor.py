@@ -23,7 +23,7 @@ from planner_jax.core.arithmetic import (
 )
 from planner_jax.core.origin import Located, to_world
 from planner_jax.core.protocol import Plan
-from planner_jax.robot.quadrotor_model import RECOVERY_TILT
+from planner_jax.robot.quadrotor_model import MORE_TILT, RECOVERY_TILT
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate, join
 
 # Factor on the limits when `beyond_reach` computes how far a quadrotor can fly. Solved plans exceed
@@ -83,16 +83,16 @@ class QuadrotorLimits:
     def of_recovery(self, acc: Array, gravity: Array) -> "QuadrotorLimits":
         """Return the limits of a recovery that starts at an acceleration (..., 3) [m/s^2].
 
-        The greatest tilt is the lesser of `recovery_tilt` and `max_tilt`, or the tilt at the start
-        if the latter is greater.
+        The greatest tilt is `recovery_tilt`, but at least 10 degrees more than the tilt at the
+        start, since the body may rotate away from upright there, and at most `max_tilt`.
         """
         xp = numpy_of(acc, gravity)
         start = xp.arctan2(xp.hypot(acc[..., 0], acc[..., 1]), acc[..., 2] + gravity)
         tilt = RECOVERY_TILT if self.recovery_tilt is None else self.recovery_tilt
+        tilt = xp.maximum(start + MORE_TILT, tilt)
         if self.max_tilt is not None:
             tilt = xp.minimum(tilt, self.max_tilt)
-        tilt = xp.maximum(start, tilt).astype(start.dtype)
-        return dataclasses.replace(self, max_tilt=tilt, recovery_tilt=None)
+        return dataclasses.replace(self, max_tilt=tilt.astype(start.dtype), recovery_tilt=None)
 
 
 def net_thrust(acc: Array, gravity: Array) -> Array:

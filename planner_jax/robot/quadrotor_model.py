@@ -18,6 +18,8 @@ from planner_jax.core.errors import ArgumentError
 GRAVITY = 9.81  # [m/s^2], used to check that the quadrotor can hover
 
 RECOVERY_TILT = math.radians(40.0)  # [rad], default of `FlightLimits.recovery_tilt`
+# [rad], at least this much more than the tilt at its start is allowed to a recovery
+MORE_TILT = math.radians(10.0)
 
 NET, RACKET = "net", "racket"
 COUNTS = (4, 6, 8)  # numbers of rotors
@@ -128,7 +130,7 @@ class FlightLimits:
     rotor_share: float | None = 0.9
     # [rad], greatest tilt (angle between thrust and vertical) of the whole flight; None: no limit
     max_tilt: float | None = None
-    recovery_tilt: float = RECOVERY_TILT  # [rad], greatest tilt of recovery trajectories
+    recovery_tilt: float = RECOVERY_TILT  # [rad], greatest tilt of recoveries
 
     def __post_init__(self) -> None:
         _require("limits.speed", self.speed, *_POSITIVE)
