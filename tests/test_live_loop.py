@@ -19,7 +19,7 @@ from planner_jax.benchmarks.serve_soak import distance_off
 from planner_jax.cli.main import main
 from planner_jax.live import planner as live_planner
 from planner_jax.live.course import with_recovery
-from planner_jax.live.packets import BALL, ROBOT, Fault, Motion, read_answer, request
+from planner_jax.live.packets import BALL, ROBOT, Fault, Motion, Reason, read_answer, request
 from planner_jax.live.planner import LivePlanner
 from planner_jax.live.server import Server
 from planner_jax.live.settings import CatchServe, HitServe
@@ -193,6 +193,72 @@ def test_throws_are_caught_by_plans_with_recoveries(warm):
         assert distance_off(last, 0.2, 9.81, np.array(ball)) < 0.125
         assert since < 1.0
     assert all(warm.report.counts[name] == before[name] for name in ("endless", "refused"))
+
+
+def detect(path, random, step, false):
+    """Return the detection of a frame; `false` [m] is where false detections stand, or None."""
+    if step == 0 or random.uniform() < 0.2:
+        return random.uniform([-1, -2, 0], [4, 2, 3]) if false is None else false
+    return path[step]
+
+
+def test_a_ball_is_known_in_spite_of_false_detections(warm, path):
+    sight, random, errors = warm._sight, np.random.default_rng(2), []
+    for run in range(60):
+        sight.forget()
+        false = random.uniform([-1, -2, 0], [4, 2, 3]) if run % 2 else None
+        error = np.inf
+        for step in range(40):
+            seen = detect(path, random, step, false) + random.normal(0.0, 0.005, 3)
+            ball, _ = sight.see(1, tuple(seen), STEP * step, STEP * step)
+            if ball is not None and step > 30:
+                error = np.linalg.norm(ball.pos - path[step])
+        errors.append(error if sight.is_known(1, 0.3) else np.inf)
+    sight.forget()
+    assert np.mean(np.array(errors) < 0.02) >= 0.95, np.sort(errors)[-6:]
+
+
+@pytest.mark.slow
+def test_balls_are_caught_in_spite_of_false_detections(warm, path):
+    random, met = np.random.default_rng(3), []
+    for run in range(60):
+        false = random.uniform([-1, -2, 0], [4, 2, 3]) if run % 2 else None
+        seen = np.array([detect(path, random, step, false) for step in range(110)])
+        answers = balls_of(Throw(warm, seen, 100 + run).fly(100))
+        plans = [answer for answer in answers if answer.motion is Motion.PLAN]
+        since = plans[-1].contact - answers[0].begin if plans else 0.0
+        ball = [np.interp(since, STEP * np.arange(200), path[:, k]) for k in range(3)]
+        met.append(bool(plans) and distance_off(plans[-1], 0.2, 9.81, np.array(ball)) < 0.125)
+    assert np.mean(met) >= 0.95, met
+
+
+def test_of_two_balls_in_flight_the_second_waits_until_the_first_is_caught(warm, path):
+    def both(step, data):
+        values = tuple(path[step] + [0.4, 0.1, 0.3])
+        return [data, request(BALL, throw.sequence + 5000, throw.now, throw.now, values, 41)]
+
+    throw = Throw(warm, path, 40, both)
+    answers = throw.fly(60)
+    plans = [answer for answer in answers if answer.motion is Motion.PLAN]
+    assert len(plans) > 60 and np.ptp([answer.contact for answer in plans]) < 0.1
+
+
+def test_an_answer_without_a_plan_has_the_reason(warm, path):
+    throw = Throw(warm, path + [40.0, 40.0, 30.0], 50)
+    reasons = [answer.reason for answer in throw.fly(60)]
+    assert reasons[0] is Reason.NO_BALL and reasons[3] is Reason.UNCERTAIN
+    assert {*reasons[-20:]} <= {Reason.TOO_FAR, Reason.NO_PLAN}
+    caught = balls_of(Throw(warm, path, 51).fly(120))
+    assert caught[-1].reason is Reason.DONE and last_plan(caught).reason is Reason.NONE
+
+
+@pytest.mark.parametrize(
+    "state", [(0, 0, -5, *[0] * 6), (*HOME, 60, 0, 0, 0, 0, 0), (*HOME, 0, 0, 0, 0, 0, -300)]
+)
+def test_an_absurd_state_of_the_robot_is_not_used(warm, state):
+    throw = Throw(warm, None, 60)
+    answer = throw.send(throw.packet(ROBOT, state))
+    assert answer.fault is Fault.ABSURD and answer.motion is Motion.NONE
 
 
 def test_a_robot_off_its_course_gets_a_recovery_from_its_position(warm, path):

@@ -33,7 +33,7 @@ def test_an_answer_comes_back_as_it_was_packed():
     packet = packets.read_request(BALL_SEEN)
     rows = np.arange(2 * packets.WIDTH, dtype=np.float32).reshape(2, packets.WIDTH)
     assert isinstance(packet, Packet)
-    state = Fault.OUTLIER, packets.Motion.PLAN, (5.0, 0.01, 5.5)
+    state = Fault.OUTLIER, packets.Motion.PLAN, packets.Reason.DONE, (5.0, 0.01, 5.5)
     found = packets.read_answer(packets.answer(packet, *state, rows))
     assert found is not None
     assert (found.sequence, found.sent, found.motion) == (7, 5.0, packets.Motion.PLAN)

@@ -185,11 +185,12 @@ def _serve(settings: ServeSettings) -> None:
     options = {name: vars(settings)[name] for name in ("rate", "horizon", "deadline", "noise")}
     server = Server(LivePlanner(settings.stroke(), **options), settings.port)
     print("Compiling the planner.", file=sys.stderr, flush=True)
-    server.warm_up()
+    server.warm_up(lambda line: print(line, file=sys.stderr, flush=True))
     report = server.planner.report
     remainder = lambda: f"{report.counts['answered']:,} packets answered"  # noqa: E731
     with stopping.under_way(remainder, bar=False), contextlib.closing(server):
-        print(f"Answering on 127.0.0.1:{server.port}; Ctrl-C stops.", flush=True)
+        waits = "waiting for states of the robot and observations of balls"
+        print(f"Answering on 127.0.0.1:{server.port}; {waits}; Ctrl-C stops.", flush=True)
         ends = time.monotonic() + (settings.seconds or math.inf)
         server.run(lambda: not stopping.is_stopped() and time.monotonic() < ends)
         print("\n".join(report.lines() if settings.report else [report.headline()]), flush=True)

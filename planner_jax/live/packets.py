@@ -22,9 +22,10 @@ _HEADER = struct.Struct("<4sBBHId")  # magic, version, kind, ball, sequence, tim
 _MEASURED = struct.Struct("<d")  # time of the measurement
 _VALUES = {BALL: struct.Struct("<3d"), ROBOT: struct.Struct("<9d")}
 _SIZES = {kind: _HEADER.size + 8 + body.size for kind, body in _VALUES.items()}
-# Description in an answer: kind of motion, fault of the request, number of setpoints, time of the
-# first setpoint, period between setpoints, time of the contact with the ball.
-_ANSWERED = struct.Struct("<BBBxddd")
+# Description in an answer: kind of motion, fault of the request, number of setpoints, reason why
+# there is no plan, time of the first setpoint, period between setpoints, time of the contact with
+# the ball.
+_ANSWERED = struct.Struct("<BBBBddd")
 FIELDS = {"pos": 3, "vel": 3, "acc": 3, "jerk": 3, "quat_wxyz": 4, "body_rate": 3, "thrust": 1}
 WIDTH = sum(FIELDS.values())
 
@@ -68,6 +69,20 @@ class Motion(enum.IntEnum):
     PLAN = 2  # a plan that meets the ball, followed by a trajectory to standstill
 
 
+class Reason(enum.IntEnum):
+    """Reason why an answer has no plan; `NONE` for an answer with a plan."""
+
+    NONE = 0
+    NO_BALL = 1  # no ball has been observed
+    UNCERTAIN = 2  # the ball's velocity is not known well enough
+    SEARCHING = 3  # the first search is running
+    TOO_FAR = 4  # the robot cannot be where the ball is at any time
+    NO_PLAN = 5  # no plan was found that keeps every limit
+    TOO_LATE = 6  # the plan was found too late to join the flown trajectory
+    NO_RECOVERY = 7  # no trajectory from the plan's end to standstill keeps every limit
+    DONE = 8  # the robot has hit or caught the ball
+
+
 @dataclasses.dataclass(frozen=True, slots=True)
 class Packet:
     """A decoded request of a client, whose header and length are valid."""
@@ -89,6 +104,7 @@ class Answer:
     sent: float  # [s], time at which the request was sent, by the sender's clock
     motion: Motion
     fault: Fault  # fault of the request
+    reason: Reason  # why the motion is not a plan
     begin: float  # [s], time of the first setpoint, by the sender's clock
     period: float  # [s], time between setpoints
     contact: float  # [s], time of the contact with the ball, sender's clock; NaN without a plan
@@ -136,12 +152,15 @@ def answer(
     packet: Packet,
     fault: Fault,
     motion: Motion,
+    reason: Reason,
     times: tuple[float, float, float],
     setpoints: np.ndarray,
 ) -> bytes:
     """Encode an answer; `times` [s]: first setpoint, period of setpoints, contact with the ball."""
     head = _HEADER.pack(MAGIC, VERSION, ANSWER, packet.ball, packet.sequence, packet.sent)
-    return head + _ANSWERED.pack(motion, fault, len(setpoints), *times) + setpoints.tobytes()
+    return (
+        head + _ANSWERED.pack(motion, fault, len(setpoints), reason, *times) + setpoints.tobytes()
+    )
 
 
 def read_answer(data: bytes) -> Answer | None:
@@ -150,8 +169,10 @@ def read_answer(data: bytes) -> Answer | None:
     if len(data) < first or data[:4] != MAGIC:
         return None
     _, version, kind, _, sequence, sent = _HEADER.unpack_from(data)
-    motion, fault, num, begin, period, contact = _ANSWERED.unpack_from(data, _HEADER.size)
+    described = _ANSWERED.unpack_from(data, _HEADER.size)
+    motion, fault, num, reason, begin, period, contact = described
     if (version, kind, len(data)) != (VERSION, ANSWER, first + 4 * WIDTH * num):
         return None
     setpoints = np.frombuffer(data, "<f4", offset=first).reshape(num, WIDTH)
-    return Answer(sequence, sent, Motion(motion), Fault(fault), begin, period, contact, setpoints)
+    kinds = Motion(motion), Fault(fault), Reason(reason)
+    return Answer(sequence, sent, *kinds, begin, period, contact, setpoints)

@@ -10,14 +10,14 @@ import contextlib
 import dataclasses
 import math
 import time
-from collections.abc import Hashable
+from collections.abc import Callable, Hashable
 from typing import Any, Generic
 
 import numpy as np
 
 from planner_jax.ball.flight import BallState
 from planner_jax.core.choices import require
-from planner_jax.core.protocol import is_solved
+from planner_jax.core.protocol import Status, is_solved
 from planner_jax.live import packets
 from planner_jax.live.arrivals import Arrivals
 from planner_jax.live.course import (
@@ -29,7 +29,16 @@ from planner_jax.live.course import (
     with_recovery,
     without_recovery,
 )
-from planner_jax.live.packets import BALL, MOST_SETPOINTS, SILENT, WIDTH, Fault, Motion, Packet
+from planner_jax.live.packets import (
+    BALL,
+    MOST_SETPOINTS,
+    SILENT,
+    WIDTH,
+    Fault,
+    Motion,
+    Packet,
+    Reason,
+)
 from planner_jax.live.report import Report
 from planner_jax.live.sight import Sight
 from planner_jax.live.strokes import CaseT, PlanT, Stroke
@@ -41,6 +50,10 @@ _ASTRAY = 0.5  # [m], distance from the planned position above which the robot i
 # plan is found only after its own starting time.
 _JOIN = (0.02, 0.2)
 _KNOWN = 0.3  # [m/s], standard deviation of a ball's velocity below which planning starts
+# States of the robot below this height [m], or with a greater acceleration [m/s^2], are absurd, and
+# so are states with a speed above this multiple of the speed limit.
+_LOWEST, _ABRUPT, _FASTEST = -1.0, 100.0, 3.0
+_FORGOTTEN = 1.0  # [s], after which the number of a ball that was hit or caught is another ball
 _NOTHING = np.zeros((0, WIDTH), np.float32)
 
 
@@ -65,7 +78,9 @@ class _Job(Generic[PlanT]):
 
 
 class LivePlanner(Generic[CaseT, PlanT]):
-    """Plans for one ball at a time, and answers packets with setpoints.
+    """Plans for one ball after another, and answers packets with setpoints.
+
+    Several balls may fly together. While the robot flies to one of them, the others wait.
 
     Args:
         stroke: the task to hit or to catch balls, such as `HitStroke()`.
@@ -102,7 +117,10 @@ class LivePlanner(Generic[CaseT, PlanT]):
         # end of the plan to standstill keeps the limits.
         self._before: _Flight[PlanT] | None = None
         self._job: _Job[PlanT] | None = None
-        self._done = -1  # number of the last ball that the robot hit or caught
+        # For each ball that the robot has hit or caught, the time [s] of its last observation.
+        self._done: dict[int, float] = {}
+        self._met: _Flight[PlanT] | None = None  # the flight that has hit or caught its ball
+        self._reason = Reason.NO_BALL
         self._sight.forget()
 
     def close(self) -> None:
@@ -110,17 +128,23 @@ class LivePlanner(Generic[CaseT, PlanT]):
         self._worker.shutdown(cancel_futures=True)
         self.report.end()
 
-    def warm_up(self) -> None:
-        """Compile all programs by planning for an invented ball; then count later compilations."""
+    def warm_up(self, say: Callable[[str], object] = lambda line: None) -> None:
+        """Compile all programs by planning for an invented ball; then count later compilations.
+
+        `say` receives a line of text after every part.
+        """
         state = np.asarray(self.stroke.case.head_state)
         self._setpoints(self._recover(state, 0.0), 0.0)
+        say("Compiled recoveries and setpoints, part 1 of 3.")
         ball = None
         for k in range(3):  # three observations of a ball that flies towards the robot
             pos = tuple(state[0] + (4.0 - 0.1 * k, 0.0, 0.1 * k))
             ball, _ = self._sight.see(0, pos, 0.01 * k, 0.01 * k)
         assert ball is not None
         plan = self._worker.submit(self.stroke.first, ball, state).result()
+        say("Compiled the estimate of a ball and plans from scratch, part 2 of 3.")
         self._worker.submit(self.stroke.again, plan, 0.01, ball).result()
+        say("Compiled plans that continue earlier ones, part 3 of 3.")
         self._sight.forget()
         self.report.begin()
 
@@ -170,6 +194,10 @@ class LivePlanner(Generic[CaseT, PlanT]):
     def _use_robot(self, packet: Packet, due: float, _: float) -> Fault:
         self._collect(due)
         pos, vel, acc = np.reshape(packet.values, (3, 3))
+        speed, rise = (float(np.linalg.norm(each)) for each in (vel, acc))
+        is_slow = speed <= _FASTEST * float(self._limits.speed) and rise <= _ABRUPT
+        if not is_slow or pos[2] < _LOWEST:
+            return Fault.ABSURD
         flight = self._flight
         if flight is not None:
             on_course = state_of(flight.course, max(packet.measured - flight.start, 0.0))
@@ -189,16 +217,22 @@ class LivePlanner(Generic[CaseT, PlanT]):
         return _Flight(course, start)
 
     def _use_ball(self, packet: Packet, due: float, received: float) -> Fault:
-        before = self._sight.number
+        begun, number = self._sight.begun, packet.ball
         with self.report.stages["estimate"].measure():
-            ball, fault = self._sight.see(packet.ball, packet.values, packet.measured, due)
-        self.report.counts["balls"] += self._sight.number != before
+            ball, fault = self._sight.see(number, packet.values, packet.measured, due)
+        self.report.counts["balls"] += self._sight.begun - begun
         self._collect(due)
+        if packet.measured - self._done.get(number, math.inf) > _FORGOTTEN:
+            del self._done[number]
+        if number in self._done:
+            self._done[number] = packet.measured
         flight = self._flight
         if ball is not None and flight is not None and self._job is None:
-            if self._is_worth_planning(flight, packet.ball, due):
-                found = self._worker.submit(self._search, ball, flight, packet.ball, due)
-                self._job = _Job(found, due, packet.ball)
+            if self._is_worth_planning(flight, number, due):
+                if self._reason in (Reason.NO_BALL, Reason.UNCERTAIN):
+                    self._reason = Reason.SEARCHING
+                found = self._worker.submit(self._search, ball, flight, number, due)
+                self._job = _Job(found, due, number)
         if self._job is not None:
             left = _PATIENCE * self.deadline - (time.perf_counter() - received)
             with contextlib.suppress(TimeoutError):
@@ -208,11 +242,14 @@ class LivePlanner(Generic[CaseT, PlanT]):
         return fault
 
     def _is_worth_planning(self, flight: _Flight[PlanT], ball: int, due: float) -> bool:
-        if not self._sight.is_known(_KNOWN):
+        if not self._sight.is_known(ball, _KNOWN):
+            if ball not in self._done:
+                self._reason = Reason.UNCERTAIN
             return False
         if flight.plan is not None and flight.ball == ball:
             return flight.contact - due >= self.stroke.shortest
-        return ball != self._done
+        is_busy = flight.plan is not None and due < flight.contact
+        return ball not in self._done and not (is_busy and self._sight.is_seen(flight.ball))
 
     def _search(
         self, ball: BallState, flight: _Flight[PlanT], number: int, due: float
@@ -229,6 +266,8 @@ class LivePlanner(Generic[CaseT, PlanT]):
         if is_solved(plan.status):
             return self._flight_of(plan, number, due)
         self.report.counts["refused"] += 1
+        is_too_far = plan.status in (Status.TOO_FAR, Status.OUT_OF_REACH)
+        self._reason = Reason.TOO_FAR if is_too_far else Reason.NO_PLAN
         return None
 
     def _flight_of(self, plan: PlanT, ball: int, due: float) -> _Flight[PlanT]:
@@ -238,15 +277,17 @@ class LivePlanner(Generic[CaseT, PlanT]):
     def _collect(self, due: float) -> None:
         flight, job = self._flight, self._job
         if flight is not None and flight.plan is not None and due >= flight.contact:
-            self._done = flight.ball
+            if flight is not self._met:
+                self._met, self._done[flight.ball], self._reason = flight, due, Reason.DONE
         if job is None or not job.found.done():
             return
         self._job = None
         found = job.found.result()
-        if found is None or flight is None or self._done == job.ball:
+        if found is None or flight is None or job.ball in self._done:
             return
         if due > job.start and not self._joins(flight, found, due):
             self.report.counts["unjoined"] += 1
+            self._reason = Reason.TOO_LATE
             return
         is_again = flight.plan is not None and flight.ball == job.ball
         self.report.counts["replans" if is_again else "plans"] += 1
@@ -262,6 +303,7 @@ class LivePlanner(Generic[CaseT, PlanT]):
             course, is_within = with_recovery(flight.plan.trajectory, self._gravity, self._limits)
         self.report.counts["endless"] += not is_within
         self._flight = dataclasses.replace(flight, course=course) if is_within else before
+        self._reason = self._reason if is_within else Reason.NO_RECOVERY
         self._before = None
 
     def _joins(self, flight: _Flight[PlanT], found: _Flight[PlanT], due: float) -> bool:
@@ -272,10 +314,12 @@ class LivePlanner(Generic[CaseT, PlanT]):
         flight = self._flight
         if flight is None or not math.isfinite(due):
             times = (packet.sent, self._period, math.nan)
-            return packets.answer(packet, fault, Motion.NONE, times, _NOTHING)
+            return packets.answer(packet, fault, Motion.NONE, self._reason, times, _NOTHING)
         motion = Motion.PLAN if due < flight.contact else Motion.SAFE
-        times = due, self._period, flight.contact if motion is Motion.PLAN else math.nan
-        return packets.answer(packet, fault, motion, times, self._setpoints(flight, due))
+        is_plan = motion is Motion.PLAN
+        times = due, self._period, flight.contact if is_plan else math.nan
+        reason = Reason.NONE if is_plan else self._reason
+        return packets.answer(packet, fault, motion, reason, times, self._setpoints(flight, due))
 
     def _setpoints(self, flight: _Flight[PlanT], due: float) -> np.ndarray:
         times: Any = np.float32(due - flight.start), np.float32(self._period)

@@ -42,9 +42,12 @@ class Server:
             raise OSError(error.errno, error.strerror, f"port {port}") from None
         self.port: int = self._socket.getsockname()[1]
 
-    def warm_up(self) -> None:
-        """Compile the planner's JAX programs, and discard packets that arrive meanwhile."""
-        self.planner.warm_up()
+    def warm_up(self, say: Callable[[str], object] = lambda line: None) -> None:
+        """Compile the planner's JAX programs, and discard packets that arrive meanwhile.
+
+        `say` receives a line of text after every part of the compilation.
+        """
+        self.planner.warm_up(say)
         self._socket.setblocking(False)
         with contextlib.suppress(BlockingIOError):
             while True:

@@ -1,5 +1,6 @@
-"""Kalman filter of one observed ball, which rejects outliers and restarts for another ball."""
+"""Kalman filters of observed balls, which reject outliers and false detections."""
 
+import dataclasses
 import math
 from typing import Any
 
@@ -19,8 +20,9 @@ _SPREAD = 15.0  # [m/s], assumed standard deviation of the velocity at the first
 _DENSITY = 0.01  # [m^2/s^3], power spectral density of accelerations not in the flight model
 # An observation is an outlier if its Mahalanobis distance from the prediction is above this number.
 _GATE = 5.0
-_OTHERS = 5  # number of consecutive outliers after which the filter deletes its estimate
-_FORGOTTEN = 0.3  # [s], time without an observation after which the filter deletes its estimate
+_DECAY = 0.8  # factor on an estimate's score at every observation of its ball
+_MOST = 3  # greatest number of estimates of a ball
+_FORGOTTEN = 0.3  # [s], time without an observation after which an estimate is deleted
 _LEAST = 3  # least number of observations from which the velocity counts as known
 
 
@@ -56,12 +58,28 @@ def _filter(flight: Flight, model: EkfModel, seen: Observation) -> Estimate:
     return Estimate(belief, is_outlier, jnp.sqrt(jnp.max(variances)), ball)
 
 
+@dataclasses.dataclass(eq=False)
+class _Track:
+    """A Kalman filter's estimate of one ball, or of what was detected in its place."""
+
+    number: int  # of the ball
+    belief: EkfState  # NumPy leaves
+    time: float  # [s], of the last observation that was used
+    num: int = 1  # number of observations that were used
+    spread: float = math.inf  # [m/s], greatest standard deviation of a velocity component
+    score: float = 1.0  # number of used observations, of which earlier ones count less
+
+
 class Sight:
-    """Estimate of position and velocity of one ball from its observed positions.
+    """Estimates of positions and velocities of balls from their observed positions.
+
+    An observation that contradicts all estimates of its ball starts another one. The estimate that
+    explains most of the latest observations is the ball; others, such as of a false detection that
+    stands still, are kept for a while.
 
     Args:
         flight: function (ball, duration, drag, gravity) -> ball after the duration.
-        drag: drag of the ball, in the unit that `flight` expects.
+        drag: drag of the balls, in the unit that `flight` expects.
         gravity: [m/s^2], magnitude.
         noise: [m], standard deviation of an observed coordinate.
     """
@@ -70,52 +88,73 @@ class Sight:
         self._flight, self._noise = flight, noise
         numbers = (drag, gravity, _DENSITY, noise)
         self._model = EkfModel(*(jnp.asarray(x, jnp.float32) for x in numbers))
+        self.begun = 0  # number of balls whose observation began
         self.forget()
 
     def forget(self) -> None:
-        """Delete the estimate; the next observation starts a new one."""
-        self._belief: EkfState | None = None  # NumPy leaves
-        self.number: int | None = None
-        self.spread = math.inf  # [m/s], greatest standard deviation of a velocity component
-        self._time = -math.inf
-        self._num = self._outliers = 0
+        """Delete all estimates; the next observation starts a new one."""
+        self._tracks: list[_Track] = []  # of each ball the best estimate is the first one
 
-    def is_known(self, spread: float) -> bool:
+    def _of(self, number: int) -> list[_Track]:
+        return [track for track in self._tracks if track.number == number]
+
+    def _sort(self) -> None:
+        self._tracks.sort(key=lambda track: -track.score)
+
+    def is_known(self, number: int, spread: float) -> bool:
         """Test whether the velocity's standard deviation is at most `spread` [m/s] on each axis."""
-        return self._num >= _LEAST and self.spread <= spread
+        return any(t.num >= _LEAST and t.spread <= spread for t in self._of(number)[:1])
+
+    def is_seen(self, number: int) -> bool:
+        """Test whether a ball was observed within 0.3 s before the last observation of any ball."""
+        return bool(self._of(number))
 
     def see(
         self, number: int, pos: tuple[float, ...], measured: float, until: float
     ) -> tuple[BallState | None, Fault]:
-        """Update the estimate, and predict the ball at the time `until` [s].
+        """Update the estimates, and predict the ball at the time `until` [s].
 
         The ball `number` was observed at `pos` (3,) [m] at the time `measured` [s]. Returns the
         predicted ball, or None at the first observation and after a fault; and the fault, which is
         the reason why the observation is not used, or `Fault.NONE`.
         """
-        belief = self._belief
-        if belief is None or number != self.number or measured - self._time > _FORGOTTEN:
+        self._tracks = [t for t in self._tracks if measured - t.time <= _FORGOTTEN]
+        own = self._of(number)
+        if not own:
+            self.begun += 1
             self._start(number, pos, measured)
             return None, Fault.NONE
-        if measured <= self._time:
+        if measured <= max(track.time for track in own):
             return None, Fault.STALE
-        times_and_pos = measured - self._time, pos, max(until - measured, 0.0)
+        for track in own:
+            track.score *= _DECAY
+        for track in own:
+            if (ball := self._update(track, pos, measured, until)) is not None:
+                self._sort()
+                is_best = self._of(number)[0] is track
+                return (ball, Fault.NONE) if is_best else (None, Fault.OUTLIER)
+        if len(own) >= _MOST:
+            self._tracks.remove(min(own, key=lambda each: each.score))
+        self._start(number, pos, measured)
+        return None, Fault.OUTLIER
+
+    def _update(
+        self, track: _Track, pos: tuple[float, ...], measured: float, until: float
+    ) -> BallState | None:
+        """Update an estimate, and return the predicted ball; None if `pos` is an outlier."""
+        times_and_pos = measured - track.time, pos, max(until - measured, 0.0)
         numbers: Any = [np.asarray(x, np.float32) for x in times_and_pos]
-        seen = Observation(belief, *numbers)
+        seen = Observation(track.belief, *numbers)
         found: Estimate = call_packed(_filter, self._flight, self._model, seen)
         if found.is_outlier:
-            self._outliers += 1
-            if self._outliers >= _OTHERS:
-                self._start(number, pos, measured)
-            return None, Fault.OUTLIER
-        self._belief, self._time, self.spread = found.belief, measured, float(found.spread)
-        self._num, self._outliers = self._num + 1, 0
-        return found.ball, Fault.NONE
+            return None
+        track.belief, track.time, track.spread = found.belief, measured, float(found.spread)
+        track.num, track.score = track.num + 1, track.score + 1.0
+        return found.ball
 
     def _start(self, number: int, pos: tuple[float, ...], measured: float) -> None:
         stds = [self._noise] * 3 + [_SPREAD] * 3
         mean: Any = np.array([*pos, 0.0, 0.0, 0.0], np.float32)
         covariance: Any = np.diag(np.square(stds)).astype(np.float32)
-        self._belief = EkfState(mean=mean, covariance=covariance)
-        self.number, self._time, self.spread = number, measured, math.inf
-        self._num, self._outliers = 1, 0
+        self._tracks.append(_Track(number, EkfState(mean=mean, covariance=covariance), measured))
+        self._sort()
