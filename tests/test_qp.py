@@ -78,9 +78,10 @@ def test_the_least_square_sum_on_a_line_beside_a_bound_and_a_row_that_the_line_d
 @pytest.mark.parametrize("given", [0, GIVEN], ids=["no equalities", "equalities"])
 def test_a_linear_term_is_a_shift_of_the_unknowns(given):
     square = HESSIAN + np.eye(UNKNOWNS)
-    linear, bounds = np.arange(UNKNOWNS) - 5.0, np.full(ROWS, 0.3)
+    linear, allowed = np.arange(UNKNOWNS) - 5.0, np.full(UNKNOWNS, 0.1)
+    bounds = np.abs(MATRIX @ allowed) + 0.3
     shift = np.linalg.solve(square, linear)  # x' Q x / 2 + c' x with x = z - shift
-    right = EQUALITIES[:given] @ np.ones(UNKNOWNS)
+    right = EQUALITIES[:given] @ allowed
     with_term = qp_template(square, EQUALITIES[:given], MATRIX, linear=linear)
     without = qp_template(square, EQUALITIES[:given], MATRIX)
     found = solve_qp(with_term, jnp.asarray(right), jnp.asarray(-bounds), jnp.asarray(bounds))

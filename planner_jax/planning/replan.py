@@ -14,6 +14,7 @@ from planner_jax.core.origin import Located, move, with_origin, without_origin
 from planner_jax.core.planner import CaseT, PlanT, require_planner
 from planner_jax.core.rules import Case
 from planner_jax.planning.plan import plan
+from planner_jax.trajectory.polynomial import PiecewisePolynomial, states_at
 
 
 @struct.dataclass
@@ -48,6 +49,15 @@ def check_elapsed(cases: Case, elapsed: PyTree) -> np.ndarray:
     if not most < np.inf:
         raise ArgumentError("elapsed", "finite", most)
     return elapsed
+
+
+def planned_state(trajectory: PiecewisePolynomial, elapsed: np.ndarray) -> np.ndarray:
+    """Return position, velocity, acceleration and jerk (..., 4, 3) as planned at `elapsed` [s].
+
+    After the end of the trajectory, the state is that at the end.
+    """
+    end = np.sum(trajectory.durations, axis=-1)
+    return np.asarray(states_at(trajectory, np.asarray(np.minimum(elapsed, end))))
 
 
 def resolve_argument(name: str, given: PyTree, own: PyTree, elapsed: np.ndarray) -> np.ndarray:

@@ -19,7 +19,7 @@ from planner_jax.core.arithmetic import Numbers
 from planner_jax.core.checks import require_path
 from planner_jax.optimise.planner import OptimisedPlanner
 from planner_jax.optimise.settings import Evaluation, LbfgsConfig, Round
-from planner_jax.planning.replan import Replanning, check_elapsed, resolve_argument
+from planner_jax.planning.replan import Replanning, check_elapsed, planned_state, resolve_argument
 from planner_jax.robot.quadrotor import body_z
 from planner_jax.task.catch.case import CatchCase
 from planner_jax.task.catch.context import CatchContext, targets_at
@@ -96,11 +96,11 @@ class ReplanCatch(OptimisedPlanner):
         >= 0. Caught targets become absent; the remaining targets keep their order. `targets` are
         the targets' paths as estimated at the present, which is time 0 of these paths. `head_state`
         (..., 4, 3) has position, velocity, acceleration and jerk of the quadrotor, by default as
-        planned.
+        planned, after the end of a plan as at its end.
         """
         elapsed = check_elapsed(cases, elapsed)
         require_path("targets", targets, np.shape(cases.present), 3)
-        own = polynomial.states_at(previous.trajectory, elapsed)
+        own = planned_state(previous.trajectory, elapsed)
         head_state = resolve_argument("head_state", head_state, own, elapsed)
         since = elapsed[..., None]
         order, times = np.asarray(previous.order), np.asarray(previous.times)

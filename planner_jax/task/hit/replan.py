@@ -18,13 +18,13 @@ from planner_jax.ball.flight import BallState
 from planner_jax.core.checks import require_beginning, require_kind
 from planner_jax.optimise.planner import OptimisedPlanner
 from planner_jax.optimise.settings import Evaluation, LbfgsConfig, Round
-from planner_jax.planning.replan import Replanning, check_elapsed, resolve_argument
+from planner_jax.planning.replan import Replanning, check_elapsed, planned_state, resolve_argument
 from planner_jax.robot.quadrotor import net_thrust, tangent_basis
 from planner_jax.task.hit.case import HitCase
 from planner_jax.task.hit.context import HitContext
 from planner_jax.task.hit.default_planner import ExactHit
 from planner_jax.task.hit.plan import HitPlan
-from planner_jax.trajectory.polynomial import evaluate, states_at, total_duration
+from planner_jax.trajectory.polynomial import evaluate, total_duration
 
 _SHORTEST = 0.01  # [s] least time to the impact in a starting point
 # Step lengths that L-BFGS tries, relative to its proposed step. Small lengths are needed, because
@@ -73,10 +73,10 @@ class ReplanHit(OptimisedPlanner):
         `cases` are one hit or a batch of B hits as they were planned. `ball` is the new estimate of
         the ball's state, leaves (3,) or (B, 3), and `drag` [1/m] its drag coefficient, by default
         as in `cases`. `head_state` (..., 4, 3) has position, velocity, acceleration and jerk of the
-        quadrotor, by default as planned.
+        quadrotor, by default as planned, after the end of a plan as at its end.
         """
         elapsed = check_elapsed(cases, elapsed)
-        own = states_at(previous.trajectory, elapsed)
+        own = planned_state(previous.trajectory, elapsed)
         head_state = resolve_argument("head_state", head_state, own, elapsed)
         drag = resolve_argument("drag", drag, cases.drag, elapsed)
         require_kind("ball", ball, BallState)
