@@ -252,6 +252,14 @@ def test_an_answer_without_a_plan_has_the_reason(warm, path):
     assert caught[-1].reason is Reason.DONE and last_plan(caught).reason is Reason.NONE
 
 
+@pytest.mark.parametrize("acc", [-9.81, -30.0])
+def test_setpoints_from_free_fall_and_upside_down_have_unit_quaternions(warm, acc):
+    throw = Throw(warm, None, 61)
+    answer = throw.send(throw.packet(ROBOT, (*HOME, *[0.0] * 5, acc)))
+    np.testing.assert_allclose(np.linalg.norm(answer.column("quat_wxyz"), axis=1), 1.0, rtol=1e-5)
+    assert answer.motion is Motion.SAFE and np.isfinite(answer.setpoints).all()
+
+
 @pytest.mark.parametrize(
     "state", [(0, 0, -5, *[0] * 6), (*HOME, 60, 0, 0, 0, 0, 0), (*HOME, 0, 0, 0, 0, 0, -300)]
 )
