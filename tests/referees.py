@@ -18,7 +18,7 @@ def tree(leaves, root="", **optional):
 def flight(leaves, **optional):
     case = tree(leaves, extras=(), **optional)
     limits = dict.fromkeys(("acceleration", "min_thrust", "max_thrust", "rotors", "max_tilt"))
-    limits["recovery_tilt"] = None
+    limits |= {"recovery_tilt": None, "air": None}
     case.limits = SimpleNamespace(**limits | vars(case.limits))
     case.trajectory = SimpleNamespace(coeffs=case.coeffs, durations=case.durations)
     case.recovery = None

@@ -61,7 +61,7 @@ def test_recoveries_tilt_by_40_degrees_unless_the_limits_or_the_start_say_otherw
         ({"recovery_tilt": 80.0, "max_tilt": 70.0}, 70.0),
     ):
         of = limits.replace(**{name: np.full(3, np.radians(x)) for name, x in fields.items()})
-        found = of.of_recovery(start, gravity)
+        found = of.of_recovery(start[:, None] * np.array([[0.0], [0.0], [1.0], [0.0]]), gravity)
         expected = np.maximum([10.0, 70.0, 130.0], usual)
         expected = np.minimum(expected, fields.get("max_tilt", 180.0))
         np.testing.assert_allclose(np.degrees(found.max_tilt), expected, rtol=1e-6)

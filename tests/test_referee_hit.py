@@ -35,7 +35,9 @@ def join_states(head, tail, duration):
     return list(map(Polynomial, np.linalg.solve(np.array(rows), np.concatenate([head, tail])).T))
 
 
-def volley(*, target=(3.0, 0.0, 0.0), flight_time=1.5, ball_vel=BALL_VEL, pieces=NUM_PIECES):
+def volley(
+    *, target=(3.0, 0.0, 0.0), flight_time=1.5, ball_vel=BALL_VEL, pieces=NUM_PIECES, air=None
+):
     """Return arrays (1, ...) of a case and a plan by name, computed backwards from the impact."""
     target = np.array(target)
     after = (target - CONTACT) / flight_time + [0.0, 0.0, 0.5 * GRAVITY * flight_time]
@@ -47,6 +49,8 @@ def volley(*, target=(3.0, 0.0, 0.0), flight_time=1.5, ball_vel=BALL_VEL, pieces
     tail[0] = CONTACT - RACKET_HEIGHT * normal
     tail[1] = normal_speed * normal
     tail[2] = 1.1 * GRAVITY * normal - [0.0, 0.0, GRAVITY]
+    if air is not None:
+        tail[2] -= air["limits.air.drag"] * (tail[1] - air["limits.air.wind"])
     back = fly(CONTACT, np.asarray(ball_vel), -IMPACT_TIME).y[:, -1]
     durations = IMPACT_TIME * np.arange(2, pieces + 2) / np.arange(2, pieces + 2).sum()
     leaves = {
@@ -59,6 +63,7 @@ def volley(*, target=(3.0, 0.0, 0.0), flight_time=1.5, ball_vel=BALL_VEL, pieces
         **{"limits.body_rate": 8.0, "limits.min_height": 0.25},
         "hit_limits.hitting_speed": [4.0, 3.0, 4.0],
         **{"hit_limits.min_apex": 2.2, "hit_limits.max_apex": 6.2},
+        **(air or {}),
     }
     return {name: np.asarray(leaf, float)[None] for name, leaf in leaves.items()}
 
@@ -98,6 +103,15 @@ def body_rates(leaves):
     skew = np.swapaxes(attitude[1:-1], 1, 2) @ change
     rates = np.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], axis=1)
     return times[1:-1], np.linalg.norm(rates, axis=1)
+
+
+def test_a_volley_in_wind_succeeds_only_if_the_referee_knows_the_wind():
+    names = {"drag": 0.4, "thrust_drag": 0.8, "wind": np.array([2.0, -2.0, 0.5])}
+    leaves = volley(air={f"limits.air.{name}": value for name, value in names.items()})
+    leaves["limits.acceleration"] += 10.0
+    assert assert_good(leaves).contact_error[0] < 1e-7
+    still = {name: leaf for name, leaf in leaves.items() if "air" not in name}
+    assert judge(still).contact_error[0] > 1e-3
 
 
 def test_a_volley_solved_backwards_succeeds():

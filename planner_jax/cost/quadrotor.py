@@ -19,7 +19,14 @@ from jaxtyping import PyTree
 from planner_jax.core.arithmetic import Components, at_least, components, inverse_sqrt, reciprocal
 from planner_jax.cost.along import Along, greatest_along
 from planner_jax.cost.extras import Extra, extra_excess, extra_rate, greatest_extras, num_limits
-from planner_jax.robot.quadrotor import QuadrotorLimits, body_rate_squared, rotor_thrusts
+from planner_jax.robot.quadrotor import (
+    QuadrotorLimits,
+    add_drag,
+    add_drag_rate,
+    body_rate_squared,
+    rotor_thrusts,
+    thrust_in_air,
+)
 from planner_jax.trajectory.polynomial import Motion
 from planner_jax.trajectory.proportional_minco import ProportionalMinco
 
@@ -147,10 +154,39 @@ def _rotor_excess(motion: Motion, gravity: Array, limits: QuadrotorLimits) -> tu
     """Return f / f_max - 1 for each rotor's thrust f (N,), then (f_min - f) / f_max for each."""
     rotors = limits.rotors
     assert rotors is not None
-    thrusts = rotor_thrusts(motion.acc, motion.jerk, motion.snap, gravity, rotors)
+    air, load = limits.air, _load(motion, limits)
+    pull = None if air is None else thrust_in_air(air, motion.vel, load.acc, gravity)
+    thrusts = rotor_thrusts(load.acc, load.jerk, load.snap, gravity, rotors, pull)
     unit = reciprocal(rotors.max_thrust)
     above = tuple(thrust * unit - 1.0 for thrust in thrusts)
     return (*above, *((rotors.min_thrust - thrust) * unit for thrust in thrusts))
+
+
+def _load(motion: Motion, limits: QuadrotorLimits) -> Motion:
+    """Return the motion that needs the same attitude without drag and wind."""
+    if limits.air is None:
+        return motion
+    snap = motion.snap
+    return dataclasses.replace(
+        motion,
+        acc=add_drag(limits.air, motion.vel, motion.acc),
+        jerk=add_drag_rate(limits.air, motion.acc, motion.jerk),
+        snap=None if snap is None else add_drag_rate(limits.air, motion.jerk, snap),
+    )
+
+
+def _rate_excess(motion: Motion, gravity: Array, limits: QuadrotorLimits) -> tuple[Array]:
+    load = _load(motion, limits)
+    return (body_rate_excess(load.acc, load.jerk, gravity, limits),)
+
+
+def _thrust_excess(motion: Motion, gravity: Array, limits: QuadrotorLimits) -> tuple[Array, Array]:
+    least, most = limits.thrust_bounds
+    if limits.air is None:
+        return thrust_excess(motion.acc, gravity, least, most)
+    load = _load(motion, limits)
+    squared = thrust_in_air(limits.air, motion.vel, load.acc, gravity) ** 2
+    return 1.0 - squared * reciprocal(least) ** 2, squared * reciprocal(most) ** 2 - 1.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -170,25 +206,15 @@ _KINDS = (
         lambda motion, _, own: (acceleration_excess(motion.acc, own),),
         (2,),
     ),
-    _Kind(
-        "body_rate",
-        (_ABOVE,),
-        lambda motion, gravity, own: (body_rate_excess(motion.acc, motion.jerk, gravity, own),),
-        (2, 3),
-    ),
-    _Kind(
-        "max_thrust",
-        (_BELOW, _ABOVE),
-        lambda motion, gravity, own: thrust_excess(motion.acc, gravity, *own.thrust_bounds),
-        (2,),
-    ),
+    _Kind("body_rate", (_ABOVE,), _rate_excess, (2, 3)),
+    _Kind("max_thrust", (_BELOW, _ABOVE), _thrust_excess, (2,)),
     _Kind(
         "min_height", (_PLAIN,), lambda motion, _, own: (ground_excess(motion.height, own),), (0,)
     ),
     _Kind(
         "max_tilt",
         (_ABOVE,),
-        lambda motion, gravity, own: (tilt_excess(motion.acc, gravity, own),),
+        lambda motion, gravity, own: (tilt_excess(_load(motion, own).acc, gravity, own),),
         (2,),
     ),
     _Kind("rotors", (_PLAIN,) * 2, _rotor_excess, (2, 3, 4)),  # of one rotor; the last
@@ -197,6 +223,12 @@ _KINDS = (
 
 def _kinds(limits: QuadrotorLimits) -> list[_Kind]:
     kinds = [kind for kind in _KINDS if vars(limits)[kind.field] is not None]
+    if limits.air is not None:  # the drag depends on the velocity too
+        of_thrust = ("body_rate", "max_thrust", "max_tilt", "rotors")
+        kinds = [
+            dataclasses.replace(kind, orders=(1, *kind.orders)) if kind.field in of_thrust else kind
+            for kind in kinds
+        ]
     if limits.rotors is not None:
         measures = limits.rotors.mixer.shape[-2] * kinds[-1].measures
         kinds[-1] = dataclasses.replace(kinds[-1], measures=measures)

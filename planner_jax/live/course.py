@@ -14,7 +14,15 @@ from planner_jax.live.packets import FIELDS
 from planner_jax.planning.programs import solve_one
 from planner_jax.recovery.case import RecoveryCase
 from planner_jax.recovery.planner import RecoveryPlanner
-from planner_jax.robot.quadrotor import QuadrotorLimits, QuadrotorPlan, setpoint_at
+from planner_jax.robot.quadrotor import (
+    Air,
+    QuadrotorLimits,
+    QuadrotorPlan,
+    add_drag,
+    setpoint_at,
+    thrust_in_air,
+    tilt_quaternion,
+)
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, states_at, total_duration
 
 _REST = RecoveryPlanner()
@@ -26,12 +34,13 @@ class Course:
 
     path: PiecewisePolynomial  # M pieces of a plan, then the pieces of the recovery trajectory
     gravity: Array  # () [m/s^2], magnitude
+    air: Air | None = None  # drag and wind
 
 
-def without_recovery(path: PiecewisePolynomial, gravity: Array) -> Course:
+def without_recovery(path: PiecewisePolynomial, gravity: Array, air: Air | None = None) -> Course:
     """Convert a plan's path to a course whose recovery trajectory (to standstill) lasts 0 s."""
     end = state_on(path, np.sum(path.durations))
-    return Course(_join(path, _stand_still(_REST.num_pieces, end[0])), gravity)
+    return Course(_join(path, _stand_still(_REST.num_pieces, end[0])), gravity, air)
 
 
 def with_recovery(
@@ -39,9 +48,9 @@ def with_recovery(
 ) -> tuple[Course, bool]:
     """Append a trajectory to standstill to a plan's path; return both, and if the limits hold."""
     state: Any = state_on(path, np.sum(path.durations))
-    case = RecoveryCase(state, state[0], gravity, limits.of_recovery(state[2], gravity))
+    case = RecoveryCase(state, state[0], gravity, limits.of_recovery(state, gravity))
     rest: QuadrotorPlan = solve_one(_REST, case, _REST.rounds[0])
-    return Course(_join(path, rest.trajectory), gravity), bool(is_solved(rest.status))
+    return Course(_join(path, rest.trajectory), gravity, limits.air), bool(is_solved(rest.status))
 
 
 def recovery_from(
@@ -84,11 +93,15 @@ def setpoints_of(num: int, _: None, query: Query) -> Float[Array, "K 20"]:
     end = total_duration(path)
 
     def at(time: Array) -> Array:
-        moving = setpoint_at((path, gravity), jnp.minimum(time, end))
+        moving = setpoint_at((path, gravity, query.course.air), jnp.minimum(time, end))
         zero = jnp.zeros(3, time.dtype)
         upright = jnp.asarray([1.0, 0.0, 0.0, 0.0], time.dtype)
         still = {**dict.fromkeys(("vel", "acc", "jerk", "body_rate"), zero), "pos": moving["pos"]}
         still |= {"quat_wxyz": upright, "thrust": gravity}
+        if (air := query.course.air) is not None:  # hover against the wind
+            load = add_drag(air, zero, zero)
+            still["quat_wxyz"] = tilt_quaternion(load, gravity)
+            still["thrust"] = thrust_in_air(air, zero, load, gravity)
         rows = [jnp.where(time < end, moving[name], still[name]) for name in FIELDS]
         return jnp.concatenate([row.ravel() for row in rows])
 

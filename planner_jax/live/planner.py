@@ -271,7 +271,7 @@ class LivePlanner(Generic[CaseT, PlanT]):
         return None
 
     def _flight_of(self, plan: PlanT, ball: int, due: float) -> _Flight[PlanT]:
-        course = without_recovery(plan.trajectory, self._gravity)
+        course = without_recovery(plan.trajectory, self._gravity, self._limits.air)
         return _Flight(course, due, plan, due + self.stroke.contact(plan), ball)
 
     def _collect(self, due: float) -> None:

@@ -85,7 +85,7 @@ def recovery_cases(cases: PyTree, plans: PyTree) -> RecoveryCase:
         head_state=states,
         home=cases.head_state[:, 0],
         gravity=cases.gravity,
-        limits=cases.limits.of_recovery(states[:, 2], cases.gravity),
+        limits=cases.limits.of_recovery(states, cases.gravity),
         extras=cases.extras,
     )
 

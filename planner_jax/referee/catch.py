@@ -316,9 +316,14 @@ def _test_order(
 
 def _judge_catches(case, pieces, held, ends, net_test: str, tolerances: dict) -> tuple[dict, dict]:
     each = pieces.durations.shape[1] // held.shape[1]
-    tail = np.moveaxis(pieces.coeffs[:, :, each - 1 :: each], -1, 0)
     spans = pieces.durations[:, each - 1 :: each]
-    pos, acc = (np.moveaxis(judging.derivative(tail, spans, order), 0, -1) for order in (0, 2))
+    pos, acc = (
+        np.moveaxis(judging.derivative(np.moveaxis(tail, -1, 0), spans, order), 0, -1)
+        for tail, order in (
+            (pieces.coeffs[:, :, each - 1 :: each], 0),
+            (quadrotor.load_pieces(pieces, case).coeffs[:, :, each - 1 :: each], 2),
+        )
+    )
     thrust = acc + case["gravity"][:, None, None] * [0.0, 0.0, 1.0]
     size = np.linalg.norm(thrust, axis=-1, keepdims=True)
     # Without thrust the net's axis has no direction: it is set to 0, and the angle is set to pi.

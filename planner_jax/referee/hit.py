@@ -215,6 +215,8 @@ def _judge_impact(case: dict, drag_after_impact: bool, tolerances: dict) -> tupl
         state = _ball_step(state, end / _INCOMING_STEPS, drag, gravity)
     tail = case["coeffs"][:, -1].transpose(1, 2, 0)
     pos, vel, normal = (judging.derivative(tail, durations[:, -1], order) for order in range(3))
+    if "limits.air.drag" in case:  # the thrust is along a + g e_3 + d (v - w)
+        normal += case["limits.air.drag"] * (vel - case["limits.air.wind"].T)
     normal[2] += gravity
     # Without thrust the racket's normal is set to zero. The ball's speed along it is 0, and the
     # plan fails the test "wrong face", which requires a negative speed.

@@ -81,6 +81,36 @@ def append_recovery(pieces: Pieces, case: dict) -> Pieces:
     )
 
 
+def load_pieces(pieces: Pieces, case: dict) -> Pieces:
+    """Return pieces q whose second derivative is  a + d (v - w) , or `pieces` if there is no air.
+
+    Thrust direction and body rate of q without drag are those of `pieces` with the drag d [1/s]
+    across the thrust and the wind w [m/s] [Faessler2018]. For the position p,
+    q = p + d (integral of p from 0 to t) - d w t^2 / 2 .
+    """
+    if "limits.air.drag" not in case:
+        return pieces
+    drag, wind = case["limits.air.drag"][:, None], case["limits.air.wind"].T[:, :, None]
+    coeffs = np.pad(pieces.coeffs, [(0, 0)] * 3 + [(0, 1)])
+    coeffs[..., 1:] += drag[..., None] * pieces.coeffs / np.arange(1, coeffs.shape[-1])
+    coeffs[..., 2] -= 0.5 * drag * wind
+    return dataclasses.replace(pieces, coeffs=coeffs)
+
+
+def thrust_along(pieces: Pieces, case: dict, u: np.ndarray) -> np.ndarray:
+    """Return the thrust per unit mass (B, M, S) [m/s^2] against gravity, drag and wind.
+
+    It is  n . (a + g e_3 + d_z (v - w))  for the thrust direction n, at S fractions of the pieces.
+    """
+    _, vel, acc, _ = _motion(pieces, u)
+    direction = _motion(load_pieces(pieces, case), u)[2]
+    for each in (acc, direction):
+        each[2] += case["gravity"][:, None, None]
+    wind, drag = case["limits.air.wind"].T[:, :, None, None], case["limits.air.thrust_drag"]
+    force = acc + drag[:, None, None] * (vel - wind)
+    return (direction * force).sum(axis=0) / np.sqrt(_norm_squared(direction))
+
+
 MOTION_SENTENCES = {
     "head state": "the trajectory starts {excess:.3g} m off the head state",
     "continuity": "the trajectory jumps by {excess:.3g} m at {time:.3f} s",
@@ -139,6 +169,9 @@ def read_flight(cases, plans) -> dict[str, np.ndarray]:
         shapes |= {"inertia": ((3,), (6,))[np.shape(rotors.inertia)[-1:] == (6,)]}
         shapes |= {"mixer": (*np.shape(rotors.mixer)[-2:-1], 4)}
         leaves |= read_leaves(rotors, shapes, num_lanes, "limits.rotors.")
+    if (air := cases.limits.air) is not None:
+        shapes = {"drag": (), "thrust_drag": (), "wind": (3,)}
+        leaves |= read_leaves(air, shapes, num_lanes, "limits.air.")
     if plans.recovery is not None:
         coeffs = check_coeffs(plans.recovery.coeffs)
         shapes = {"coeffs": coeffs.shape[1:], "durations": coeffs.shape[1:2]}
@@ -358,7 +391,14 @@ def judge_motion(
     Returns:
         The measurements of `FlightVerdict`, and tests (failed, excess, time), by name.
     """
-    found = peaks(pieces, case["gravity"], intervals)
+    found, load = peaks(pieces, case["gravity"], intervals), load_pieces(pieces, case)
+    u = np.linspace(0.0, 1.0, intervals + 1)
+    if load is not pieces:
+        found["body rate"] = peaks(load, case["gravity"], intervals)["body rate"]
+        thrust = thrust_along(pieces, case, u)
+        for name, sign in (("thrust", 1.0), ("weakness", -1.0)):
+            top, greatest, _ = _tops(sign * thrust**2)
+            found[name] = greatest, _time(pieces, top, u)
     head, jump, jump_time, scale = joint_errors(pieces, case["head_state"])
     measured = {
         "max_speed": np.sqrt(found["speed"][0]),
@@ -370,7 +410,6 @@ def judge_motion(
         "continuity_error": jump,
         "head_error": head,
     }
-    u = np.linspace(0.0, 1.0, intervals + 1)
     num = len(head)
     beyond, at, measured["worst_extra"] = np.full(num, -1.0), np.zeros(num), np.full(num, -1)
     if extras:
@@ -404,7 +443,7 @@ def judge_motion(
         measured, tests = measured | of_rotors, tests | rotor_tests
     else:
         measured |= dict.fromkeys(("min_rotor_thrust", "max_rotor_thrust"), np.full(num, np.nan))
-    measured["max_tilt"], found_tilt = _judge_tilt(case, pieces, u, relative)
+    measured["max_tilt"], found_tilt = _judge_tilt(case, load, u, relative)
     return measured, tests | found_tilt | _judge_rest(case, pieces, continuity)
 
 

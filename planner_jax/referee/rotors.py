@@ -8,7 +8,7 @@ planners, which compute it from the snap.
 import numpy as np
 
 from planner_jax.referee.judging import cut, derivative
-from planner_jax.referee.quadrotor import Pieces
+from planner_jax.referee.quadrotor import Pieces, load_pieces, thrust_along
 
 _MOMENT = 1e-5  # [s], half the step of the central difference of body rates
 _NUMBERS = 250_000  # greatest number of samples computed at once, so that they fit the cache
@@ -36,7 +36,12 @@ def judge_rotors(pieces: Pieces, case: dict, u: np.ndarray, relative: float) -> 
 def _rotor_range(pieces: Pieces, case: dict, u: np.ndarray) -> tuple[np.ndarray, ...]:
     times = pieces.durations[:, :, None] * u
     body = (case[f"limits.rotors.{name}"] for name in ("mass", "inertia", "mixer"))
-    thrusts = rotor_thrusts(pieces.coeffs, times, case["gravity"], *body)
+    load, (mass, inertia, mixer) = load_pieces(pieces, case), body
+    thrusts = rotor_thrusts(load.coeffs, times, case["gravity"], mass, inertia, mixer)
+    if load is not pieces:  # the drag along the thrust adds to the total thrust only
+        pull = _pull_and_rate(load.coeffs, times, case["gravity"])[0]
+        more = thrust_along(pieces, case, u) - np.linalg.norm(pull, axis=-1)
+        thrusts += np.einsum("b,bi,bms->bmsi", mass, mixer[:, :, 0], more)
     lanes, at = np.arange(len(thrusts)), (times + pieces.starts[:, :, None]).reshape(len(times), -1)
     found = []
     for rows, sign in ((thrusts.min(axis=-1), 1.0), (thrusts.max(axis=-1), -1.0)):

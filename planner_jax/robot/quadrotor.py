@@ -45,6 +45,19 @@ class RotorLimits:
 
 
 @struct.dataclass
+class Air:
+    """Linear drag of the rotors in a constant wind: forces that no trajectory can avoid.
+
+    The drag per unit mass is  -D (v - w)  for the velocity v and the wind w. The matrix D has the
+    eigenvalue `drag` across the thrust, and `thrust_drag` along it [Faessler2018].
+    """
+
+    drag: Array  # () [1/s], across the thrust
+    thrust_drag: Array  # () [1/s], along the thrust
+    wind: Array  # (3,) [m/s], velocity of the air
+
+
+@struct.dataclass
 class QuadrotorLimits:
     """Limits of a quadrotor; None means no limit.
 
@@ -62,6 +75,7 @@ class QuadrotorLimits:
     rotors: RotorLimits | None = None
     max_tilt: Array | None = None  # () [rad], greatest tilt: angle between thrust and vertical
     recovery_tilt: Array | None = None  # () [rad], greatest tilt of recoveries; None: 40 degrees
+    air: Air | None = None  # drag and wind; None: there is neither
 
     @property
     def thrust_bounds(self) -> tuple[Array, Array]:
@@ -80,19 +94,56 @@ class QuadrotorLimits:
             limits["max_thrust"] = gravity + factor * (self.max_thrust - gravity)
         return dataclasses.replace(self, **limits)
 
-    def of_recovery(self, acc: Array, gravity: Array) -> "QuadrotorLimits":
-        """Return the limits of a recovery that starts at an acceleration (..., 3) [m/s^2].
+    def of_recovery(self, state: Array, gravity: Array) -> "QuadrotorLimits":
+        """Return the limits of a recovery that starts at a state (..., 4, 3), position to jerk.
 
         The greatest tilt is `recovery_tilt`, but at least 10 degrees more than the tilt at the
         start, since the body may rotate away from upright there, and at most `max_tilt`.
         """
-        xp = numpy_of(acc, gravity)
+        xp = numpy_of(state, gravity)
+        acc = add_drag(self.air, state[..., 1, :], state[..., 2, :])
         start = xp.arctan2(xp.hypot(acc[..., 0], acc[..., 1]), acc[..., 2] + gravity)
         tilt = RECOVERY_TILT if self.recovery_tilt is None else self.recovery_tilt
         tilt = xp.maximum(start + MORE_TILT, tilt)
         if self.max_tilt is not None:
             tilt = xp.minimum(tilt, self.max_tilt)
         return dataclasses.replace(self, max_tilt=tilt.astype(start.dtype), recovery_tilt=None)
+
+
+def velocity_in_air(air: Air, vel: Array) -> Array:
+    """Return the velocity v - w relative to the air, for velocities (..., 3) [m/s]."""
+    return vel - air.wind.reshape((1,) * (vel.ndim - air.wind.ndim) + air.wind.shape)
+
+
+def add_drag(air: Air | None, vel: Array, acc: Array) -> Array:
+    """Return a + d (v - w): without drag, this acceleration needs the same thrust direction.
+
+    The thrust per unit mass that balances the drag is  a + g e_3 + D (v - w) , and D (v - w) is
+    d (v - w)  plus a vector along the thrust. So the thrust is along  a + g e_3 + d (v - w) .
+    """
+    return acc if air is None else add_drag_rate(air, velocity_in_air(air, vel), acc)
+
+
+def add_drag_rate(air: Air | None, acc: Array, jerk: Array) -> Array:
+    """Return j + d a, the derivative of `add_drag`; of jerk and snap its second derivative."""
+    if air is None:
+        return jerk
+    drag = air.drag[..., None]
+    return jerk + drag.reshape((1,) * (acc.ndim - drag.ndim) + drag.shape) * acc
+
+
+def thrust_in_air(air: Air, vel: Array, load: Array, gravity: Array) -> Array:
+    """Return the thrust per unit mass (...) [m/s^2] for a velocity and the result of `add_drag`.
+
+    With t = `load` + g e_3, n = t / |t|, and the coefficients d and d_z of the drag,
+    it is  |t| + (d_z - d) n . (v - w) .
+    """
+    x, y, z = components(load)
+    z = z + gravity
+    u, v, w = components(velocity_in_air(air, vel))
+    square = at_least(x * x + y * y + z * z, 1e-4)
+    along = (air.thrust_drag - air.drag) * (x * u + y * v + z * w)
+    return (square + along) * inverse_sqrt(square)
 
 
 def net_thrust(acc: Array, gravity: Array) -> Array:
@@ -157,16 +208,24 @@ def body_rate(acc: Components, jerk: Components, gravity: Array) -> tuple[Array,
 
 
 def rotor_thrusts(
-    acc: Components, jerk: Components, snap: Components, gravity: Array, rotors: RotorLimits
+    acc: Components,
+    jerk: Components,
+    snap: Components,
+    gravity: Array,
+    rotors: RotorLimits,
+    pull: Array | None = None,
 ) -> tuple[Array, ...]:
     """Return the thrusts (...) [N] that R rotors need for a motion at zero heading.
 
-    Acceleration [m/s^2], jerk [m/s^3] and snap [m/s^4] are (..., 3), gravity is () [m/s^2].
+    Acceleration [m/s^2], jerk [m/s^3] and snap [m/s^4] are (..., 3), gravity is () [m/s^2]. `pull`
+    is the thrust per unit mass (...) [m/s^2], by default |acceleration + gravity e_3|.
     """
     a, j, s = (tuple(components(each)) for each in (acc, jerk, snap))
     rate, turning = jax.jvp(lambda acc, jerk: body_rate(acc, jerk, gravity), (a, j), (j, s))
     x, y, z = a
-    thrust = rotors.mass * jnp.sqrt(at_least(x * x + y * y + (z + gravity) ** 2, 1e-4))
+    if pull is None:
+        pull = jnp.sqrt(at_least(x * x + y * y + (z + gravity) ** 2, 1e-4))
+    thrust = rotors.mass * pull
     about_x, about_y, about_z = (rotors.inertia[..., k] for k in range(3))
     roll = about_x * turning[0] + (about_z - about_y) * rate[1] * rate[2]
     pitch = about_y * turning[1] + (about_x - about_z) * rate[2] * rate[0]
@@ -269,8 +328,11 @@ def beyond_reach(
     x, y, z = (each - start[k] for k, each in enumerate(components(positions)))
     half_square = 0.5 * jnp.maximum(times, _SHORTEST) ** 2
     thrust = _greatest_thrust(limits)
-    acceleration = _greatest_acceleration(limits, thrust, gravity)
     first, most = jnp.sqrt(jnp.sum(vel * vel)), greatest_speed(head_state, limits)
+    if limits.air is not None and thrust is not None:  # the air accelerates by at most this much
+        speed = most + jnp.sqrt(jnp.sum(limits.air.wind**2))
+        thrust = thrust + jnp.maximum(limits.air.drag, limits.air.thrust_drag) * speed
+    acceleration = _greatest_acceleration(limits, thrust, gravity)
     if acceleration is None:
         return _length(x, y, z) - most * times
     rise = (most - first) / acceleration
@@ -337,6 +399,7 @@ class QuadrotorPlan(Plan, Located):
     gravity: Array  # () [m/s^2], magnitude
     # Trajectory from the last contact to standstill; None if none was requested.
     recovery: PiecewisePolynomial | None = struct.field(default=None, kw_only=True)
+    air: Air | None = struct.field(default=None, kw_only=True)  # drag and wind of the case
 
     @property
     def whole(self) -> PiecewisePolynomial:
@@ -353,20 +416,28 @@ class QuadrotorPlan(Plan, Located):
 
         path = jax.tree.map(np.asarray, self).whole
         ends = np.sum(path.durations, axis=-1)
-        found = sample_at_rate(rate, ends, (path, self.gravity), setpoint_at)
+        air = jax.tree.map(np.asarray, self.air)
+        found = sample_at_rate(rate, ends, (path, self.gravity, air), setpoint_at)
         return QuadrotorSetpoints(**{**found, "pos": to_world(found["pos"], self.origin)})
 
 
-def setpoint_at(leaves: tuple[PiecewisePolynomial, Array], time: Array) -> dict[str, Array]:
-    """Return the `QuadrotorSetpoints`, except `time`, of (trajectory, gravity) at a time () [s]."""
-    path, gravity = leaves
+def setpoint_at(
+    leaves: tuple[PiecewisePolynomial, Array, Air | None], time: Array
+) -> dict[str, Array]:
+    """Return the `QuadrotorSetpoints`, except `time`, of (path, gravity, air) at a time () [s]."""
+    path, gravity, air = leaves
     pos, vel, acc, jerk = (evaluate(path, time, order) for order in range(4))
+    load, load_jerk = add_drag(air, vel, acc), add_drag_rate(air, acc, jerk)
+    if air is None:
+        thrust = jnp.sqrt(jnp.sum(net_thrust(acc, gravity) ** 2))
+    else:
+        thrust = thrust_in_air(air, vel, load, gravity)
     return {
         "pos": pos,
         "vel": vel,
         "acc": acc,
         "jerk": jerk,
-        "quat_wxyz": tilt_quaternion(acc, gravity),
-        "body_rate": flat_attitude(acc, jerk, gravity)[1],
-        "thrust": jnp.sqrt(jnp.sum(net_thrust(acc, gravity) ** 2)),
+        "quat_wxyz": tilt_quaternion(load, gravity),
+        "body_rate": flat_attitude(load, load_jerk, gravity)[1],
+        "thrust": thrust,
     }

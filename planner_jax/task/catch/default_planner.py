@@ -19,7 +19,7 @@ from planner_jax.optimise.chain import ChainEnds, ChainPlanner
 from planner_jax.optimise.planner import pending
 from planner_jax.optimise.settings import LbfgsConfig, Round, Stage
 from planner_jax.optimise.shipped import StartNetwork, load_network
-from planner_jax.robot.quadrotor import body_z, tangent_basis
+from planner_jax.robot.quadrotor import add_drag, body_z, tangent_basis
 from planner_jax.task.catch.case import CatchCase
 from planner_jax.task.catch.context import (
     CatchContext,
@@ -236,8 +236,8 @@ class ExactCatch(ChainPlanner[CatchCase, CatchPlan]):
         durations = jnp.exp(natural[:, 0])
         times = jnp.cumsum(jnp.where(context.active, durations, 0.0))
         ball = targets_at(context.targets, times)
-        acc = natural[:, 6:9]
-        axis = body_z(acc, case.gravity)
+        vel, acc = natural[:, 3:6], natural[:, 6:9]
+        axis = body_z(add_drag(case.limits.air, vel, acc), case.gravity)
         across_x, across_y = jax.vmap(tangent_basis)(axis)
         place = natural[:, 1:3]
         inside = _RIM * net.radius / jnp.sqrt(1.0 + jnp.sum(place**2, axis=1, keepdims=True))
@@ -248,7 +248,7 @@ class ExactCatch(ChainPlanner[CatchCase, CatchPlan]):
         angle = jnp.maximum(net.max_angle, 1e-3)
         excess = (jnp.cos(angle) - facing) / (angle * jnp.sin(angle))
         excess = jnp.where(moving, excess, -1.0)
-        tail_states = jnp.stack([pos, natural[:, 3:6], acc, natural[:, 9:12]], axis=1)
+        tail_states = jnp.stack([pos, vel, acc, natural[:, 9:12]], axis=1)
         # Feasible plans may exceed a limit by the tolerance, added here so that no catch is late.
         late = times / context.horizon - 1.0 + FEASIBILITY_TOLERANCE
         return ChainEnds(
@@ -270,8 +270,8 @@ class ExactCatch(ChainPlanner[CatchCase, CatchPlan]):
         """
         case, net = context.case, context.case.net
         times = jnp.cumsum(jnp.where(context.active, durations, 0.0))
-        pos, acc = tail_states[:, 0], tail_states[:, 2]
-        axis = body_z(acc, case.gravity)
+        pos, vel, acc = (tail_states[:, order] for order in range(3))
+        axis = body_z(add_drag(case.limits.air, vel, acc), case.gravity)
         miss = targets_at(context.targets, times).pos - net.height * axis - pos
         across = jnp.stack(jax.vmap(tangent_basis)(axis), axis=1)  # (N, 2, 3)
         share = jnp.sum(across * miss[:, None], axis=2) / (_RIM * net.radius)
@@ -300,6 +300,7 @@ class ExactCatch(ChainPlanner[CatchCase, CatchPlan]):
         return CatchPlan(
             trajectory=trajectory,
             gravity=context.case.gravity,
+            air=context.case.limits.air,
             order=context.case.order,
             decided_times=context.times,
             times=ends.contact,

@@ -20,7 +20,7 @@ from planner_jax.core.checks import require_path
 from planner_jax.optimise.planner import OptimisedPlanner
 from planner_jax.optimise.settings import Evaluation, LbfgsConfig, Round
 from planner_jax.planning.replan import Replanning, check_elapsed, planned_state, resolve_argument
-from planner_jax.robot.quadrotor import body_z
+from planner_jax.robot.quadrotor import add_drag, body_z
 from planner_jax.task.catch.case import CatchCase
 from planner_jax.task.catch.context import CatchContext, targets_at
 from planner_jax.task.catch.default_planner import ExactCatch
@@ -143,7 +143,8 @@ class ReplanCatch(OptimisedPlanner):
         last = (segments + 1) * planner.num_pieces - 1
         coeffs, ends = trajectory.coeffs[last], trajectory.durations[last]
         tails = _states(coeffs, ends)
-        axis = body_z(tails[:, 2], task.case.gravity)
+        load = add_drag(task.case.limits.air, tails[:, 1], tails[:, 2])
+        axis = body_z(load, task.case.gravity)
         ball = targets_at(context.targets, times)
         above = jnp.sum((ball.pos - tails[:, 0]) * axis, axis=1) - net.height
         closing = jnp.sum((tails[:, 1] - ball.vel) * axis, axis=1)

@@ -110,6 +110,8 @@ def case(
     hitting_speed=(4.0, 3.0, 4.0),
     min_apex=2.2,
     max_apex=6.2,
+    rotor_drag=None,
+    wind=None,
     extras: Sequence[Extra] = (),
     origin=None,
     dtype=jnp.float32,
@@ -138,6 +140,9 @@ def case(
         max_thrust: [m/s^2], greatest thrust per unit mass.
         body_rate: [rad/s], greatest body rate.
         min_height: [m], least height of the propeller plane.
+        rotor_drag: [1/s], linear drag of the quadrotor per unit mass: one number, or two numbers
+            (..., 2) across and along the thrust; None for no drag.
+        wind: (3,) or (..., 3) [m/s], velocity of the air; it acts by `rotor_drag`.
         hitting_speed: (3,) [m/s], greatest speed of the quadrotor at the impact on each axis.
         min_apex: [m], least apex of the returned ball.
         max_apex: [m], greatest apex of the returned ball.
@@ -185,6 +190,7 @@ def case(
         limits=quadrotor.limits_of(
             robot,
             leaf,
+            air=quadrotor.air_of(rotor_drag, wind, leaf),
             speed=speed,
             acceleration=acceleration,
             min_thrust=min_thrust,
@@ -203,6 +209,7 @@ def case(
     )
     require_sound(cases, _ARGUMENTS)
     quadrotor.require_start(cases)
+    quadrotor.require_hover(cases)
     height = np.asarray(cases.ball.pos)[..., 2]
     rules.require_rule("ball_pos", height, height >= 0.0, "at a height >= 0 m", batch)
     return cases

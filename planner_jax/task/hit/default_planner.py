@@ -24,7 +24,7 @@ from planner_jax.optimise.chain import ChainEnds, ChainPlanner
 from planner_jax.optimise.planner import pending
 from planner_jax.optimise.settings import LbfgsConfig, Round, Stage
 from planner_jax.optimise.shipped import StartNetwork, load_network
-from planner_jax.robot.quadrotor import tangent_basis
+from planner_jax.robot.quadrotor import tangent_basis, velocity_in_air
 from planner_jax.task.hit.case import HitCase
 from planner_jax.task.hit.context import (
     HitContext,
@@ -310,14 +310,11 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
             apex = drag_free_apex(BallState(ball.pos, after), case.gravity)
         normal, normal_speed = solve_impact(ball.vel, after, case.restitution)
         across_x, across_y = tangent_basis(normal)
-        tail_state = jnp.stack(
-            [
-                ball.pos - case.racket_height * normal,
-                normal_speed * normal + natural[3] * across_x + natural[4] * across_y,
-                thrust * normal + gravity_vector(case.gravity),
-                natural[5:],
-            ]
-        )
+        vel = normal_speed * normal + natural[3] * across_x + natural[4] * across_y
+        acc = thrust * normal + gravity_vector(case.gravity)
+        if (air := case.limits.air) is not None:  # the thrust is along a + g e_3 + d (v - w)
+            acc = acc - air.drag * velocity_in_air(air, vel)
+        tail_state = jnp.stack([ball.pos - case.racket_height * normal, vel, acc, natural[5:]])
         stroke = Stroke(time, ball.pos, ball.vel, after, normal, flight_time)
         return Impact(stroke=stroke, tail_state=tail_state, apex=apex)
 
@@ -336,6 +333,7 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
         return HitPlan(
             trajectory=trajectory,
             gravity=context.case.gravity,
+            air=context.case.limits.air,
             stroke=ends.contact,
             **pending(violation),
         )

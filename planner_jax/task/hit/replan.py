@@ -19,7 +19,7 @@ from planner_jax.core.checks import require_beginning, require_kind
 from planner_jax.optimise.planner import OptimisedPlanner
 from planner_jax.optimise.settings import Evaluation, LbfgsConfig, Round
 from planner_jax.planning.replan import Replanning, check_elapsed, planned_state, resolve_argument
-from planner_jax.robot.quadrotor import net_thrust, tangent_basis
+from planner_jax.robot.quadrotor import add_drag, net_thrust, tangent_basis
 from planner_jax.task.hit.case import HitCase
 from planner_jax.task.hit.context import HitContext
 from planner_jax.task.hit.default_planner import ExactHit
@@ -92,7 +92,7 @@ class ReplanHit(OptimisedPlanner):
         planner, stroke = self.planner, task.previous.stroke
         path = task.previous.trajectory
         vel, acc, jerk = (evaluate(path, total_duration(path), order) for order in (1, 2, 3))
-        pull = net_thrust(acc, task.case.gravity)
+        pull = net_thrust(add_drag(task.case.limits.air, vel, acc), task.case.gravity)
         across = jnp.stack([jnp.sum(vel * each) for each in tangent_basis(stroke.normal)])
         times = jnp.stack([stroke.time - task.elapsed, stroke.flight_time])
         sizes = jnp.append(times, jnp.sqrt(jnp.sum(pull**2)))
