@@ -7,6 +7,7 @@ import pytest
 
 import planner_jax as pj
 from planner_jax.ball.spin import SpinningBall, Surroundings, spin_bounce, spin_flight
+from planner_jax.cli.compilation import record_programs
 
 NUM, LANES = 20, 64  # Observations and recordings: all fits share two compiled programs.
 BALL = pj.ball.Ball.sphere(0.0027, 0.04)
@@ -139,6 +140,41 @@ def test_outliers_that_come_first_and_absent_observations_do_no_harm():
     assert np.median(np.abs(smooth.pos - seen)[:, 9:]) < 0.001
 
 
+def test_another_number_of_observations_or_of_times_compiles_no_program():
+    times, seen, *_ = flights()
+    pj.ball.fit(times[0], seen[0], ball=BALL).predict([0.3])
+    with record_programs() as programs:
+        found = pj.ball.fit(times[0, :17], seen[0, :17], ball=BALL, noise=0.003)
+        found.predict(np.linspace(0.2, 0.3, 7))
+        pj.ball.fit(times[:9], seen[:9], ball=BALL)
+        pj.ball.fit(times[:33, :19], seen[:33, :19], ball=BALL)
+    assert not programs
+
+
+@pytest.mark.slow
+def test_a_fit_through_an_observed_bounce_predicts_the_flight_after_it():
+    times = np.linspace(0.0, 0.5, 50)
+    vel = np.array([3.0, 0.2, -1.0])
+    truth = np.asarray(
+        spin_flight(
+            ball([0, 0, 0.5], vel, BALL.drag, [0, 0.3, 0.1]),
+            jnp.asarray([*times, 0.6]),
+            air(height=0.02),
+            bounces=1,
+            steps=20,
+        )[0]
+    )
+    assert truth[20, 2] < 0.2 < truth[-1, 2]  # the bounce is among the observations
+    seen = truth[:-1] + np.random.default_rng(0).normal(0.0, 0.001, (50, 3))
+    found = pj.ball.fit(times, seen, ball=BALL, floor=0.02)
+    then = found.predict([0.6])
+    assert np.linalg.norm(then.pos[0] - truth[-1]) < 0.01
+    low, high = then.interval(0.99)
+    assert np.all((low[0] < truth[-1]) & (truth[-1] < high[0]))
+    # The bounce determines the restitution, whose prior has a standard deviation of 0.1.
+    assert np.sqrt(found.covariance[10, 10]) < 0.02
+
+
 def test_fit_refuses_what_is_no_recording_of_one_flight():
     times, seen, *_ = flights()
     t, p = times[0], seen[0]
@@ -153,7 +189,7 @@ def test_fit_refuses_what_is_no_recording_of_one_flight():
     with pytest.raises(pj.CaseError, match="positions must be of one flight in one frame"):
         pj.ball.fit(t, mixed, ball=BALL)
     turning = np.stack([0.1 * np.sin(60 * t), 0.1 * np.cos(60 * t), 1 - 4.905 * t**2], axis=1)
-    with pytest.raises(pj.CaseError, match="in one frame, with the lift of `ball`"):
+    with pytest.raises(pj.CaseError, match="with the lift and drag of `ball`"):
         pj.ball.fit(t, turning, ball=BALL)
     seen[5, :17] = np.nan
     with pytest.raises(pj.CaseError, match="at least 4 observations in lane 5"):

@@ -49,7 +49,7 @@ _MOST_LIFT = 8.0  # greatest length of the lift vector, in standard deviations
 class Ball:
     """What is known about a ball, and about the plane on which it bounces, before its flight.
 
-    The default is an unknown ball. The model of a bounce is [Nakashima2010].
+    The default is an unknown ball. `spin_bounce` states the model of a bounce.
     """
 
     drag: float = 0.06  # [1/m], median of K_D
@@ -148,13 +148,13 @@ class FlightFit:
         _, origin, freedom, fitted, numbers, bounces = self._data
         rows, num = after.reshape(-1, after.shape[-1]), after.shape[-1]
         lanes = np.minimum(np.arange(len(fitted)), len(rows) - 1)
-        padded = rows[lanes[:, None], np.minimum(np.arange(_next_size(num)), num - 1)]
-        distance = after.max() * np.abs(self.vel).max()
+        padded = rows[lanes][:, np.minimum(np.arange(_next_size(num)), num - 1)]
+        distance = float(after.max() * np.abs(self.vel).max())
         program = _program(_forecast, bounces, _num_steps(numbers[0] * distance))
         found = np.asarray(program(fitted, padded.astype(np.float32), numbers), np.float64)
         found = found[: len(rows), :num].reshape((*after.shape, 24))
         sure, seen = (found[..., k : k + 9].reshape((*after.shape, 3, 3)) for k in (6, 15))
-        freedom = np.broadcast_to(freedom[..., None], after.shape)
+        freedom = freedom[..., None] + np.zeros(after.shape)
         pos = found[..., :3] + origin[..., None, :]
         return Prediction(pos, found[..., 3:6], sure, seen, freedom)
 
@@ -210,12 +210,13 @@ def fit(
     points = np.asarray(positions, np.float64).reshape(-1, num, 3)
     rows = np.concatenate([clock[..., None], points], axis=-1)
     present = np.asarray(np.isfinite(rows).all(axis=-1))
-    _require(present.sum(axis=-1) >= _LEAST, batch, "positions", "of at least 4 observations")
-    if not present.all():  # absent observations are the last ones
+    counts = present.sum(axis=-1)
+    _require(counts >= _LEAST, batch, "positions", "of at least 4 observations")
+    if counts.min() < num:  # absent observations are the last ones
         order = np.argsort(~present, axis=-1, kind="stable")[..., None]
         rows = np.take_along_axis(np.where(present[..., None], rows, np.nan), order, axis=1)
-    falls = np.sum(np.diff(rows[:, :, 0]) <= 0.0, axis=-1)
-    _require(falls == 0, batch, "times", "strictly increasing")
+    falls = rows[:, 1:, 0] <= rows[:, :-1, 0]
+    _require(~falls.any(axis=-1), batch, "times", "strictly increasing")
     first, lanes = rows[:, 0].copy(), 1 if len(rows) == 1 else _next_size(len(rows), 64)
     padded = np.full((lanes, _next_size(num), 4), np.nan, np.float32)
     padded[: len(rows), :num] = rows - first[:, None]
@@ -227,16 +228,17 @@ def fit(
         low, high = np.nanmin(rows[..., 3], axis=-1), np.nanmax(rows[..., 3], axis=-1)
         bounces = _BOUNCES
         observed = _BOUNCES if np.any(low - floor < 0.5 * (high - low)) else 0
-    numbers = _pack(ball, (float(gravity), *map(float, np.asarray(wind)), float(noise)))
-    distance = np.nanmax(np.abs(padded[..., 1:]))
+    numbers = _pack(ball, (float(gravity), *np.asarray(wind, np.float64).tolist(), float(noise)))
+    distance = float(np.fmax.reduce(np.abs(padded[..., 1:]), axis=None))
     program = _program(_estimate, observed, _num_steps(ball.drag * distance))
     fitted = np.asarray(program(padded, floors, numbers))
     state = fitted[: len(rows)].reshape((*batch, -1)).astype(np.float64)
-    sound = state[..., 161] > 0.0
-    rule = "of one flight in one frame, with the lift of `ball`, except for less than half"
-    _require(sound, batch, "positions", rule)
+    verdict, rule = state[..., 161], "of one flight in one frame, except for less than half"
+    smooth = "of a flight with the lift and drag of `ball`; errors of neighbours are alike"
+    _require(verdict >= 0.0, batch, "positions", smooth)
+    _require(verdict > 0.0, batch, "positions", rule)
     start, origin = first[:, 0].reshape(batch), first[:, 1:].reshape((*batch, 3))
-    freedom = (3.0 * present.sum(axis=-1) - 9.0 + _WEIGHT).reshape(batch)
+    freedom = (3.0 * counts - 9.0 + _WEIGHT).reshape(batch)
     pos, drag, errors = state[..., :3] + origin, np.exp(state[..., 6]), np.sqrt(state[..., 156:158])
     covariance = state[..., 12:156].reshape((*batch, 12, 12))
     data = clock.reshape(shape[:-1]), origin, freedom, fitted, numbers, bounces
@@ -250,10 +252,12 @@ def _pack(ball: Ball, others: tuple[float, ...]) -> np.ndarray:
     return np.array([*packed, *others], np.float32)
 
 
-def _require(holds: ArrayLike, batch: tuple[int, ...], name: str, rule: str) -> None:
-    if not np.all(holds):
+def _require(holds: np.ndarray | np.bool_, batch: tuple[int, ...], name: str, rule: str) -> None:
+    if not holds.all():
         index = int(np.argmin(holds)) if batch else None
-        raise CaseError(name, rule, index=index, shown="", more=np.size(holds) - np.sum(holds) - 1)
+        raise CaseError(
+            name, rule, index=index, shown="", more=int(np.size(holds) - np.sum(holds)) - 1
+        )
 
 
 def _next_size(num: int, least: int = 16) -> int:
@@ -296,7 +300,8 @@ def _estimate(rows: Array, floor: Array, numbers: Array, counts: tuple[int, int]
     """Estimate one flight from rows (N, 4) of time [s] and position [m]; absent rows are NaN.
 
     The result (162,) has the unknowns, their covariance, squared errors of positions and of time
-    stamps, last time, floor, share of outliers, and whether the flight explains the rows.
+    stamps, last time, floor, share of outliers, and 1 if the flight explains the rows. Otherwise
+    the last number is -1 if errors of neighbours are alike, and 0 if not.
     """
     present = jnp.isfinite(rows[:, 0])
     num = jnp.sum(present, dtype=rows.dtype)
@@ -406,7 +411,7 @@ def _estimate(rows: Array, floor: Array, numbers: Array, counts: tuple[int, int]
 
     scales = jnp.stack([jnp.maximum(0.6 * error, noise**2), jnp.zeros_like(noise)])
     begun = state, scales, jnp.ones_like(noise)
-    (state, scales, _), (covariance, far) = lax.scan(
+    (state, scales, overlap), (covariance, far) = lax.scan(
         linearise, begun, None, length=_ROUNDS[not is_short]
     )
     size = jnp.linalg.norm(scaled @ state[7:10])
@@ -417,7 +422,9 @@ def _estimate(rows: Array, floor: Array, numbers: Array, counts: tuple[int, int]
     error = scales[0] + scales[1] * jnp.sum(state[3:6] ** 2)
     sound = (error <= _MOST_NOISE**2 * jnp.sum(extent**2)) & (size <= _MOST_LIFT)
     sound &= jnp.isfinite(jnp.sum(covariance)) & (far[-1] <= _MOST_OUTLIERS)
-    others = jnp.stack([*scales, last, floor, far[-1], sound.astype(rows.dtype)])
+    # Spin that the prior excludes leaves smooth errors; another frame leaves errors that alternate.
+    verdict = jnp.where(sound, 1.0, jnp.where(overlap < 0.5, -1.0, 0.0)).astype(rows.dtype)
+    others = jnp.stack([*scales, last, floor, far[-1], verdict])
     return jnp.concatenate([state, covariance.reshape(-1), others])
 
 

@@ -79,11 +79,12 @@ def spin_step(ball: SpinningBall, duration: Array, air: Surroundings) -> Spinnin
 
 
 def spin_bounce(ball: SpinningBall, air: Surroundings) -> SpinningBall:
-    """Return the ball after its bounce on the plane, by the model of [Nakashima2010].
+    """Return the ball after its bounce on the plane.
 
-    The vertical velocity v_z becomes -e v_z. The point of contact slips with s = v_t + r omega x
-    (-z). Friction changes the tangential velocity v_t by -min(mu (1 + e) |v_z| / |s|, grip) s:
-    either the point slides until the end of the contact, or the slip ends before.
+    The ball is rigid, with restitution and Coulomb friction; compare [Nakashima2010]. The vertical
+    velocity v_z becomes -e v_z. The point of contact slips with s = v_t + r omega x (-z). Friction
+    changes the tangential velocity v_t by -min(mu (1 + e) |v_z| / |s|, grip) s: either the point
+    slides until the end of the contact, or the slip ends before.
     """
     surface = air.reach * ball.lift
     slip = jnp.stack([ball.vel[0] - surface[1], ball.vel[1] + surface[0]])
