@@ -32,7 +32,8 @@ from planner_jax.benchmarks.run import Bench, argument_parser, begin
 from planner_jax.core.errors import ArgumentError
 from planner_jax.runs.dataset import Dataset
 from planner_jax.runs.summary import wilson_interval
-from planner_jax.task.hit.suites import generate_serves, read_serves, to_cases
+from planner_jax.task.hit.published import read_serves
+from planner_jax.task.hit.suites import generate_serves, to_cases
 
 NUM_GENERATED = 9000  # Number of serves that are drawn if no folder of serves is passed.
 VERDICTS = ("feasible", "infeasible", "undecided")

@@ -7,8 +7,9 @@ import dataclasses
 import pkgutil
 from typing import ClassVar
 
-from planner_jax.core.choices import EFFORTS, require, require_memory, require_one_of
+from planner_jax.core.choices import EFFORTS, require, require_one_of
 from planner_jax.core.registry import task_named
+from planner_jax.core.room import require_memory
 from planner_jax.runs.settings import SweepSettings, option
 
 _MOST = 100_000  # Maximum of the settings that are counts. Larger counts would take hours.

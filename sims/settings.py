@@ -8,8 +8,9 @@ import math
 import pkgutil
 from typing import Any, ClassVar
 
-from planner_jax.core.choices import SCALES, require, require_memory, require_one_of, require_seed
+from planner_jax.core.choices import SCALES, require, require_one_of, require_seed
 from planner_jax.core.registry import Task, all_tasks, split_name
+from planner_jax.core.room import require_memory
 from planner_jax.runs.settings import Options, option, require_count
 from planner_jax.sims.noise import NOISES, PLANE_NOISES, PlaneSensing, Sensing, require_whole
 from planner_jax.sims.robots.arm.drives import ENCODERS, TORQUES, Drives

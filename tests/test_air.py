@@ -11,15 +11,16 @@ from jax.test_util import check_grads
 import planner_jax as pj
 from planner_jax.core.protocol import is_solved
 from planner_jax.cost.quadrotor import flight_excess, flight_names, relative_excess
+from planner_jax.referee import air as judged_air
 from planner_jax.referee import quadrotor as referee
 from planner_jax.referee.rotors import judge_rotors
+from planner_jax.robot.attitude import setpoint_at
 from planner_jax.robot.quadrotor import (
     Air,
     RotorLimits,
     add_drag,
     add_drag_rate,
     body_z,
-    setpoint_at,
     thrust_in_air,
 )
 from planner_jax.robot.quadrotor_models import PAPER_CATCHER
@@ -94,7 +95,7 @@ def test_planner_and_referee_agree_on_thrust_tilt_body_rate_and_rotors_in_wind()
         most[name] = max(most.get(name, -np.inf), float(np.max(excess)))
     case, u = case_of(limits), np.linspace(0.0, 1.0, nodes + 1)
     pieces = referee.pieces_of(flown.coeffs[None], flown.durations[None])
-    thrust = referee.thrust_along(pieces, case, u)
+    thrust = judged_air.thrust_along(pieces, case, u)
     measured, _ = judge_rotors(pieces, case, u, 0.01)
     motion = sample_pieces(flown, nodes)
     load = add_drag(limits.air, motion.vel, motion.acc)
@@ -104,7 +105,7 @@ def test_planner_and_referee_agree_on_thrust_tilt_body_rate_and_rotors_in_wind()
     high = measured["max_rotor_thrust"][0] / 11.0 - 1.0
     low = (0.1 - measured["min_rotor_thrust"][0]) / 11.0
     assert rotor == pytest.approx(max(high, low), rel=1e-4)
-    rate = referee.peaks(referee.load_pieces(pieces, case), case["gravity"], 400)["body rate"][0]
+    rate = referee.peaks(judged_air.load_pieces(pieces, case), case["gravity"], 400)["body rate"][0]
     assert most["body_rate"] <= np.sqrt(rate[0]) / 4.0 - 1.0 + 1e-9
     assert most["body_rate"] == pytest.approx(np.sqrt(rate[0]) / 4.0 - 1.0, rel=0.02)
 
@@ -120,10 +121,10 @@ def test_zero_drag_equals_none_and_a_batch_equals_a_loop():
     coeffs, durations = (np.stack([vars(each)[k] for each in paths]) for k in vars(paths[0]))
     u, case = np.linspace(0.0, 1.0, 9), case_of(bounds(air=air()), 3)
     pieces = referee.pieces_of(coeffs, durations)
-    whole = referee.thrust_along(pieces, case, u)
+    whole = judged_air.thrust_along(pieces, case, u)
     for k in range(3):
         one = {name: leaf[k : k + 1] for name, leaf in case.items()}
-        alone = referee.thrust_along(pieces.of(slice(k, k + 1)), one, u)[0]
+        alone = judged_air.thrust_along(pieces.of(slice(k, k + 1)), one, u)[0]
         np.testing.assert_allclose(whole[k], alone, rtol=1e-12)
 
 

@@ -13,7 +13,8 @@ from sweeps import quick_hit
 
 import planner_jax as pj
 from planner_jax.referee.rotors import rotor_thrusts as judged_thrusts
-from planner_jax.robot.quadrotor import RotorLimits, flat_attitude, rotor_thrusts
+from planner_jax.robot.attitude import flat_attitude
+from planner_jax.robot.quadrotor import RotorLimits
 from planner_jax.robot.quadrotor_model import (
     NET,
     RACKET,
@@ -22,6 +23,7 @@ from planner_jax.robot.quadrotor_model import (
     Tool,
     place_in_cross,
 )
+from planner_jax.robot.rotor_thrusts import rotor_thrusts
 
 GRAVITY = 9.81
 MODEL = pj.QuadrotorModel(

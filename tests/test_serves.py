@@ -14,6 +14,7 @@ from planner_jax.core.errors import ArgumentError, CaseError
 from planner_jax.task.hit import court, suites
 from planner_jax.task.hit.case import GRAVITY
 from planner_jax.task.hit.court import check_cases, fly, landing
+from planner_jax.task.hit.published import read_serves
 from planner_jax.task.hit.spec import DRAG
 from tests.trees import assert_same
 
@@ -79,7 +80,7 @@ def test_trial_files_are_read_with_the_outcome_of_each_planner(tmp_path):
     write(tmp_path, "1_1_2_l.csv", row(1, hit=MISS), row(2, position="  1.5  0.2       2"))
     write(tmp_path, "1_1_2_b.csv", row(1, hit=MISS), row(2, position="1.5 0.2 2", hit=MISS))
     (tmp_path / "README.md").write_text("not a trial file")
-    serves = suites.read_serves(tmp_path)
+    serves = read_serves(tmp_path)
     np.testing.assert_array_equal(serves.position, [[2.5, -0.3, 2.0], [1.5, 0.2, 2.0]])
     np.testing.assert_array_equal(serves.velocity[0], [-4.3, 0.02, 7.3])
     np.testing.assert_array_equal(serves.target[0], [1.75, 0.0, 0.0])
@@ -91,7 +92,7 @@ def test_trial_files_are_read_with_the_outcome_of_each_planner(tmp_path):
 def test_a_missing_planner_is_nan_and_scenarios_take_turns(tmp_path):
     write(tmp_path, "3_4_4_l.csv", row(1), row(2, hit=MISS))
     write(tmp_path, "1_1_1_p.csv", row(1), row(2), row(3))
-    serves = suites.read_serves(tmp_path)
+    serves = read_serves(tmp_path)
     names = [court.SCENARIOS[s] for s in serves.scenario]
     assert names == ["NNN", "LRR", "NNN", "LRR", "NNN"]
     np.testing.assert_array_equal(serves.published[1], [np.nan, 1, np.nan])
@@ -100,12 +101,12 @@ def test_a_missing_planner_is_nan_and_scenarios_take_turns(tmp_path):
 
 def test_an_absent_or_unsuitable_folder_is_named(tmp_path):
     with pytest.raises(ArgumentError, match="existing folder, got .*nowhere"):
-        suites.read_serves(tmp_path / "nowhere")
+        read_serves(tmp_path / "nowhere")
     with pytest.raises(ArgumentError, match="S_L_T_M.csv files, got none"):
-        suites.read_serves(tmp_path)
+        read_serves(tmp_path)
     write(tmp_path, "1_1_4_p.csv", row())
     with pytest.raises(ArgumentError, match=r"36 scenarios, got 1_1_4_p.csv \(NNR"):
-        suites.read_serves(tmp_path)
+        read_serves(tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -123,7 +124,7 @@ def test_an_absent_or_unsuitable_folder_is_named(tmp_path):
 def test_a_bad_row_is_named_by_file_line_rule_and_value(tmp_path, bad, says):
     write(tmp_path, "1_1_1_p.csv", row(), bad)
     with pytest.raises(ArgumentError) as caught:
-        suites.read_serves(tmp_path)
+        read_serves(tmp_path)
     assert f"1_1_1_p.csv:3: {says}" in str(caught.value)
     assert "\n" not in str(caught.value) and len(caught.value.value) == 1
 
@@ -132,12 +133,12 @@ def test_all_bad_rows_and_empty_files_are_collected_and_the_first_few_spelled_ou
     write(tmp_path, "1_1_1_p.csv", *["broken"] * 4, row())
     write(tmp_path, "1_1_2_p.csv", *["broken"] * 3)
     with pytest.raises(ArgumentError, match="1_1_2_p.csv:2: .*; and 2 more$") as caught:
-        suites.read_serves(tmp_path)
+        read_serves(tmp_path)
     assert len(caught.value.value) == 7
     for text in ("", HEADER + "\n"):
         (tmp_path / "1_1_1_p.csv").write_text(text)
         with pytest.raises(ArgumentError, match="1_1_1_p.csv: file must have a row") as caught:
-            suites.read_serves(tmp_path)
+            read_serves(tmp_path)
         assert len(caught.value.value) == 4
 
 
@@ -145,7 +146,7 @@ def test_files_of_one_scenario_must_hold_the_same_serves(tmp_path):
     write(tmp_path, "1_1_1_b.csv", row(), row(2), row(3))
     write(tmp_path, "1_1_1_p.csv", row(), row(2, position="2.6 0 2"))
     with pytest.raises(ArgumentError) as caught:
-        suites.read_serves(tmp_path)
+        read_serves(tmp_path)
     changed, missing = caught.value.value
     rule = "serve must be the one in 1_1_1_b.csv"
     assert changed.startswith(f"1_1_1_p.csv:3: {rule}, [2.5, -0.3, 2.0")
@@ -154,7 +155,7 @@ def test_files_of_one_scenario_must_hold_the_same_serves(tmp_path):
 
 @needs_published
 def test_the_published_serves_are_read_with_their_rates():
-    serves = suites.read_serves(PUBLISHED)
+    serves = read_serves(PUBLISHED)
     assert len(serves) == 9000
     np.testing.assert_array_equal(np.bincount(serves.scenario), np.full(36, 250))
     np.testing.assert_allclose(serves.target, court.target_of(serves.scenario))
@@ -248,7 +249,7 @@ def test_the_shortcut_of_the_generator_draws_uniform_serves():
 
 @needs_published
 def test_generated_serves_are_distributed_as_the_published_ones():
-    published, generated = suites.read_serves(PUBLISHED), suites.generate_serves(36000, 0)
+    published, generated = read_serves(PUBLISHED), suites.generate_serves(36000, 0)
     pair = np.array([name[:2] for name in court.SCENARIOS])
 
     def features(serves):

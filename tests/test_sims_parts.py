@@ -13,7 +13,7 @@ import pytest
 from sweeps import quick_hit
 
 import planner_jax as pj
-from planner_jax.robot.quadrotor import flat_attitude
+from planner_jax.robot.attitude import flat_attitude
 from planner_jax.robot.quadrotor_model import FlightLimits
 from planner_jax.sims import sensing as estimation
 from planner_jax.sims.launch import await_ball, ready, require_plan, require_world

@@ -1,11 +1,9 @@
 """Named choices and ranges that planners, settings and exports share; no import of JAX."""
 
-import os
 from collections.abc import Iterable
 from numbers import Integral
 
 from planner_jax.core.errors import ArgumentError, ArgumentTypeError
-from planner_jax.host import machine
 
 EFFORTS = ("feasible", "good", "best")  # how long a planner searches; the first is the default
 RECOVERIES = ("brake", "home")  # come to standstill anywhere, or at the case's initial position
@@ -45,21 +43,3 @@ def require_scale(value: float) -> None:
     """Raise `ArgumentError` unless `limit_scale`, the factor on all limits, is from 1e-3 to 1e3."""
     least, most = SCALES
     require(least <= value <= most, "limit_scale", f"from {least:g} to {most:g}", value)
-
-
-def require_memory(name: str, num: int, bytes_each: int) -> None:
-    """Raise `ArgumentError` if `num` elements of `bytes_each` bytes exceed the free memory."""
-    free = machine.available_memory()
-    _require_space(name, num, bytes_each, free, "which this machine has memory")
-
-
-def require_disk(name: str, num: int, bytes_each: int, folder: str | os.PathLike) -> None:
-    """Raise `ArgumentError` if `num` rows of `bytes_each` bytes exceed the folder's free disk."""
-    _require_space(name, num, bytes_each, machine.free_disk(folder), "which the disk has room")
-
-
-def _require_space(name: str, num: int, bytes_each: int, free: int | None, what: str) -> None:
-    if free is not None and num * bytes_each > free:
-        sizes = f"{machine.format_size(bytes_each)} each, {machine.format_size(free)} free"
-        most = max(free // bytes_each, 1)
-        raise ArgumentError(name, f"at most {most:,}, for {what} ({sizes})", num)

@@ -24,7 +24,6 @@ from planner_jax.robot.quadrotor import (
     add_drag,
     add_drag_rate,
     body_rate_squared,
-    rotor_thrusts,
     thrust_in_air,
 )
 from planner_jax.trajectory.polynomial import Motion
@@ -152,6 +151,8 @@ class Measure(enum.Enum):
 
 def _rotor_excess(motion: Motion, gravity: Array, limits: QuadrotorLimits) -> tuple[Array, ...]:
     """Return f / f_max - 1 for each rotor's thrust f (N,), then (f_min - f) / f_max for each."""
+    from planner_jax.robot.rotor_thrusts import rotor_thrusts  # few robots have these limits
+
     rotors = limits.rotors
     assert rotors is not None
     air, load = limits.air, _load(motion, limits)

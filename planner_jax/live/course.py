@@ -14,14 +14,13 @@ from planner_jax.live.packets import FIELDS
 from planner_jax.planning.programs import solve_one
 from planner_jax.recovery.case import RecoveryCase
 from planner_jax.recovery.planner import RecoveryPlanner
+from planner_jax.robot.attitude import setpoint_at, tilt_quaternion
 from planner_jax.robot.quadrotor import (
     Air,
     QuadrotorLimits,
     QuadrotorPlan,
     add_drag,
-    setpoint_at,
     thrust_in_air,
-    tilt_quaternion,
 )
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, states_at, total_duration
 

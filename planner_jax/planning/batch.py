@@ -30,7 +30,6 @@ from planner_jax.core.protocol import (
     select,
     select_into,
 )
-from planner_jax.host.machine import as_here, usable_cores
 from planner_jax.planning.programs import (
     FEW,
     LANES,
@@ -252,7 +251,11 @@ class _Batch:
     ) -> Iterator[PyTree]:
         """Yield the plans of each compiled call, or None after the time limit if `may_end`."""
         watch, spec = self.watch, lane_sharding(self.mesh)
-        threads = min(len(calls), usable_cores() + 1) if is_one_cpu(self.mesh) else 1
+        threads = 1
+        if len(calls) > 1 and is_one_cpu(self.mesh):
+            from planner_jax.host.machine import usable_cores  # small batches do not need it
+
+            threads = min(len(calls), usable_cores() + 1)
 
         def solve(call: _Call) -> PyTree:
             if may_end and watch.is_over:
@@ -267,6 +270,8 @@ class _Batch:
         if threads == 1:  # JAX returns before a result is ready, so the next call is prepared early
             yield from map(solve, calls) if watch.waits else [solve(call) for call in calls]
             return
+        from planner_jax.host.machine import as_here
+
         # The first call runs alone, so that its program is compiled once and not in every thread.
         key = self._key(attempt, calls[0][0].size, cases)
         alone = [] if key in compiled else [solve(calls[0])]
@@ -345,6 +350,8 @@ class _Batch:
         keys = {self._key(attempt, size, cases) for size in firsts}
         found: dict[int, PyTree] = {}
         if len(keys - compiled) > 1:  # compile several programs at the same time
+            from planner_jax.host.machine import as_here  # small batches do not need it
+
             with ThreadPoolExecutor(len(firsts)) as pool:
                 plans = pool.map(as_here(solve), firsts.values(), firsts)
                 found = dict(zip(firsts.values(), plans, strict=True))

@@ -12,7 +12,7 @@ from jax import Array, lax
 from jax.core import Tracer
 from jaxtyping import PyTree
 
-from planner_jax.core.choices import require, require_size
+from planner_jax.core.choices import require_size
 from planner_jax.core.errors import ArgumentError, ArgumentTypeError
 from planner_jax.core.origin import with_origin, without_origin
 from planner_jax.core.planner import CaseT, Kind, Planner, PlanT, require_fit
@@ -103,28 +103,6 @@ def plan(
     if not alone and resident and not is_resident(plans):
         plans = jax.device_put(plans, devices[0] if devices else None)
     return with_origin(plans, cases)
-
-
-def warm_up(planner: Planner[CaseT, PlanT], case: CaseT) -> None:
-    """Compile all searches of a planner for one case, so that `plan` of later cases never compiles.
-
-    `plan` compiles a search when a case first needs it. Without a warm-up the first case that is
-    hard thus waits for seconds. Later cases must have leaves of the same shapes.
-
-    Args:
-        planner: a planner whose searches are compiled; planners that work on the host need none.
-        case: one case of the planner's task; it is planned by every search.
-
-    Raises:
-        ValueError: there is a batch of cases instead of one case.
-        TypeError: the case belongs to another task than the planner.
-    """
-    require(case.batch_shape == (), "case", "one case", shown=f"batch shape {case.batch_shape}")
-    plan(planner, case)
-    inner = planner.inner
-    if inner.kind is Kind.COMPILED and isinstance(case, inner.case_type):
-        for attempt in inner.attempts_for(case):
-            Driver()(inner, case, (attempt,))
 
 
 def _require_layout(chunk: object, devices: object) -> None:

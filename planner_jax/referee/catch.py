@@ -17,6 +17,8 @@ from typing import Literal
 import numpy as np
 
 from planner_jax.referee import judging, quadrotor
+from planner_jax.referee.air import load_pieces
+from planner_jax.referee.recovery import append_recovery
 
 _ORDER_OF_MOTION = (
     *("head state", "continuity", "speed", "thrust low", "thrust high", "body rate"),
@@ -278,7 +280,7 @@ def _judge(
         "target pos": np.where(held[..., None], case["target pos"], 0.0),
         "target vel": np.where(held[..., None], case["target vel"], 0.0),
     }
-    whole = quadrotor.append_recovery(pieces, case)
+    whole = append_recovery(pieces, case) if "recovery.coeffs" in case else pieces
     motion, tests = quadrotor.judge_motion(
         whole, case, extras, intervals, tolerances["relative"], tolerances["continuity"]
     )
@@ -321,7 +323,7 @@ def _judge_catches(case, pieces, held, ends, net_test: str, tolerances: dict) ->
         np.moveaxis(judging.derivative(np.moveaxis(tail, -1, 0), spans, order), 0, -1)
         for tail, order in (
             (pieces.coeffs[:, :, each - 1 :: each], 0),
-            (quadrotor.load_pieces(pieces, case).coeffs[:, :, each - 1 :: each], 2),
+            (load_pieces(pieces, case).coeffs[:, :, each - 1 :: each], 2),
         )
     )
     thrust = acc + case["gravity"][:, None, None] * [0.0, 0.0, 1.0]

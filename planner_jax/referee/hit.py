@@ -117,7 +117,11 @@ def referee_hits(
 def _judge(
     case: dict, extras: tuple, intervals: int, drag_after_impact: bool, tolerances: dict
 ) -> dict:
-    pieces = quadrotor.append_recovery(quadrotor.pieces_of(case["coeffs"], case["durations"]), case)
+    pieces = quadrotor.pieces_of(case["coeffs"], case["durations"])
+    if "recovery.coeffs" in case:
+        from planner_jax.referee.recovery import append_recovery  # few plans have a recovery
+
+        pieces = append_recovery(pieces, case)
     measured, tests = quadrotor.judge_motion(
         pieces, case, extras, intervals, tolerances["relative"], tolerances["continuity"]
     )

@@ -59,58 +59,6 @@ def pieces_of(coeffs: np.ndarray, durations: np.ndarray, flown: np.ndarray | Non
     return Pieces(np.ascontiguousarray(coeffs), durations, starts, flown)
 
 
-def append_recovery(pieces: Pieces, case: dict) -> Pieces:
-    """Append the recovery trajectories to standstill behind the pieces, if the plans have them."""
-    if "recovery.coeffs" not in case:
-        return pieces
-    durations = case["recovery.durations"]
-    size = max(pieces.coeffs.shape[-1], case["recovery.coeffs"].shape[2])
-
-    def wide(coeffs: np.ndarray) -> np.ndarray:
-        return np.pad(coeffs, [(0, 0)] * 3 + [(0, size - coeffs.shape[-1])])
-
-    begin = np.where(pieces.flown, pieces.starts + pieces.durations, 0.0).max(axis=1)
-    starts = begin[:, None] + durations.cumsum(axis=1) - durations
-    return Pieces(
-        np.concatenate(
-            [wide(pieces.coeffs), wide(np.moveaxis(case["recovery.coeffs"], -1, 0))], axis=2
-        ),
-        np.concatenate([pieces.durations, durations], axis=1),
-        np.concatenate([pieces.starts, starts], axis=1),
-        np.concatenate([pieces.flown, np.ones(durations.shape, bool)], axis=1),
-    )
-
-
-def load_pieces(pieces: Pieces, case: dict) -> Pieces:
-    """Return pieces q whose second derivative is  a + d (v - w) , or `pieces` if there is no air.
-
-    Thrust direction and body rate of q without drag are those of `pieces` with the drag d [1/s]
-    across the thrust and the wind w [m/s] [Faessler2018]. For the position p,
-    q = p + d (integral of p from 0 to t) - d w t^2 / 2 .
-    """
-    if "limits.air.drag" not in case:
-        return pieces
-    drag, wind = case["limits.air.drag"][:, None], case["limits.air.wind"].T[:, :, None]
-    coeffs = np.pad(pieces.coeffs, [(0, 0)] * 3 + [(0, 1)])
-    coeffs[..., 1:] += drag[..., None] * pieces.coeffs / np.arange(1, coeffs.shape[-1])
-    coeffs[..., 2] -= 0.5 * drag * wind
-    return dataclasses.replace(pieces, coeffs=coeffs)
-
-
-def thrust_along(pieces: Pieces, case: dict, u: np.ndarray) -> np.ndarray:
-    """Return the thrust per unit mass (B, M, S) [m/s^2] against gravity, drag and wind.
-
-    It is  n . (a + g e_3 + d_z (v - w))  for the thrust direction n, at S fractions of the pieces.
-    """
-    _, vel, acc, _ = _motion(pieces, u)
-    direction = _motion(load_pieces(pieces, case), u)[2]
-    for each in (acc, direction):
-        each[2] += case["gravity"][:, None, None]
-    wind, drag = case["limits.air.wind"].T[:, :, None, None], case["limits.air.thrust_drag"]
-    force = acc + drag[:, None, None] * (vel - wind)
-    return (direction * force).sum(axis=0) / np.sqrt(_norm_squared(direction))
-
-
 MOTION_SENTENCES = {
     "head state": "the trajectory starts {excess:.3g} m off the head state",
     "continuity": "the trajectory jumps by {excess:.3g} m at {time:.3f} s",
@@ -179,7 +127,7 @@ def read_flight(cases, plans) -> dict[str, np.ndarray]:
     return leaves
 
 
-def _motion(pieces: Pieces, u: np.ndarray) -> list:
+def motion_of(pieces: Pieces, u: np.ndarray) -> list:
     """Evaluate position, velocity, acceleration and jerk at the fractions `u` of all pieces."""
     durations, num = pieces.durations, pieces.coeffs.shape[-1]
     spans = np.vander(durations.ravel(), num, increasing=True)
@@ -194,7 +142,8 @@ def _motion(pieces: Pieces, u: np.ndarray) -> list:
     return out
 
 
-def _norm_squared(vector: np.ndarray) -> np.ndarray:
+def norm_squared(vector: np.ndarray) -> np.ndarray:
+    """Return |v|^2 (...) of vectors (3, ...)."""
     return vector[0] ** 2 + vector[1] ** 2 + vector[2] ** 2
 
 
@@ -232,8 +181,8 @@ def _body_rate_squared(gravity, acc: np.ndarray, jerk: np.ndarray) -> np.ndarray
 # "depth" is minus the height, and "weakness" minus the squared thrust: their maxima are minima of
 # height and thrust.
 _MEASURES = {
-    "speed": ((1,), lambda gravity, vel: _norm_squared(vel)),
-    "acceleration": ((2,), lambda gravity, acc: _norm_squared(acc)),
+    "speed": ((1,), lambda gravity, vel: norm_squared(vel)),
+    "acceleration": ((2,), lambda gravity, acc: norm_squared(acc)),
     "body rate": ((2, 3), _body_rate_squared),
     "depth": ((0,), lambda gravity, pos: -pos[2]),
     "thrust": ((2,), _thrust_squared),
@@ -290,7 +239,7 @@ def _peaks(pieces: Pieces, gravity: np.ndarray, u: np.ndarray) -> dict[str, tupl
 
 
 def _sample(pieces: Pieces, gravity: np.ndarray, u: np.ndarray) -> tuple:
-    motion = _motion(pieces, u)
+    motion = motion_of(pieces, u)
     gravity = gravity[:, None, None]
     values = np.empty((len(_MEASURES), *motion[0].shape[1:]))
     for i, (orders, measure) in enumerate(_MEASURES.values()):
@@ -334,7 +283,7 @@ def _fastest_turn(acc, gravity, pieces: Pieces, u: np.ndarray) -> tuple[np.ndarr
     tau = acc.copy()
     tau[2] += gravity
     tau = tau.reshape(3, -1)
-    size = np.sqrt(_norm_squared(tau))
+    size = np.sqrt(norm_squared(tau))
     along = tau[:, 1:] * tau[:, :-1]
     cosine = np.ones(acc.shape[1:])
     cosine.ravel()[:-1] = (along[0] + along[1] + along[2]) / (size[1:] * size[:-1])
@@ -391,9 +340,12 @@ def judge_motion(
     Returns:
         The measurements of `FlightVerdict`, and tests (failed, excess, time), by name.
     """
-    found, load = peaks(pieces, case["gravity"], intervals), load_pieces(pieces, case)
+    found, load = peaks(pieces, case["gravity"], intervals), pieces
     u = np.linspace(0.0, 1.0, intervals + 1)
-    if load is not pieces:
+    if "limits.air.drag" in case:
+        from planner_jax.referee.air import load_pieces, thrust_along  # few cases have drag
+
+        load = load_pieces(pieces, case)
         found["body rate"] = peaks(load, case["gravity"], intervals)["body rate"]
         thrust = thrust_along(pieces, case, u)
         for name, sign in (("thrust", 1.0), ("weakness", -1.0)):
@@ -444,7 +396,12 @@ def judge_motion(
     else:
         measured |= dict.fromkeys(("min_rotor_thrust", "max_rotor_thrust"), np.full(num, np.nan))
     measured["max_tilt"], found_tilt = _judge_tilt(case, load, u, relative)
-    return measured, tests | found_tilt | _judge_rest(case, pieces, continuity)
+    tests |= found_tilt
+    if "recovery.coeffs" in case:
+        from planner_jax.referee.recovery import judge_rest  # few plans have a recovery
+
+        tests |= judge_rest(case, pieces, continuity)
+    return measured, tests
 
 
 def _judge_tilt(case: dict, pieces: Pieces, u: np.ndarray, relative: float) -> tuple:
@@ -459,7 +416,7 @@ def _judge_tilt(case: dict, pieces: Pieces, u: np.ndarray, relative: float) -> t
         start_tilt = 2.0 * np.arcsin(_tilt(gravity, start) ** 0.5)
         parts.append((rest, np.maximum(usual, start_tilt + MORE_TILT)))
     for part, limit in parts:
-        top, greatest, likeliest = _tops(_tilt(gravity[:, None, None], _motion(part, u)[2]))
+        top, greatest, likeliest = _tops(_tilt(gravity[:, None, None], motion_of(part, u)[2]))
         found = _search(((2,), _tilt), part, gravity, likeliest, u)
         sine, at = _greater(found, (greatest, _time(part, top, u)))
         sine = np.sqrt(np.minimum(sine, 1.0))
@@ -470,21 +427,3 @@ def _judge_tilt(case: dict, pieces: Pieces, u: np.ndarray, relative: float) -> t
     failed, excess, at = (np.array(each) for each in zip(*tests, strict=True))
     worst, lanes = excess.argmax(axis=0), np.arange(len(tilt))
     return tilt, {"tilt": (failed.any(axis=0), excess[worst, lanes], at[worst, lanes])}
-
-
-def _judge_rest(case: dict, pieces: Pieces, continuity: float) -> dict:
-    if "recovery.coeffs" not in case:
-        return {}
-    durations = case["recovery.durations"]
-    last = np.moveaxis(case["recovery.coeffs"][:, -1], 0, -1)
-    period = np.maximum(durations.mean(axis=1), SHORTEST_PIECE)
-    moved = np.stack(
-        [
-            np.linalg.norm(derivative(last, durations[:, -1], order), axis=0)
-            * (period**order / math.factorial(order))
-            for order in (1, 2, 3)
-        ]
-    ).max(axis=0)
-    scale = np.maximum(np.abs(pieces.coeffs[..., 0]).max(axis=(0, 2)), 1.0)
-    failed = ~(moved <= continuity * scale) | (durations <= 0.0).any(axis=1)
-    return {"recovery": (failed, moved, pieces.starts[:, -1] + pieces.durations[:, -1])}

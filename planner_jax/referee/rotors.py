@@ -7,8 +7,9 @@ planners, which compute it from the snap.
 
 import numpy as np
 
+from planner_jax.referee.air import load_pieces, thrust_along
 from planner_jax.referee.judging import cut, derivative
-from planner_jax.referee.quadrotor import Pieces, load_pieces, thrust_along
+from planner_jax.referee.quadrotor import Pieces
 
 _MOMENT = 1e-5  # [s], half the step of the central difference of body rates
 _NUMBERS = 250_000  # greatest number of samples computed at once, so that they fit the cache

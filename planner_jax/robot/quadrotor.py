@@ -24,7 +24,7 @@ from planner_jax.core.arithmetic import (
 from planner_jax.core.origin import Located, to_world
 from planner_jax.core.protocol import Plan
 from planner_jax.robot.quadrotor_model import MORE_TILT, RECOVERY_TILT
-from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate, join
+from planner_jax.trajectory.polynomial import PiecewisePolynomial, join
 
 # Factor on the limits when `beyond_reach` computes how far a quadrotor can fly. Solved plans exceed
 # their limits by far less than 1 %.
@@ -207,45 +207,6 @@ def body_rate(acc: Components, jerk: Components, gravity: Array) -> tuple[Array,
     return -(dy - y * sway - y * dz), dx - x * sway - x * dz, (y * dx - x * dy) * k
 
 
-def rotor_thrusts(
-    acc: Components,
-    jerk: Components,
-    snap: Components,
-    gravity: Array,
-    rotors: RotorLimits,
-    pull: Array | None = None,
-) -> tuple[Array, ...]:
-    """Return the thrusts (...) [N] that R rotors need for a motion at zero heading.
-
-    Acceleration [m/s^2], jerk [m/s^3] and snap [m/s^4] are (..., 3), gravity is () [m/s^2]. `pull`
-    is the thrust per unit mass (...) [m/s^2], by default |acceleration + gravity e_3|.
-    """
-    a, j, s = (tuple(components(each)) for each in (acc, jerk, snap))
-    rate, turning = jax.jvp(lambda acc, jerk: body_rate(acc, jerk, gravity), (a, j), (j, s))
-    x, y, z = a
-    if pull is None:
-        pull = jnp.sqrt(at_least(x * x + y * y + (z + gravity) ** 2, 1e-4))
-    thrust = rotors.mass * pull
-    about_x, about_y, about_z = (rotors.inertia[..., k] for k in range(3))
-    roll = about_x * turning[0] + (about_z - about_y) * rate[1] * rate[2]
-    pitch = about_y * turning[1] + (about_x - about_z) * rate[2] * rate[0]
-    yaw = about_z * turning[2] + (about_y - about_x) * rate[0] * rate[1]
-    if rotors.inertia.shape[-1] == 6:  # the matrix P of the products adds  P w' + w x P w
-        xy, xz, yz = (rotors.inertia[..., k] for k in range(3, 6))
-        (own, bent) = (
-            (xy * v[1] + xz * v[2], xy * v[0] + yz * v[2], xz * v[0] + yz * v[1])
-            for v in (rate, turning)
-        )
-        roll += bent[0] + rate[1] * own[2] - rate[2] * own[1]
-        pitch += bent[1] + rate[2] * own[0] - rate[0] * own[2]
-        yaw += bent[2] + rate[0] * own[1] - rate[1] * own[0]
-    rows = (rotors.mixer[..., i, :] for i in range(rotors.mixer.shape[-2]))
-    return tuple(
-        row[..., 0] * thrust + row[..., 1] * roll + row[..., 2] * pitch + row[..., 3] * yaw
-        for row in rows
-    )
-
-
 def tangent_basis(normal: Array) -> tuple[Array, Array]:
     """Return the body's x and y axes (3,) at zero heading for its z axis `normal` (3,)."""
     x, y, z = components(normal)
@@ -254,48 +215,6 @@ def tangent_basis(normal: Array) -> tuple[Array, Array]:
         jnp.stack([1.0 - k * x * x, -k * x * y, -x]),
         jnp.stack([-k * x * y, 1.0 - k * y * y, -y]),
     )
-
-
-def flat_attitude(acc: Array, jerk: Array, gravity: Array) -> tuple[Array, Array]:
-    """Return rotation (3, 3) from body to world, and body rate (3,) [rad/s], at zero heading.
-
-    Without thrust the body is upright. The rate is bounded there and near upside down, where the
-    rate of the Hopf fibration has no limit.
-    """
-    w, x, y, _ = components(tilt_quaternion(acc, gravity))
-    axes = (
-        jnp.stack([1.0 - 2.0 * y * y, 2.0 * x * y, -2.0 * w * y]),
-        jnp.stack([2.0 * x * y, 1.0 - 2.0 * x * x, 2.0 * w * x]),
-        jnp.stack([2.0 * w * y, -2.0 * w * x, w * w - x * x - y * y]),
-    )
-    z = axes[2]
-    size = jnp.sqrt(jnp.maximum(jnp.sum(net_thrust(acc, gravity) ** 2), 1e-2))
-    z_dot = (jerk - jnp.sum(jerk * z) * z) / size
-    twist = (z[1] * z_dot[0] - z[0] * z_dot[1]) / jnp.maximum(1.0 + z[2], 1e-2)
-    rate = jnp.stack([-jnp.sum(axes[1] * z_dot), jnp.sum(axes[0] * z_dot), twist])
-    return jnp.stack(axes, axis=1), rate
-
-
-def tilt_quaternion(acc: Array, gravity: Array) -> Array:
-    """Return the attitude at zero heading, a unit quaternion (4,) w x y z, for an acceleration.
-
-    It is the shortest rotation from upright to the thrust direction z [Watterson2020]:
-    (1 + z_z, -z_y, z_x, 0) / sqrt(2 (1 + z_z)). Below the horizontal the equal expression
-    (|z_xy|, -(1 - z_z) z_y / |z_xy|, (1 - z_z) z_x / |z_xy|, 0) / sqrt(2 (1 - z_z)) has no small
-    denominator. Exactly upside down every horizontal axis is shortest, and the y axis is selected.
-    Without thrust the attitude is upright.
-    """
-    normal = body_z(acc, gravity)
-    x, y, z = components(normal)
-    z = jnp.where(jnp.any(normal != 0.0), z, 1.0)
-    across = x * x + y * y
-    has_side = across > 0.0
-    side = jnp.sqrt(jnp.where(has_side, across, 1.0))
-    half = jnp.sqrt(0.5 + 0.5 * jnp.abs(z))  # the greater one of sine and cosine of half the tilt
-    less = jnp.where(has_side, 0.5 * side / half, 0.0)
-    cosine, sine = jnp.where(z < 0.0, less, half), jnp.where(z < 0.0, half, less)
-    turn_x, turn_y = jnp.where(has_side, -y / side, 0.0), jnp.where(has_side, x / side, 1.0)
-    return jnp.stack([cosine, sine * turn_x, sine * turn_y, jnp.zeros_like(z)])
 
 
 def greatest_speed(head_state: Array, limits: QuadrotorLimits) -> Array:
@@ -412,32 +331,12 @@ class QuadrotorPlan(Plan, Located):
         Raises:
             ValueError: the rate is not positive.
         """
-        from planner_jax.robot.setpoints import sample_at_rate  # imported only if needed
+        # These modules are imported only if needed.
+        from planner_jax.robot.attitude import setpoint_at
+        from planner_jax.robot.setpoints import sample_at_rate
 
         path = jax.tree.map(np.asarray, self).whole
         ends = np.sum(path.durations, axis=-1)
         air = jax.tree.map(np.asarray, self.air)
         found = sample_at_rate(rate, ends, (path, self.gravity, air), setpoint_at)
         return QuadrotorSetpoints(**{**found, "pos": to_world(found["pos"], self.origin)})
-
-
-def setpoint_at(
-    leaves: tuple[PiecewisePolynomial, Array, Air | None], time: Array
-) -> dict[str, Array]:
-    """Return the `QuadrotorSetpoints`, except `time`, of (path, gravity, air) at a time () [s]."""
-    path, gravity, air = leaves
-    pos, vel, acc, jerk = (evaluate(path, time, order) for order in range(4))
-    load, load_jerk = add_drag(air, vel, acc), add_drag_rate(air, acc, jerk)
-    if air is None:
-        thrust = jnp.sqrt(jnp.sum(net_thrust(acc, gravity) ** 2))
-    else:
-        thrust = thrust_in_air(air, vel, load, gravity)
-    return {
-        "pos": pos,
-        "vel": vel,
-        "acc": acc,
-        "jerk": jerk,
-        "quat_wxyz": tilt_quaternion(load, gravity),
-        "body_rate": flat_attitude(load, load_jerk, gravity)[1],
-        "thrust": thrust,
-    }

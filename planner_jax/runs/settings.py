@@ -8,13 +8,13 @@ from planner_jax.core.choices import (
     CHOICES,
     NONE,
     require,
-    require_disk,
     require_one_of,
     require_seed,
     require_size,
 )
 from planner_jax.core.errors import ArgumentError, PlannerJaxError
 from planner_jax.core.registry import Task, require_name
+from planner_jax.core.room import require_disk
 
 AnySettings = TypeVar("AnySettings", bound="SweepSettings")
 KnownSettings = TypeVar("KnownSettings")

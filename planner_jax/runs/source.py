@@ -8,8 +8,9 @@ import jax
 import numpy as np
 from jaxtyping import PyTree
 
-from planner_jax.core.choices import require, require_memory
+from planner_jax.core.choices import require
 from planner_jax.core.registry import Task
+from planner_jax.core.room import require_memory
 from planner_jax.runs.manifest import Entries
 from planner_jax.runs.settings import SweepSettings
 

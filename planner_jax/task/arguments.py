@@ -13,7 +13,7 @@ from jax import Array
 from jax.typing import ArrayLike, DTypeLike
 
 from planner_jax.core import checks
-from planner_jax.core.choices import require_memory, require_size
+from planner_jax.core.choices import require_size
 from planner_jax.core.errors import ArgumentError, ArgumentTypeError
 from planner_jax.core.origin import has_origin
 from planner_jax.core.protocol import Decision, Plan, take
@@ -22,6 +22,7 @@ from planner_jax.core.rules import NOT_NEGATIVE, Case
 
 TreeT = TypeVar("TreeT")
 
+_FEW = 1000  # number of drawn cases that fit in every memory
 _DRAWN_BYTES = 1_000  # [B], estimated memory of one case of a suite
 
 
@@ -68,7 +69,10 @@ def require_draw(num: int, seed: int, first: int) -> None:
     """Raise unless num >= 1, seed >= 0, first case's index >= 0, and `num` cases fit in memory."""
     for name, value, least in (("num", num, 1), ("seed", seed, 0), ("first", first, 0)):
         require_size(name, value, least)
-    require_memory("num", num, _DRAWN_BYTES)
+    if num > _FEW:
+        from planner_jax.core.room import require_memory  # few cases always fit
+
+        require_memory("num", num, _DRAWN_BYTES)
 
 
 def make_generators(suite: str, num: int, seed: int, first: int) -> list[np.random.Generator]:

@@ -23,8 +23,9 @@ from planner_jax.sweep.quadrotor_settings import robot_remark
 from planner_jax.sweep.rows import quadrotor_plan
 from planner_jax.sweep.sweep import RunFigure, Sweep, first_values
 from planner_jax.task.hit.court import check_cases
+from planner_jax.task.hit.published import read_serves
 from planner_jax.task.hit.spec import REAL_SCENARIOS, TASK
-from planner_jax.task.hit.suites import Serves, generate_serves, read_serves, to_cases
+from planner_jax.task.hit.suites import Serves, generate_serves, to_cases
 
 
 @dataclasses.dataclass(frozen=True)

@@ -7,6 +7,6 @@ from .case import case as case
 from .default_planner import ExactHit as ExactHit
 from .plan import HitPlan as HitPlan
 from .plan import Stroke as Stroke
+from .published import read_serves as read_serves
 from .suites import generate_serves as generate_serves
-from .suites import read_serves as read_serves
 from .suites import to_cases as to_cases

@@ -15,7 +15,8 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array, lax
 
-from planner_jax.robot.quadrotor import flat_attitude, net_thrust
+from planner_jax.robot.attitude import flat_attitude
+from planner_jax.robot.quadrotor import net_thrust
 from planner_jax.robot.quadrotor_model import QuadrotorModel
 from planner_jax.sims.model import World
 from planner_jax.sims.robot import rotation

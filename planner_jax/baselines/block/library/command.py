@@ -17,11 +17,11 @@ from planner_jax.baselines.block.library.table import Library, Setting, fingerpr
 from planner_jax.core.arithmetic import host_leaf
 from planner_jax.core.choices import (
     require,
-    require_memory,
     require_one_of,
     require_seed,
     require_size,
 )
+from planner_jax.core.room import require_memory
 from planner_jax.robot.arm import REGIMES
 from planner_jax.robot.arm_file import irb1600, read_arm
 from planner_jax.runs import style
