@@ -8,20 +8,25 @@ velocity and acceleration of the plan and with yaw 0. "feed-forward" has the sam
 the plan's thrust, attitude and body rate. The table has the distance from the plan at the contact,
 its greatest value in the recovery, how many recoveries stay within 20 cm, and in how many flights a
 rotor saturates. Robots are RotorPy's Hummingbird and Crazyflie Brushless, and the Agilicious
-quadrotor of 0.752 kg [Foehn2022]; tools and limits are assumptions. The air is still, and RotorPy's
-aerodynamics are off. RotorPy is in the extra `peers`.
+quadrotor of 0.752 kg [Foehn2022]; tools and limits are assumptions. RotorPy's aerodynamics are off,
+or on with a wind of 0 or 3 m/s along x. Then plans know the wind and the rotors' drag at the
+speed of hover. RotorPy is in the extra `peers`.
 """
 
+import dataclasses
 import importlib
 import importlib.util
+import itertools
 from types import SimpleNamespace
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 import planner_jax as pj
 from planner_jax.benchmarks.run import argument_parser, begin
+from planner_jax.robot.quadrotor import Air
 from planner_jax.robot.quadrotor_model import GRAVITY, FlightLimits, QuadrotorModel, Rotors, Tool
 
 RATE = 500.0  # [Hz], of setpoints, controllers and simulation
@@ -64,6 +69,18 @@ def model_of(name: str, params: dict[str, Any], speed: float, tool: Tool) -> Qua
     return QuadrotorModel(name, params["mass"], inertia, rotors, tool, limits)
 
 
+def air_of(params: dict[str, Any], wind: float, num: int) -> Air:
+    """Return the drag of RotorPy's rotors at hover, for `num` cases with a wind [m/s] along x.
+
+    RotorPy's rotors have the drag  k_d Omega v  across and  k_z Omega v  along the thrust, for the
+    rotor speed Omega. The quadratic drag of the body is left out, and so is the translational lift.
+    """
+    speeds = 4.0 * np.sqrt(0.25 * params["mass"] * GRAVITY / params["k_eta"])
+    drags = (params[name] * speeds / params["mass"] for name in ("k_d", "k_z"))
+    leaves = (*drags, np.array([wind, 0.0, 0.0]))
+    return Air(*(jnp.asarray(np.tile(x, (num, *np.ones_like(np.shape(x)))), "f4") for x in leaves))
+
+
 def track(own: Any, state: dict[str, np.ndarray], at: SimpleNamespace) -> np.ndarray:
     """Return thrusts (4,) [N] of RotorPy's rotors that track a setpoint.
 
@@ -86,8 +103,8 @@ def track(own: Any, state: dict[str, np.ndarray], at: SimpleNamespace) -> np.nda
     return own.TM_to_f @ np.append(own.mass * force @ R[:, 2], torque)
 
 
-def fly(plan: Any, params: dict[str, Any], controller: str) -> dict[str, float]:
-    """Fly one plan in RotorPy by a controller, "SE3" or "feed-forward".
+def fly(plan: Any, params: dict[str, Any], controller: str, wind: float | None) -> dict[str, float]:
+    """Fly one plan in RotorPy by a controller, "SE3" or "feed-forward"; wind None: no aerodynamics.
 
     Returns the distance from the plan at the contact, its greatest value in the recovery [m], and
     the share of control steps in which a rotor saturates.
@@ -101,9 +118,9 @@ def fly(plan: Any, params: dict[str, Any], controller: str) -> dict[str, float]:
     ahead = np.minimum(np.arange(len(quats)) + round(lag * RATE), len(quats) - 1)
     turning = np.gradient(points.body_rate, 1.0 / RATE, axis=0)[ahead]
     state = {"x": points.pos[0], "v": points.vel[0], "q": quats[0], "w": np.zeros(3)}
-    state["wind"] = np.zeros(3)
+    state["wind"] = np.array([wind or 0.0, 0.0, 0.0])
     state["rotor_speeds"] = np.full(4, np.sqrt(0.25 * params["mass"] * GRAVITY / params["k_eta"]))
-    vehicle = multirotor(params, state, "cmd_motor_thrusts", aero=False)
+    vehicle = multirotor(params, state, "cmd_motor_thrusts", aero=wind is not None)
     most = params["k_eta"] * params["rotor_speed_max"] ** 2
     apart, saturated = np.zeros(len(quats)), np.zeros(len(quats), bool)
     for k, (pos, vel, acc) in enumerate(zip(points.pos, points.vel, points.acc, strict=True)):
@@ -133,32 +150,37 @@ def main() -> None:
     }
     with begin(parser, options) as bench:
         bench.say(
-            "| robot, task, controller | flights | contact, mean cm | contact, max cm "
+            "| robot, task, air, controller | flights | contact, mean cm | contact, max cm "
             "| recovery, max cm | recoveries within 20 cm | flights that saturate |",
             "|---|---|---|---|---|---|---|",
         )
-        for name, (params, speed) in robots().items():
-            for task, (module, tool) in tasks.items():
-                robot = model_of(name, params, speed, tool)
-                cases = module.draw(options.num, seed=options.seed, robot=robot)
-                plans = pj.plan(module.planner(recovery="brake"), cases)
-                good = np.asarray(module.judge(cases, plans).success)
-                bench.count(good)
-                for controller in ("feed-forward", "SE3"):
-                    some = [pj.take(plans, k) for k in np.flatnonzero(good)]
-                    flights = [fly(each, params, controller) for each in some]
-                    contact, recovery, saturated = (
-                        np.array([each[key] for each in flights])
-                        for key in ("contact", "recovery", "saturated")
-                    )
-                    of = {"contact": contact, "recovery": recovery, "saturated": saturated}
-                    bench.row(robot=name, task=task, controller=controller, **of)
-                    bench.say(
-                        f"| {name}, {task}, {controller} | {len(some)} "
-                        f"| {100 * contact.mean():.2f} | {100 * contact.max():.2f} "
-                        f"| {100 * recovery.max():.1f} | {(recovery <= NEAR).sum()} "
-                        f"| {(saturated > 0).sum()} |"
-                    )
+        for name, task, wind in itertools.product(robots(), tasks, (None, 0.0, 3.0)):
+            (params, speed), (module, tool) = robots()[name], tasks[task]
+            cases = module.draw(
+                options.num, seed=options.seed, robot=model_of(name, params, speed, tool)
+            )
+            if wind is not None:
+                limits = cases.limits.replace(air=air_of(params, wind, options.num))
+                cases = dataclasses.replace(cases, limits=limits)
+            plans = pj.plan(module.planner(recovery="brake"), cases)
+            good = np.asarray(module.judge(cases, plans).success)
+            bench.count(good)
+            for controller in ("feed-forward", "SE3")[: 2 if wind is None else 1]:
+                some = [pj.take(plans, k) for k in np.flatnonzero(good)]
+                flights = [fly(each, params, controller, wind) for each in some]
+                contact, recovery, saturated = (
+                    np.array([each[key] for each in flights])
+                    for key in ("contact", "recovery", "saturated")
+                )
+                of = {"contact": contact, "recovery": recovery, "saturated": saturated}
+                bench.row(robot=name, task=task, wind=wind, controller=controller, **of)
+                air = "off" if wind is None else f"wind {wind:g} m/s"
+                bench.say(
+                    f"| {name}, {task}, {air}, {controller} | {len(some)} "
+                    f"| {100 * contact.mean():.2f} | {100 * contact.max():.2f} "
+                    f"| {100 * recovery.max():.1f} | {(recovery <= NEAR).sum()} "
+                    f"| {(saturated > 0).sum()} |"
+                )
 
 
 if __name__ == "__main__":

@@ -3,7 +3,8 @@
 import dataclasses
 from typing import ClassVar
 
-from planner_jax.core.choices import require, require_memory, require_seed
+from planner_jax.core.choices import require, require_seed
+from planner_jax.core.room import require_memory
 from planner_jax.runs.settings import option, require_count
 from planner_jax.task.catch.spec import SUITES
 
