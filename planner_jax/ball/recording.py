@@ -34,8 +34,9 @@ _ROUNDS = (2, 4)  # numbers of linearisations of a short and of a longer flight
 _WEIGHINGS = 3  # number of weighted least-squares problems for each linearisation
 _LEAST = 4  # least number of observations
 _BOUNCES = 2  # number of bounces that are simulated
-# Pairs of observations, of which each yields a first guess of the flight: the first observation and
-# the time between both, as fractions of the recording. The fractions are quasi-random numbers.
+# Each row selects a pair of observations, from which a first guess of the flight is made. A row has
+# the time of the first observation, and the time from there to the second one, as fractions of the
+# recording's duration. The fractions are quasi-random numbers.
 _PAIRS = 0.6 * (np.arange(1, 17)[:, None] * [0.618034, 0.754878] % 1.0)
 # Numbers of Runge-Kutta steps of a flight, and greatest products of drag and distance for them.
 _STEPS = ((2, 0.25), (4, 1.0), (12, math.inf))
@@ -47,7 +48,7 @@ _MOST_LIFT = 8.0  # greatest length of the lift vector, in standard deviations
 
 @dataclass(frozen=True)
 class Ball:
-    """What is known about a ball, and about the plane on which it bounces, before its flight.
+    """Properties of a ball, and of the plane on which it bounces, as known before its flight.
 
     The default is an unknown ball. `spin_bounce` states the model of a bounce.
     """
@@ -101,7 +102,7 @@ class Prediction:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return bounds (T, 3) [m] between which each coordinate is with the probability.
 
-        With `observed`, the coordinates are those of an observation, with its noise.
+        With `observed`, the bounds are for an observed position, which has noise.
         """
         require(0.0 < probability < 1.0, "probability", "> 0 and < 1", probability)
         covariance = self.observed_covariance if observed else self.covariance
@@ -343,7 +344,8 @@ def _estimate(rows: Array, floor: Array, numbers: Array, counts: tuple[int, int]
         states[best],
         jnp.sort(jnp.where(present, away[best], jnp.inf))[(0.5 * num).astype(jnp.int32)],
     )
-    # Prior of the unknowns after position and velocity; the lift's frame is that of the flight.
+    # Prior distribution of the unknowns after position and velocity. The lift vector has the axes
+    # of `Ball.lift_spread`: forward, to the side, and perpendicular to both.
     speed = jnp.sqrt(at_least(jnp.sum(state[3:6] ** 2), 1e-6))
     forward = state[3:6] / speed
     side = jnp.stack([-forward[1], forward[0] + 1e-6, jnp.zeros_like(speed)])

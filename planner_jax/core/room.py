@@ -1,4 +1,4 @@
-"""Whether memory and disk have room for so many cases or rows; no import of JAX."""
+"""Checks that memory and disk have room for a number of cases or rows; no import of JAX."""
 
 import os
 

@@ -67,7 +67,7 @@ class _Track:
     time: float  # [s], of the last observation that was used
     num: int = 1  # number of observations that were used
     spread: float = math.inf  # [m/s], greatest standard deviation of a velocity component
-    score: float = 1.0  # number of used observations, of which earlier ones count less
+    score: float = 1.0  # number of used observations; earlier observations count less
 
 
 class Sight:

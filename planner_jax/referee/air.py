@@ -8,10 +8,10 @@ from planner_jax.referee.quadrotor import Pieces, motion_of, norm_squared
 
 
 def load_pieces(pieces: Pieces, case: dict) -> Pieces:
-    """Return pieces q whose second derivative is  a + d (v - w) , or `pieces` if there is no air.
+    """Return pieces q whose second derivative is  a + d (v - w) , or `pieces` if drag is absent.
 
-    Thrust direction and body rate of q without drag are those of `pieces` with the drag d [1/s]
-    across the thrust and the wind w [m/s] [Faessler2018]. For the position p,
+    With the drag d [1/s] across the thrust and the wind w [m/s], `pieces` need the thrust direction
+    and the body rate that q would need without drag [Faessler2018]. For the position p,
     q = p + d (integral of p from 0 to t) - d w t^2 / 2 .
     """
     if "limits.air.drag" not in case:

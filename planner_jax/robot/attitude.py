@@ -1,6 +1,6 @@
 """Attitude, body rate and thrust of a quadrotor along a plan, at zero heading.
 
-The heading is that of the Hopf fibration; `planner_jax.robot.quadrotor` states it.
+The heading is zero in the sense of the Hopf fibration, see `planner_jax.robot.quadrotor`.
 """
 
 import jax.numpy as jnp

@@ -57,7 +57,7 @@ def _read(file: str | None, tip: str | None, shield: str | None) -> Arm:
 class ShieldArm:
     """A simulated arm with a shield, by default the IRB 1600; static under `jax.jit`.
 
-    Masses and inertias are those of the arm's file, without friction.
+    The bodies have the masses and inertias of the arm's file. The joints have no friction.
     """
 
     base_height: float = 0.0  # [m], height of the base frame above the ground
