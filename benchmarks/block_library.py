@@ -47,6 +47,7 @@ from planner_jax.baselines.block.library.table import (
     unpack_rows,
 )
 from planner_jax.benchmarks.run import Bench, argument_parser, begin, parse_names
+from planner_jax.core import GRAVITY
 from planner_jax.robot.arm import REGIMES
 from planner_jax.robot.arm_file import irb1600
 from planner_jax.runs.timing import CompileClock
@@ -172,7 +173,7 @@ class OneBall:
     adapted to the ball.
     """
 
-    def __init__(self, library: Library, gravity: float = 9.81, home: int = 0):
+    def __init__(self, library: Library, gravity: float = GRAVITY, home: int = 0):
         """Compile the lookup of motions that start at the library's home pose with index `home`.
 
         `gravity` is in [m/s^2].
@@ -242,7 +243,7 @@ def batch_queries(bench: Bench, library: Library, batch: int) -> None:
     pick = np.random.default_rng(SEED).integers(0, 2000, batch)
     balls = jax.device_put(jax.tree.map(lambda leaf: np.asarray(leaf)[pick], cases.ball))
     table = jax.device_put(library.table)
-    gravity = jnp.asarray(9.81, jnp.float32)
+    gravity = jnp.asarray(GRAVITY, jnp.float32)
     _, compiling = time_call(lambda: jax.block_until_ready(look_up(table, balls, gravity)))
 
     def rounds() -> None:

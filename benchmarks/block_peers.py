@@ -37,6 +37,7 @@ from jax import Array
 
 import planner_jax as pj
 from planner_jax.benchmarks.run import Bench, argument_parser, begin, parse_names
+from planner_jax.core import GRAVITY
 from planner_jax.referee.block import BlockVerdict
 from planner_jax.robot.arm import Arm
 from planner_jax.robot.arm_dynamics import inverse_dynamics
@@ -92,7 +93,7 @@ class Torques:
 
 
 def motion_torques(
-    arm: Arm, motion: PiecewisePolynomial, gravity: float | Array = 9.81, samples: int = 256
+    arm: Arm, motion: PiecewisePolynomial, gravity: float | Array = GRAVITY, samples: int = 256
 ) -> Torques:
     """Return RMS and greatest joint torques of a motion, as in Table II of [Natarajan2024].
 
@@ -174,7 +175,7 @@ def run_planner(planner: Any, cases: Any, warm: Any, *, lasts: bool) -> Outcome:
         counted = verdict.success & (cases.delay + query + execution <= plans.contact_time)
     torques = jax.jit(jax.vmap(motion_torques, (0, 0, None)))
     with_gravity, without = (
-        jax.tree.map(np.asarray, torques(cases.arm, motion, gravity)) for gravity in (9.81, 0.0)
+        jax.tree.map(np.asarray, torques(cases.arm, motion, gravity)) for gravity in (GRAVITY, 0.0)
     )
     found = is_found(plans, verdict)
     return Outcome(verdict, found, counted, query, execution, with_gravity, without)

@@ -49,6 +49,7 @@ from jax import Array
 import planner_jax as pj
 from planner_jax.ball.flight import BallState, drag_free_flight
 from planner_jax.benchmarks.run import Bench, argument_parser, begin, parse_names
+from planner_jax.core import GRAVITY
 from planner_jax.robot.arm_file import irb1600
 from planner_jax.runs.summary import percent, wilson_interval
 from planner_jax.runs.timing import measure_warm
@@ -270,7 +271,7 @@ def report_times(
 
     # The fit takes NumPy arrays, because a real camera delivers positions to the host. The arrays
     # have a constant size, so that the fit is compiled only once.
-    until, gravity = np.asarray(times), np.float32(9.81)
+    until, gravity = np.asarray(times), np.float32(GRAVITY)
     jax.block_until_ready(fit(until, places, gravity))
     fit_seconds = []
     for _ in range(TIMED):

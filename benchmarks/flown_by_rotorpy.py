@@ -26,8 +26,9 @@ from scipy.spatial.transform import Rotation
 
 import planner_jax as pj
 from planner_jax.benchmarks.run import argument_parser, begin
+from planner_jax.core import GRAVITY
 from planner_jax.robot.quadrotor import Air
-from planner_jax.robot.quadrotor_model import GRAVITY, FlightLimits, QuadrotorModel, Rotors, Tool
+from planner_jax.robot.quadrotor_model import FlightLimits, QuadrotorModel, Rotors, Tool
 
 RATE = 500.0  # [Hz], of setpoints, controllers and simulation
 NEAR = 0.2  # [m], greatest distance from the plan of a recovery that counts as flown

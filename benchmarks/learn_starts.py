@@ -40,6 +40,7 @@ from planner_jax.benchmarks.run import Bench, argument_parser, begin
 from planner_jax.optimise.shipped import StartNetwork
 from planner_jax.planning.decided import first_choice
 from planner_jax.task.hit.default_planner import WITH_VELOCITIES
+from planner_jax.task.hit.suites import GRAVITY
 
 _POOL = 262_144  # Number of cases that are drawn once, from which all training batches are sampled.
 _BATCH = 8192  # Number of cases in a training batch.
@@ -84,7 +85,7 @@ def draw_hits(num: int, seed: int) -> pj.hit.HitCase:
     delay = np.where(late, random.uniform(0.0, 0.7, half), 0.0)[:, None]
     head = _add_motion(random, varied.head_state)
     head[:, 0] += random.normal(size=(half, 3)) * (0.6, 0.6, 0.25)
-    fall = np.array([0.0, 0.0, -9.8])
+    fall = np.array([0.0, 0.0, -GRAVITY])
     varied = dataclasses.replace(
         varied,
         ball=dataclasses.replace(

@@ -18,10 +18,12 @@ from planner_jax.robot.arm_dynamics import (
     sample_states,
     stretch,
 )
+from planner_jax.robot.arm_file import irb1600
 from planner_jax.task.block.default_planner import OnlineBlock, Search
 from planner_jax.task.block.end_poses import end_poses, flight_of
 from planner_jax.task.block.motion import polynomial
 from planner_jax.task.block.scene import paper_scene
+from planner_jax.task.reach.default_planner import ReachPlan
 from planner_jax.task.reach.default_planner import Search as Direct
 
 float64 = pytest.mark.usefixtures("float64")
@@ -52,9 +54,9 @@ def test_torques_are_those_of_the_referees_mujoco_model(kind):
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-8)
 
 
-def pendulum():
+def pendulum(arm):
     """Return an arm whose only mass is at the distance `LENGTH` from its horizontal axis 2."""
-    arm, only = ur_like(), np.arange(6) == 1
+    only = np.arange(6) == 1
     return dataclasses.replace(
         arm,
         mass=MASS * only,
@@ -67,7 +69,8 @@ def pendulum():
 @pytest.mark.parametrize(("angle", "rate", "rise"), [(0.3, 0.0, 0.0), (-1.1, 4.0, 7.0)])
 def test_a_pendulum_has_the_torque_of_its_weight_and_its_moment_of_inertia(angle, rate, rise):
     only = np.arange(6) == 1
-    torque = inverse_dynamics(pendulum(), angle * only, rate * only, rise * only, GRAVITY)[1]
+    motion = angle * only, rate * only, rise * only
+    torque = inverse_dynamics(pendulum(ur_like()), *motion, GRAVITY)[1]
     weight = MASS * GRAVITY * LENGTH * np.cos(angle)
     assert torque == pytest.approx(weight + (SPIN + MASS * LENGTH**2) * rise, rel=1e-12)
 
@@ -152,6 +155,17 @@ def test_weak_motors_block_with_less_torque_or_report_that_they_are_weak(brisk):
     assert not pj.are_solved(plan) and pj.block.judge(weak, plan).failed_limit == "torque"
     assert "motors may be too weak" in pj.block.prospects(weak).sentence()
     assert pj.block.prospects(throw()).torque == 0.0
+
+
+@pytest.mark.parametrize("gravity", [0.0, 1.62, 9.81])
+def test_the_torques_of_an_arm_that_waits_are_of_the_gravity_of_its_case(gravity):
+    arm = pendulum(irb1600())
+    limits = dataclasses.replace(arm.limits, torque=np.full(6, 50.0))
+    case = pj.reach.case(np.zeros(6), angles=np.zeros(6), arm=arm, limits=limits, gravity=gravity)
+    waits = pj.PiecewisePolynomial(np.zeros((1, 3, 6)), np.ones(1))
+    verdict = pj.reach.judge(case, ReachPlan(0.0, 0.0, 0, 0, motion=waits, goal=0))
+    weight = MASS * gravity * LENGTH
+    assert verdict.torque_share == pytest.approx(weight / 50.0, rel=1e-6, abs=1e-12)
 
 
 @pytest.mark.slow

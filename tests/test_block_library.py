@@ -10,13 +10,14 @@ import planner_jax as pj
 from planner_jax.ball.flight import drag_free_flight
 from planner_jax.baselines.block.library import build as building
 from planner_jax.baselines.block.library import cells, command, table
-from planner_jax.baselines.block.library.cells import GRAVITY, LAYOUTS, Face, Layout, tunnels
+from planner_jax.baselines.block.library.cells import LAYOUTS, Face, Layout, tunnels
 from planner_jax.baselines.block.library.coverage import check, coverage
 from planner_jax.baselines.block.library.file import load_library, save_library
 from planner_jax.baselines.block.library.planner import LibraryBlock
 from planner_jax.baselines.block.library.table import Setting, library_of, pack_rows
 from planner_jax.benchmarks.block_library import OneBall
 from planner_jax.cli.main import main
+from planner_jax.core import GRAVITY
 from planner_jax.core.errors import ArgumentError
 from planner_jax.robot.arm import REGIMES
 from planner_jax.robot.arm_file import irb1600

@@ -16,6 +16,7 @@ from test_block_library import make_library
 import planner_jax as pj
 from planner_jax.baselines.block.library.file import save_library
 from planner_jax.cli.main import main
+from planner_jax.core import GRAVITY
 from planner_jax.core.errors import ArgumentError
 from planner_jax.referee.arm_clearance import KINDS
 from planner_jax.robot.arm import shield_pose
@@ -48,7 +49,6 @@ from planner_jax.sims.tasks.intercept import CAR_WORLD
 from planner_jax.sims.view import Viewer
 from planner_jax.task.block.motion import polynomial, profiles
 from planner_jax.task.block.scene import FLOOR
-from planner_jax.task.block.suites import GRAVITY
 
 HOME, LANES = np.asarray(irb1600().home), 4  # all batches are of one size: one program
 TURN = np.array([-0.4, -0.5, 0.4, 0.6, -0.5, 0.8])  # [rad], of a motion without collisions

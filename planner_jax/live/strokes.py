@@ -20,12 +20,12 @@ from jaxtyping import Float, PyTree
 from planner_jax.ball.estimation import Flight
 from planner_jax.ball.flight import BallState, linear_drag_flight, rk4_step
 from planner_jax.ball.target import BallPath
+from planner_jax.core import GRAVITY
 from planner_jax.optimise.planner import OptimisedPlanner
 from planner_jax.optimise.settings import LbfgsConfig, Round
 from planner_jax.planning.programs import call_packed, solve_cases
 from planner_jax.planning.replan import Replanning
 from planner_jax.robot.quadrotor_model import PAPER_CATCHER, PAPER_HITTER, QuadrotorModel
-from planner_jax.task.catch.case import GRAVITY as CATCH_GRAVITY
 from planner_jax.task.catch.case import CatchCase
 from planner_jax.task.catch.case import case as catch_case
 from planner_jax.task.catch.decide import Greedy
@@ -185,7 +185,7 @@ class CatchStroke(Stroke[CatchCase, CatchPlan]):
     shortest = 0.15
 
     def __init__(self, robot: QuadrotorModel = PAPER_CATCHER, *, drag: float = CATCH_DRAG) -> None:
-        zero, gravity = jnp.zeros((1, 3)), jnp.full(1, CATCH_GRAVITY, jnp.float32)
+        zero, gravity = jnp.zeros((1, 3)), jnp.full(1, GRAVITY, jnp.float32)
         path = BallPath(BallState(zero, zero), jnp.full((1, 3), drag, jnp.float32), gravity)
         case = catch_case(path, np.ones(1, np.float32), robot=robot)
         planner = ExactCatch()

@@ -198,7 +198,7 @@ def _judge(
     samples = state(time, np.append(piece, len(index) - 1), 0)
     measured["torque_share"] = 0.0
     if limits.torque is not None:
-        compare = Dynamics(functools.partial(getattr, arm), 9.81).compare
+        compare = Dynamics(functools.partial(getattr, arm), float(case.gravity)).compare
         of_plan = coeffs.transpose(1, 2, 0), durations, limits.torque
         excess, at, joint = compare(*of_plan, stays=True)
         tests["torque"], parts["torque"] = (excess > relative, excess, at), names[joint]

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
+from planner_jax.core import GRAVITY
 from planner_jax.robot.arm import Arm, ArmLimits, joint_axes, link_frames, product
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, derivative_factors
 
@@ -18,7 +19,7 @@ USED = 0.99
 
 
 def inverse_dynamics(
-    arm: Arm, angles: Array, velocity: Array, acceleration: Array, gravity: float | Array = 9.81
+    arm: Arm, angles: Array, velocity: Array, acceleration: Array, gravity: float | Array = GRAVITY
 ) -> Array:
     """Return the joint torques (n,) [N m] of a motion, without friction.
 

@@ -12,10 +12,9 @@ from collections.abc import Callable
 
 import numpy as np
 
+from planner_jax.core import GRAVITY
 from planner_jax.core.choices import require
 from planner_jax.core.errors import ArgumentError
-
-GRAVITY = 9.81  # [m/s^2], used to check that the quadrotor can hover
 
 RECOVERY_TILT = math.radians(40.0)  # [rad], default of `FlightLimits.recovery_tilt`
 # [rad], at least this much more than the tilt at its start is allowed to a recovery

@@ -9,9 +9,9 @@ massless. All limits, and the tools of Crazyflie, racer and X500, are assumption
 import dataclasses
 import math
 
+from planner_jax.core import GRAVITY
 from planner_jax.core.errors import UnknownName
 from planner_jax.robot.quadrotor_model import (
-    GRAVITY,
     NET,
     PAPER_CATCHER,
     PAPER_HITTER,

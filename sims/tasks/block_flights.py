@@ -15,6 +15,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from planner_jax.core import GRAVITY
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.plan_files import leaves_by_name
 from planner_jax.core.protocol import is_solved
@@ -35,7 +36,7 @@ from planner_jax.task.block.api import planner as block_planner
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.plan import BlockPlan
 from planner_jax.task.block.scene import FLOOR
-from planner_jax.task.block.suites import BALL_RADIUS, GRAVITY
+from planner_jax.task.block.suites import BALL_RADIUS
 from planner_jax.task.block.suites import draw as draw_throws
 
 BLOCK_ARM = ShieldArm(base_height=-FLOOR)

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from planner_jax.ball.flight import BallState
+from planner_jax.core import GRAVITY
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.planner import Planner
 from planner_jax.planning.decided import DecidedPlanner
@@ -45,7 +46,7 @@ from planner_jax.sims.tasks.catch_ahead import (
 )
 from planner_jax.sims.tasks.catch_pilot import LIFT, CatchPilot
 from planner_jax.task.catch.api import planner as catch_planner
-from planner_jax.task.catch.case import GRAVITY, START, CatchCase
+from planner_jax.task.catch.case import START, CatchCase
 from planner_jax.task.catch.default_planner import ExactCatch
 from planner_jax.task.catch.plan import CatchPlan
 from planner_jax.task.catch.suites import LAUNCH, draw, earliest_throw

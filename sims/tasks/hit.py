@@ -39,13 +39,13 @@ from planner_jax.sims.settings import HitFly
 from planner_jax.sims.task import BallFlightTask, FlightCases, Flights
 from planner_jax.task.hit import court
 from planner_jax.task.hit.api import planner as hit_planner
-from planner_jax.task.hit.case import GRAVITY, HitCase
+from planner_jax.task.hit.case import HitCase
 from planner_jax.task.hit.court import landing
 from planner_jax.task.hit.default_planner import ExactHit
 from planner_jax.task.hit.plan import HitPlan
 from planner_jax.task.hit.replan import ReplanHit
 from planner_jax.task.hit.spec import REAL_SCENARIOS
-from planner_jax.task.hit.suites import DEPTH, SERVE_HEIGHT, generate_serves, to_cases
+from planner_jax.task.hit.suites import DEPTH, GRAVITY, SERVE_HEIGHT, generate_serves, to_cases
 
 # [s], time from a serve to the first plan; the ball flies more than 2 m [Yu2023catch, VII-A].
 SEEN = 0.25

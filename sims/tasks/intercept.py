@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from planner_jax.core import GRAVITY
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.protocol import is_solved
 from planner_jax.plane.obstacles import Obstacles
@@ -38,7 +39,7 @@ from planner_jax.sims.noise import CONTROL_RATE, FRAME_RATE
 from planner_jax.sims.prediction.polynomial_fit import fit_polynomial
 from planner_jax.sims.prediction.select_path import select
 from planner_jax.sims.robots.car.robot import Car
-from planner_jax.sims.robots.car.vehicle import GRAVITY, Vehicle
+from planner_jax.sims.robots.car.vehicle import Vehicle
 from planner_jax.sims.task import FlightCases, Flights
 from planner_jax.task.intercept.api import draw, observe, positions
 from planner_jax.task.intercept.api import planner as intercept_planner

@@ -15,10 +15,9 @@ from planner_jax.core.choices import require
 from planner_jax.core.errors import ArgumentError
 from planner_jax.host.files import open_plain
 from planner_jax.task.hit import court
-from planner_jax.task.hit.case import GRAVITY
 from planner_jax.task.hit.court import landing
 from planner_jax.task.hit.spec import DRAG
-from planner_jax.task.hit.suites import Serves
+from planner_jax.task.hit.suites import GRAVITY, Serves
 
 _FILE_NAME = re.compile(r"([1-4])_([1-4])_([1-4])_([plb])\.csv")
 _FILE_PLANNER = {"p": "bat", "l": "bat-lite", "b": "juggle"}

@@ -8,9 +8,9 @@ from planner_jax.ball.flight import BallState
 from planner_jax.ball.target import BallPath
 from planner_jax.cli.plan.answer import Answer, Margin, Single
 from planner_jax.cli.plan.settings import SingleCatchSettings
+from planner_jax.core import GRAVITY
 from planner_jax.core.origin import to_world
 from planner_jax.core.protocol import take
-from planner_jax.task.catch.case import GRAVITY
 
 
 class SingleCatch(Single[SingleCatchSettings]):

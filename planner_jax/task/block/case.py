@@ -10,7 +10,7 @@ from jax import Array
 from numpy.typing import ArrayLike, DTypeLike
 
 from planner_jax.ball.flight import BallState
-from planner_jax.core import rules
+from planner_jax.core import GRAVITY, rules
 from planner_jax.core.checks import floating, require_kind, require_switch, shape_of
 from planner_jax.core.choices import require
 from planner_jax.core.registry import require_name
@@ -115,7 +115,7 @@ def case(
     arm: Arm | None = None,
     angles: ArrayLike | None = None,
     rates: ArrayLike = 0.0,
-    gravity: ArrayLike = 9.81,
+    gravity: ArrayLike = GRAVITY,
     ball_radius: ArrayLike = 0.0,
     dtype: DTypeLike = jnp.float32,
 ) -> BlockCase:

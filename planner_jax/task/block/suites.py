@@ -10,6 +10,7 @@ import numpy as np
 from jax.typing import DTypeLike
 from scipy.spatial.transform import Rotation
 
+from planner_jax.core import GRAVITY
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.registry import suite_named
 from planner_jax.referee import solids
@@ -21,7 +22,6 @@ from planner_jax.task.block.case import BlockCase, case
 from planner_jax.task.block.scene import Scene
 from planner_jax.task.block.spec import SUITES, TASK, Suite
 
-GRAVITY = 9.81  # [m/s^2]
 BALL_RADIUS = 0.05  # [m]
 AZIMUTH = np.deg2rad(60.0)  # [rad], greatest magnitude of the launch's azimuth from the x axis
 HEIGHT = (-0.48, 1.0)  # [m], range of the launch's height

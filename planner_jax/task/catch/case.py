@@ -13,6 +13,7 @@ from jax.typing import ArrayLike
 from jaxtyping import PyTree
 
 from planner_jax.ball.target import TargetPath
+from planner_jax.core import GRAVITY
 from planner_jax.core.arithmetic import Numbers
 from planner_jax.core.checks import floating, require_path, require_switch, shape_of
 from planner_jax.core.errors import ArgumentError, ArgumentTypeError
@@ -44,7 +45,6 @@ RULES: Table = (
     *quadrotor.FLIGHT_RULES,
     Field("limits.min_height", ()),
 )
-GRAVITY = 9.81  # [m/s^2]
 START = (0.0, 0.0, 1.0)  # [m], hover position of the quadrotor
 _ARGUMENTS = {
     **quadrotor.ARGUMENTS,

@@ -18,13 +18,14 @@ from jaxtyping import PyTree
 
 from planner_jax.ball.flight import BallState
 from planner_jax.ball.target import BallPath, HarmonicPath, TargetPath
+from planner_jax.core import GRAVITY
 from planner_jax.core.arithmetic import host_leaf
 from planner_jax.core.checks import floating, require_scalar
 from planner_jax.core.choices import require, require_scale
 from planner_jax.core.registry import suite_named
 from planner_jax.robot.quadrotor_model import PAPER_CATCHER, QuadrotorModel
 from planner_jax.task.arguments import require_draw
-from planner_jax.task.catch.case import GRAVITY, CatchCase, case
+from planner_jax.task.catch.case import CatchCase, case
 from planner_jax.task.catch.spec import SUITES, TASK
 from planner_jax.task.quadrotor import require_own_robot
 

@@ -10,7 +10,7 @@ from flax import struct
 from jax import Array
 
 from planner_jax.ball.flight import BallState
-from planner_jax.core import rules
+from planner_jax.core import GRAVITY, rules
 from planner_jax.core.checks import floating
 from planner_jax.core.origin import NEAR, Located, find_origin, move
 from planner_jax.core.rules import Field, Table, require_sound
@@ -40,7 +40,6 @@ RULES: Table = (
     Field("hit_limits.min_apex", (), rules.below("hit_limits.max_apex")),
     Field("hit_limits.max_apex", ()),
 )
-GRAVITY = 9.8  # [m/s^2], default magnitude of gravity in cases
 _ARGUMENTS = {
     **quadrotor.ARGUMENTS,
     **{f"ball.{name}": f"ball_{name}" for name in ("pos", "vel")},

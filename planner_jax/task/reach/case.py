@@ -9,7 +9,7 @@ from flax import struct
 from jax import Array
 from numpy.typing import ArrayLike, DTypeLike
 
-from planner_jax.core import rules
+from planner_jax.core import GRAVITY, rules
 from planner_jax.core.checks import floating, require_kind
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.rules import Field, Table, require_sound
@@ -24,6 +24,7 @@ from planner_jax.task.block.scene import make_scene as make_scene  # for users o
 RULES: Table = (
     Field("angles", ("J",)),
     Field("goals", ("G", "J")),
+    Field("gravity", (), rules.NOT_NEGATIVE),
     Field("arm.lower", ("J",), rules.below("arm.upper")),
     Field("arm.upper", ("J",)),
     Field("arm.capsule_radius", ("C",), rules.NOT_NEGATIVE),
@@ -48,6 +49,7 @@ class ReachCase:
     arm: Arm
     limits: ArmLimits
     scene: Scene
+    gravity: Array  # () [m/s^2], magnitude; it loads motors whose limits have torques
 
     @property
     def batch_shape(self) -> tuple[int, ...]:
@@ -63,6 +65,7 @@ def case(
     arm: Arm | None = None,
     limits: ArmLimits | None = None,
     scene: Scene | None = None,
+    gravity: ArrayLike = GRAVITY,
     dtype: DTypeLike = jnp.float32,
 ) -> ReachCase:
     """Make one case of a motion of the joints, or a batch.
@@ -78,6 +81,7 @@ def case(
             limits of the arm.
         scene: obstacles, without batch axes, for example of `make_scene`; by default the pole, the
             floor and the beams of [Natarajan2024].
+        gravity: () or (B,) [m/s^2], magnitude, for limits that have torques.
         dtype: type of every floating leaf.
 
     Raises:
@@ -106,6 +110,7 @@ def case(
         arm=repeat(arm),
         limits=repeat(limits),
         scene=repeat(scene),
+        gravity=leaf("gravity", gravity),
     )
     require_sound(cases)
     return cases

@@ -37,7 +37,6 @@ from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
 _RESOLUTION, _COARSE = 0.02, 0.04
 _CHUNK = 16  # number of states that are checked together
 _TORQUES = 256  # number of times, besides the ends of pieces, at which torques are computed
-_GRAVITY = 9.81  # [m/s^2]
 _CUTS = 30  # number of attempts to shorten a path
 
 
@@ -255,7 +254,7 @@ class ReachPlanner(Planner):
         path = motion.join_knots(case.angles, durations, rates)
         weak = None
         if case.limits.torque is not None:
-            _, factor, weak = measure_torques(case.arm, case.limits, _GRAVITY, path, _TORQUES)
+            _, factor, weak = measure_torques(case.arm, case.limits, case.gravity, path, _TORQUES)
             path = stretch(path, factor)
         duration = jnp.sum(path.durations)
         floors = self._floors(jnp.minimum(rows[:, 0], rows[:, 1 + goal]))

@@ -7,9 +7,8 @@ leaves a margin for control.
 
 import dataclasses
 
+from planner_jax.core import GRAVITY
 from planner_jax.core.errors import ArgumentError
-
-GRAVITY = 9.81  # [m/s^2]
 
 
 @dataclasses.dataclass(frozen=True)

@@ -18,11 +18,11 @@ from flax import struct
 from jax import Array
 
 from planner_jax.ball.flight import BallState
+from planner_jax.core import GRAVITY
 from planner_jax.robot.arm import product
 from planner_jax.task.block.scene import Box
 
 SPEED = 8.0  # [m/s], speed of the ball that stands for all balls through one pair of cells
-GRAVITY = 9.81  # [m/s^2]
 
 
 @dataclasses.dataclass(frozen=True)

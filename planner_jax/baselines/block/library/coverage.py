@@ -13,9 +13,10 @@ from jax import Array
 from jax.typing import ArrayLike
 
 from planner_jax.ball.flight import BallState, drag_free_flight
-from planner_jax.baselines.block.library.cells import GRAVITY, Tunnels, farthest_crossing, tunnels
+from planner_jax.baselines.block.library.cells import Tunnels, farthest_crossing, tunnels
 from planner_jax.baselines.block.library.planner import LibraryBlock
 from planner_jax.baselines.block.library.table import Library, Row, unpack_rows
+from planner_jax.core import GRAVITY
 from planner_jax.core.arithmetic import host_leaf
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.protocol import are_solved

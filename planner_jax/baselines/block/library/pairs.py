@@ -17,8 +17,9 @@ from flax import struct
 from jax import Array, lax
 
 from planner_jax.ball.flight import drag_free_flight
-from planner_jax.baselines.block.library.cells import GRAVITY, farthest_crossing, nominal_ball
+from planner_jax.baselines.block.library.cells import farthest_crossing, nominal_ball
 from planner_jax.baselines.block.library.table import Setting
+from planner_jax.core import GRAVITY
 from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import (
     FEASIBILITY_TOLERANCE,
