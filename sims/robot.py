@@ -143,6 +143,11 @@ class ToolRobot(Robot, Protocol):
         ...
 
     @property
+    def wind(self) -> tuple[float, ...]:
+        """The velocity of the air, (3,) [m/s]; plans know it if the model has drag."""
+        ...
+
+    @property
     def tool(self) -> Tool:
         """The tool that hits or catches balls."""
         ...

@@ -15,7 +15,7 @@ from planner_jax.runs.settings import Options, option, require_count
 from planner_jax.sims.noise import NOISES, PLANE_NOISES, PlaneSensing, Sensing, require_whole
 from planner_jax.sims.robots.arm.drives import ENCODERS, TORQUES, Drives
 from planner_jax.sweep.block.settings import REGIMES, ArmSettings, require_moderate
-from planner_jax.sweep.quadrotor_settings import resolve_robot, robot_option
+from planner_jax.sweep.quadrotor_settings import robot_option, set_robot, wind_option
 from planner_jax.task.block.spec import TASK as BLOCK
 from planner_jax.task.catch.spec import DECISIONS, TRAINED
 from planner_jax.task.catch.spec import TASK as CATCH
@@ -129,11 +129,36 @@ class BallFly(FlySettings):
     drag_error: float = option(
         0.15, "F", "relative error of the initial estimate of the balls' drag, of random sign"
     )
+    robot: Any = robot_option("the task's")
+    wind: tuple[float, ...] | None = wind_option()
+    rotor_drag_error: float = option(
+        0.0, "F", "relative error of the robot's drag in plans; -1: plans know no drag"
+    )
+
+    TOOL: ClassVar[str]  # tool that the robot must carry, "net" or "racket"
+
+    def known_robot(self) -> Any:
+        """Return the robot as plans know it, with an error of its drag; None for the default."""
+        if not self.rotor_drag_error:
+            return self.robot
+        factor, drag = 1.0 + self.rotor_drag_error, self.robot.drag
+        known = dataclasses.replace(drag, across=factor * drag.across, along=factor * drag.along)
+        return dataclasses.replace(self.robot, drag=known)
+
+    def air(self) -> dict[str, Any]:
+        """Return the true drag and wind as arguments of the simulated robot."""
+        drag = None if self.robot is None else self.robot.drag
+        return {"drag": drag} | ({} if self.wind is None else {"wind": self.wind})
 
     def __post_init__(self) -> None:
         require_one_of(NOISES, "noise", self.noise)
         super().__post_init__()
         require(0.0 <= self.drag_error < 1.0, "drag_error", ">= 0 and < 1", self.drag_error)
+        set_robot(self, self.TOOL)
+        error, has_drag = self.rotor_drag_error, bool(self.robot and self.robot.drag)
+        require(-1.0 <= error < math.inf, "rotor_drag_error", "finite and >= -1", error)
+        rule = "0 unless the file of the robot states its drag"
+        require(has_drag or error == 0.0, "rotor_drag_error", rule, error)
 
     def check_rate(self) -> None:
         """Raise `ValueError` unless plans are made a whole number of observations apart."""
@@ -161,15 +186,13 @@ class CatchFly(BallFly):
         "rate at which order and times are decided again, 0 for never (default: same as --replan)",
     )
 
-    robot: Any = robot_option("paper-catcher")
-
     TASK: ClassVar[Task] = CATCH
     FLIGHT: ClassVar[str] = "planner_jax.sims.tasks.catch:CatchFlight"
+    TOOL: ClassVar[str] = "net"
     RATE: ClassVar[float] = 100.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        object.__setattr__(self, "robot", resolve_robot(self.robot, "net"))
         require_count("balls", self.balls, 1)
         require(self.balls <= _MOST_BALLS, "balls", f"<= {_MOST_BALLS}", self.balls)
         split_name(_FLOWN_DECISIONS, "decide", self.decide, TRAINED)
@@ -212,15 +235,13 @@ class HitFly(BallFly):
     planner: str = option("exact", "NAME", "planner of plans from scratch")
     suite: str = option("S.1", "NAME", "suite of serves")
 
-    robot: Any = robot_option("paper-hitter")
-
     TASK: ClassVar[Task] = HIT
     FLIGHT: ClassVar[str] = "planner_jax.sims.tasks.hit:HitFlight"
+    TOOL: ClassVar[str] = "racket"
     RATE: ClassVar[float] = 50.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        object.__setattr__(self, "robot", resolve_robot(self.robot, "racket"))
         require_one_of(HIT.suites, "suite", self.suite)
 
 

@@ -182,9 +182,14 @@ class BallFlightTask(FlightTask):
     def conditions(self) -> str:
         """Sensing noise and error of the balls' estimated drag, as the beginning of a sentence."""
         settings = self.settings
-        return (
+        words = (
             f"Noise {settings.noise}, {100 * settings.drag_error:g} % error of the estimated drag"
         )
+        if settings.robot is None or settings.robot.drag is None:
+            return words
+        wind = " ".join(f"{speed:g}" for speed in settings.wind or (0.0, 0.0, 0.0))
+        error = 100 * settings.rotor_drag_error
+        return f"{words}, wind {wind} m/s, {error:g} % error of the rotors' drag in plans"
 
     @property
     def simulated(self) -> str:

@@ -23,7 +23,16 @@ from planner_jax.robot.quadrotor import (
     body_z,
     thrust_in_air,
 )
+from planner_jax.robot.quadrotor_model import PAPER_HITTER, RotorDrag
 from planner_jax.robot.quadrotor_models import PAPER_CATCHER
+from planner_jax.sims.loop_state import Loop
+from planner_jax.sims.model import World
+from planner_jax.sims.robot import Physics, rotation
+from planner_jax.sims.robots.quadrotor.reference import reference_at
+from planner_jax.sims.robots.quadrotor.robot import Quadrotor
+from planner_jax.sims.tasks.hit import HIT_WORLD, fly_hits, volleys
+from planner_jax.sweep.quadrotor import air_of, air_setting, body_rate, sample_motion, thrust_size
+from planner_jax.task.hit.spec import REAL_SCENARIOS
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, sample_pieces
 
 float64 = pytest.mark.usefixtures("float64")
@@ -126,6 +135,68 @@ def test_zero_drag_equals_none_and_a_batch_equals_a_loop():
         one = {name: leaf[k : k + 1] for name, leaf in case.items()}
         alone = judged_air.thrust_along(pieces.of(slice(k, k + 1)), one, u)[0]
         np.testing.assert_allclose(whole[k], alone, rtol=1e-12)
+
+
+@float64
+def test_curves_and_margins_of_a_plan_have_the_thrust_and_body_rate_in_wind():
+    flown, of = path(pieces=1), air()
+    motion = sample_motion(flown.coeffs.ravel(), flown.durations, 9, of)
+    at = jax.jit(jax.vmap(setpoint_at, ((None, None, None), 0)))
+    points = at((flown, GRAVITY, of), motion.time)
+    np.testing.assert_allclose(thrust_size(motion, GRAVITY), points["thrust"], rtol=1e-9)
+    rates = np.linalg.norm(points["body_rate"], axis=1)
+    np.testing.assert_allclose(body_rate(motion, GRAVITY), rates, rtol=1e-6)
+    stored = air_of(air_setting(jax.tree.map(lambda leaf: leaf[None], of)))
+    for name, leaf in vars(of).items():
+        np.testing.assert_allclose(vars(stored)[name], leaf, rtol=1e-6)
+    assert air_of(air_setting(None)) is None
+
+
+@pytest.mark.parametrize("wind", [(0.0, 0.0, 0.0), (3.0, -2.0, 1.0)])
+def test_a_simulated_robot_hovers_in_wind_by_rotors_against_drag_and_gravity(wind):
+    model = dataclasses.replace(PAPER_CATCHER, drag=RotorDrag(0.1, 0.2))
+    robot = Quadrotor(model, wind=wind, drag=RotorDrag(0.4, 0.9))
+    qpos, qvel, lift = robot.at_rest(jnp.zeros(3), 9.81)
+    physics = Physics(qpos, qvel, lift)
+    axis = np.asarray(rotation(qpos[3:]))[:, 2]
+    np.testing.assert_allclose(np.cross(axis, UP * 9.81 - 0.4 * np.array(wind)), 0.0, atol=1e-5)
+    command, forces = robot.drive(physics, lift, 0.002)
+    assert command is lift and not np.any(forces[3:])
+    force = model.rotors.allocation[0] @ np.asarray(lift) * axis + np.asarray(forces)[:3]
+    np.testing.assert_allclose(force, [0.0, 0.0, 1.2 * 9.81], atol=1e-4)
+
+
+@float64
+def test_the_references_of_a_flight_balance_the_drag_that_the_plan_knows():
+    flown, of, world = path(pieces=1), air(), World(Quadrotor(PAPER_CATCHER), 9.81)
+    at = jax.jit(lambda path, time, air: reference_at(path, time, 0.0, world, air))
+    once = jax.jit(setpoint_at)
+    for known in (of, None):
+        now, later = (at(flown, np.array(0.2 + k * 0.5 * world.timestep), known) for k in (0, 1))
+        point = once((flown, GRAVITY, known), np.array(0.2 + 0.5 * world.timestep))
+        load = now.acc if known is None else now.load
+        thrust = np.linalg.norm(load + GRAVITY * UP) + now.thrust_lead  # half a step ahead
+        np.testing.assert_allclose(thrust, point["thrust"], rtol=1e-12)
+        if known is not None:
+            np.testing.assert_allclose(now.load, add_drag(of, now.vel, now.acc), rtol=1e-12)
+            slope = (later.load - now.load) / (0.5 * world.timestep)
+            np.testing.assert_allclose(slope, now.load_jerk, atol=0.1)
+    assert now.load is None
+
+
+@pytest.mark.slow
+def test_hits_in_known_wind_land_as_in_still_air_and_worse_if_plans_ignore_it():
+    dragged = dataclasses.replace(PAPER_HITTER, drag=RotorDrag(0.3, 0.5))
+    wind = (3.0, 0.0, 0.0)
+    served = volleys(4, REAL_SCENARIOS["S.1"], seed=1, robot=dragged, wind=wind)
+    world = dataclasses.replace(HIT_WORLD, robot=Quadrotor(dragged, wind=wind))
+    known = fly_hits(Loop(world), served)
+    assert known.flown.tracking[:, 1].max() < 0.02 and known.miss.max() < 0.05
+    served = volleys(4, REAL_SCENARIOS["S.1"], seed=1)
+    robot = Quadrotor(PAPER_HITTER, wind=wind, drag=dragged.drag)
+    world = dataclasses.replace(HIT_WORLD, robot=robot)
+    unknown = fly_hits(Loop(world), served)
+    assert (unknown.flown.tracking[:, 1] > 2.0 * known.flown.tracking[:, 1]).all()
 
 
 def test_wind_without_drag_and_wind_that_no_thrust_holds_are_errors_of_one_line():

@@ -39,6 +39,7 @@ LIMITS = pj.FlightLimits(speed=5.0, body_rate=5.0)
         ("3 3 5 g m^2", "inertia", (0.003, 0.003, 0.005)),
         ("1 2 kg cm^2", "inertia", (1e-4, 2e-4)),
         (["1 m", "2 cm"], "length", (1.0, 0.02)),
+        *(("0.3 1/s", "drag", 0.3), ("0.3 0.5 1/s", "drag", (0.3, 0.5)), (1, "drag", 1.0)),
         ("0.2 to 1.9 g", "acceleration", (0.2 * GRAVITY, 1.9 * GRAVITY)),
     ],
 )
@@ -68,7 +69,10 @@ def test_keywords_go_before_the_file():
         pj.read_robot(MINE, inertia="3 3 5")
 
 
-@pytest.mark.parametrize("robot", [*MODELS.values(), pj.read_robot(MINE)], ids=lambda r: r.name)
+DRAGGED = pj.read_robot(MINE, name="dragged", drag={"across": "0.3 1/s", "along": 0.5})
+
+
+@pytest.mark.parametrize("robot", [*MODELS.values(), pj.read_robot(MINE), DRAGGED], ids=str)
 def test_a_robot_is_the_same_after_yaml_and_after_a_manifest(robot, tmp_path):
     place = tmp_path / "robot.yaml"
     place.write_text(to_yaml(robot))
@@ -127,11 +131,16 @@ inertia | 3 3 5 g m | inertia must be in INERTIAS, got '3 3 5 g m'; did you mean
 inertia | 3 3 5 | inertia must have its UNIT, got '3 3 5'
 inertia | [3, 3, 5] | inertia must have its UNIT, got [3, 3, 5]
 inertia | [3 g m^2, 3 g m^2, 5] | inertia must have its UNIT, got ['3 g m^2', '3 g m^2', 5]
+drag | 0.3 1/s | drag must be fields with values, got '0.3 1/s'
+drag | {across: 0.3 1/s} | drag.along must be given, got nothing
+drag | {across: 0.3 1/ms, along: 0} | drag.across must be in 1/s, got '0.3 1/ms'; did you mean 1/s?
+drag | {across: 0.3 2 1/s, along: 0} | drag.across must be a number in 1/s, got '0.3 2 1/s'
+drag | {across: -1 1/s, along: 0} | drag.across must be >= 0, got -1
 model | my.urdf | model must name an MJCF file, .xml, got 'my.urdf'
 """
 WORDS = {
     "RATES": "rad/s, deg/s",
-    "FIELDS": "name, source, mass, inertia, rotors, tool, limits",
+    "FIELDS": "name, source, mass, inertia, rotors, tool, limits, drag",
     "TOOL": "kind, height, radius, restitution, max_angle",
     "OF_A_BODY": "of a body, none above the other two together",
     "HOVER": "let the robot hover with 1.962 N a rotor, got 0.103 to 1.957 N",
@@ -382,3 +391,27 @@ def test_draws_are_of_the_robot_and_without_one_of_the_paper_s():
     throws = pj.catch.draw(2, robot=pj.robot_named("x500-net"))
     np.testing.assert_allclose(throws.net.radius, 0.2)
     np.testing.assert_allclose(throws.limits.max_thrust, 4.0 * 0.95 * 8.549 / 2.064, rtol=1e-6)
+    assert cases.limits.air is None
+
+
+def test_draws_and_settings_have_the_drag_of_the_robot_and_the_wind():
+    wind = (3.0, 0.0, -1.0)
+    net = dataclasses.replace(DRAGGED, tool=TOOL)
+    for draw, robot in ((pj.hit.draw, DRAGGED), (pj.catch.draw, net)):
+        calm, windy = (draw(2, robot=robot, wind=each).limits.air for each in (None, wind))
+        np.testing.assert_allclose(windy.wind, [wind] * 2)
+        np.testing.assert_array_equal(calm.wind, np.zeros((2, 3)))
+        np.testing.assert_allclose(np.stack([calm.drag, calm.thrust_drag]), [[0.3] * 2, [0.5] * 2])
+    for kind in (HitSettings, HitFly):
+        settings = kind(robot=DRAGGED, wind=list(wind))
+        again = kind(**json.loads(json.dumps(dataclasses.asdict(settings))))
+        assert again == settings and again.wind == wind
+        with pytest.raises(ArgumentError, match="^wind must be three finite numbers"):
+            kind(robot=DRAGGED, wind=(1.0, math.nan, 0.0))
+        with pytest.raises(ArgumentError, match="^wind must be left out unless the file of the "):
+            kind(robot=str(MINE), wind=wind)
+    assert HitSettings(robot=DRAGGED, wind=wind).draw_options()["wind"] == wind
+    known = HitFly(robot=DRAGGED, rotor_drag_error=-1.0).known_robot()
+    assert (known.drag.across, known.drag.along) == (0.0, 0.0)
+    with pytest.raises(ArgumentError, match="^rotor_drag_error must be 0 unless the file of the "):
+        HitFly(rotor_drag_error=0.1)

@@ -18,7 +18,7 @@ _NUMBERS = 250_000  # greatest number of samples computed at once, so that they 
 def judge_rotors(pieces: Pieces, case: dict, u: np.ndarray, relative: float) -> tuple[dict, dict]:
     """Measure rotor thrusts [N] at fractions u of pieces; test limits with tolerance `relative`."""
     parts = [
-        _rotor_range(pieces.of(lanes), {name: leaf[lanes] for name, leaf in case.items()}, u)
+        rotor_range(pieces.of(lanes), {name: leaf[lanes] for name, leaf in case.items()}, u)
         for lanes in cut(len(pieces.durations), max(_NUMBERS // (pieces.flown[0].size * u.size), 1))
     ]
     least, least_time, most, most_time = (
@@ -34,7 +34,8 @@ def judge_rotors(pieces: Pieces, case: dict, u: np.ndarray, relative: float) -> 
     return {"min_rotor_thrust": least, "max_rotor_thrust": most}, tests
 
 
-def _rotor_range(pieces: Pieces, case: dict, u: np.ndarray) -> tuple[np.ndarray, ...]:
+def rotor_range(pieces: Pieces, case: dict, u: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Return the least rotor thrust (B,) [N] and its time [s], and the greatest and its time."""
     times = pieces.durations[:, :, None] * u
     body = (case[f"limits.rotors.{name}"] for name in ("mass", "inertia", "mixer"))
     load, (mass, inertia, mixer) = load_pieces(pieces, case), body

@@ -6,6 +6,7 @@
     rotors: {diagonal: 250 mm, max_thrust: 4.5 N, lag: 30 ms}
     tool: {kind: racket, height: 6 cm, radius: 11 cm}
     limits: {speed: 5 m/s, body_rate: 344 deg/s, thrust: 0.2 to 1.9 g}
+    drag: {across: 0.3 1/s, along: 0.5 1/s}
 
 A number without a unit is in SI units. Only an inertia must have its unit, because it is often
 stated in g m^2. In an acceleration "g" is the standard gravity, elsewhere the gram. The field
@@ -35,6 +36,7 @@ from planner_jax.robot.quadrotor_model import (
     RACKET,
     FlightLimits,
     QuadrotorModel,
+    RotorDrag,
     Rotors,
     Tool,
     place_in_cross,
@@ -62,14 +64,17 @@ UNITS: dict[str, dict[str, Fraction]] = {
         "rate": {"rad/s": "1", "deg/s": _DEGREE},
         "angle": {"rad": "1", "deg": _DEGREE},
         "share": {"": "1", "%": "1e-2"},
+        "drag": {"1/s": "1"},
     }.items()
 }
 _NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,3})?"
-_QUANTITY = re.compile(rf"\s*({_NUMBER}(?:(?:\s*,\s*|\s+){_NUMBER})*)\s*(\D.*?)?\s*", re.ASCII)
+_MORE = rf"(?:\s*,\s*|\s+){_NUMBER}(?!/)"  # the 1 of the unit 1/s is no number
+_QUANTITY = re.compile(rf"\s*({_NUMBER}(?:{_MORE})*)\s*(\D.*?|1/s)?\s*", re.ASCII)
 _LONGEST = 200  # greatest number of characters in the text of a quantity
 
 ENDINGS = (".yaml", ".yml", ".xml")
-_PARTS: dict[str, type] = {"rotors": Rotors, "tool": Tool, "limits": FlightLimits}
+# Sections of a robot's file; only "drag" may be left out.
+_PARTS = {"rotors": Rotors, "tool": Tool, "limits": FlightLimits, "drag": RotorDrag}
 
 
 class RobotError(PlannerJaxError, ValueError):
@@ -92,7 +97,7 @@ class _Quantity(NamedTuple):
 
 _LENGTH, _COORDINATES = _Quantity("length"), tuple(2 * count for count in COUNTS)
 # Section of a robot's file -> field -> format of its value, or None for a text. The sections are
-# "rotors", "tool" and "limits"; "" holds the fields outside of them.
+# "rotors", "tool", "limits" and "drag"; "" holds the fields outside of them.
 _FIELDS: dict[str, dict[str, _Quantity | None]] = {
     "": {
         "name": None,
@@ -127,6 +132,7 @@ _FIELDS: dict[str, dict[str, _Quantity | None]] = {
         "max_tilt": _Quantity("angle", optional=True),
         "recovery_tilt": _Quantity("angle"),
     },
+    "drag": {"across": _Quantity("drag"), "along": _Quantity("drag")},
 }
 
 
@@ -135,10 +141,10 @@ def read_robot(path: str | os.PathLike, **given: Value) -> QuadrotorModel:
 
     Args:
         path: path of a YAML file (.yaml, .yml), or of a MuJoCo model (MJCF, .xml), which needs
-            MuJoCo (extra `sims`). MJCF describes neither tool nor limits.
+            MuJoCo (extra `sims`). MJCF describes neither tool, limits nor drag.
         **given: fields that override the fields in the file: `name`, `mass`, `inertia`, `rotors`,
-            `tool`, `limits` and `source`. A value has the format of the YAML file, or is a number
-            in SI units, or an object such as a `Tool`.
+            `tool`, `limits`, `drag` and `source`. A value has the format of the YAML file, or is a
+            number in SI units, or an object such as a `Tool`.
 
     Raises:
         RobotError: the file, or a field such as a negative mass, is invalid (message of one line).
@@ -163,6 +169,8 @@ def model_of(description: Mapping[str, Value], place: str = "robot") -> Quadroto
     parts: dict[str, Value] = {}
     for part in _PARTS:
         value = description.get(part)
+        if value is None and part == "drag":
+            continue
         if value is None:
             raise RobotError(f"{place}: {part} must be given, got nothing")
         if not isinstance(value, Mapping):
@@ -182,9 +190,9 @@ def model_of(description: Mapping[str, Value], place: str = "robot") -> Quadroto
         hint = suggestion(kind, (NET, RACKET))
         raise RobotError(f"{place}: tool.kind must be {NET} or {RACKET}, got {kind!r}{hint}")
     try:
-        for part, make in _PARTS.items():
-            _require_all(make, parts[part], f"{part}.", place)
-            parts[part] = make(**parts[part])
+        for part, given in parts.items():
+            _require_all(_PARTS[part], given, f"{part}.", place)
+            parts[part] = _PARTS[part](**given)
         _require_all(QuadrotorModel, {**whole, **parts}, "", place)
         return QuadrotorModel(**whole, **parts)
     except RobotError:
@@ -204,7 +212,7 @@ def to_yaml(model: QuadrotorModel) -> str:
     shown = {name: _add_unit(plain[name], kind) for name, kind in _FIELDS[""].items()}
     if not model.source:
         del shown["source"]
-    for part in _PARTS:
+    for part in [part for part in _PARTS if plain[part]]:
         fields = _FIELDS[part]
         shown[part] = {name: _add_unit(value, fields[name]) for name, value in plain[part].items()}
     return yaml.safe_dump(shown, sort_keys=False, allow_unicode=True, width=100)

@@ -149,6 +149,18 @@ class FlightLimits:
 
 
 @dataclasses.dataclass(frozen=True)
+class RotorDrag:
+    """Coefficients of the linear drag per unit mass, across and along the thrust [Faessler2018]."""
+
+    across: float  # [1/s]
+    along: float  # [1/s]
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            _require(f"drag.{name}", value, *_NOT_NEGATIVE)
+
+
+@dataclasses.dataclass(frozen=True)
 class QuadrotorModel:
     """Description of a quadrotor; hashable, so that it can be a static argument of `jax.jit`.
 
@@ -165,6 +177,7 @@ class QuadrotorModel:
     tool: Tool
     limits: FlightLimits
     source: str = ""  # where the numbers are from
+    drag: RotorDrag | None = None  # None: plans and simulated flights have no drag
 
     def __post_init__(self) -> None:
         _require("mass", self.mass, *_POSITIVE)

@@ -64,11 +64,11 @@ def quadrotor_figure(
     further panels, keys of `PANELS`. The function `word` describes a successful plan briefly.
     """
     plans, setting = run.same_case(), run.manifest["setting"]
-    axes = figure.subplots(2, 3, sharex=True)
+    axes, air = figure.subplots(2, 3, sharex=True), quadrotor.air_of(setting)
     drawn: list[Drawn] = []
     for k, (name, row) in enumerate(plans):
-        motion = quadrotor.sample_motion(row["coeffs"], row["durations"], _SAMPLES)
-        rest = quadrotor.sample_rest(row, _SAMPLES)
+        motion = quadrotor.sample_motion(row["coeffs"], row["durations"], _SAMPLES, air)
+        rest = quadrotor.sample_rest(row, _SAMPLES, air)
         drawn.insert(0, Drawn(row, motion, rest, look_of(k, name, row)))
     first(axes[0, 0], setting, drawn)
     for panel, name in zip(axes.flat[1:5], panels, strict=True):

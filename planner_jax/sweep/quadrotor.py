@@ -6,8 +6,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from planner_jax.core.arithmetic import host_leaf
+from planner_jax.robot.quadrotor import Air, add_drag, add_drag_rate
 from planner_jax.runs.columns import LIST, VECTOR, Column, RefereedBatch, leaves_of
-from planner_jax.runs.manifest import Row
+from planner_jax.runs.manifest import Entries, Row
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, states_at
 
 
@@ -65,10 +66,28 @@ class SampledMotion:
     vel: np.ndarray  # (N, 3) [m/s]
     acc: np.ndarray  # (N, 3) [m/s^2]
     jerk: np.ndarray  # (N, 3) [m/s^3]
+    air: Air | None = None  # drag and wind, with NumPy leaves
+
+
+def air_setting(air: Air | None) -> Entries:
+    """Return drag and wind of the first case of a batch for the manifest's entry `setting`."""
+    leaves = {} if air is None else vars(air)
+    return {f"air_{k}": np.asarray(x, float)[0].round(6).tolist() for k, x in leaves.items()}
+
+
+def air_of(setting: Entries) -> Air | None:
+    """Return the drag and wind in a manifest's entry `setting`, in float32; None if absent."""
+    if "air_drag" not in setting:
+        return None
+    names = ("drag", "thrust_drag", "wind")
+    return Air(*(host_leaf(setting[f"air_{name}"], np.float32) for name in names))
 
 
 def sample_motion(
-    coeffs: Sequence[float] | np.ndarray, durations: Sequence[float] | np.ndarray, num: int
+    coeffs: Sequence[float] | np.ndarray,
+    durations: Sequence[float] | np.ndarray,
+    num: int,
+    air: Air | None = None,
 ) -> SampledMotion:
     """Sample a piecewise polynomial of M pieces at `num` evenly spaced times, in float64.
 
@@ -77,30 +96,38 @@ def sample_motion(
             since the start of each piece.
         durations: (M,) [s], durations of the pieces.
         num: number of samples from the start of the first piece to the end of the last.
+        air: drag and wind, for the thrust and the body rate.
     """
     lengths = np.asarray(durations, float)
     pieces = np.asarray(coeffs, float).reshape(len(lengths), -1, 3)
     time = np.linspace(0.0, lengths.sum(), num)
     leaves = (host_leaf(np.broadcast_to(x, (num, *x.shape))) for x in (pieces, lengths))
-    return SampledMotion(time, *np.moveaxis(states_at(PiecewisePolynomial(*leaves), time), 1, 0))
+    states = np.moveaxis(states_at(PiecewisePolynomial(*leaves), time), 1, 0)
+    return SampledMotion(time, *states, air=air)
 
 
-def sample_rest(row: Row, num: int) -> SampledMotion | None:
+def sample_rest(row: Row, num: int, air: Air | None) -> SampledMotion | None:
     """Sample the recovery trajectory to standstill in a stored row; None if the row has none."""
     if row["recovery_durations"] is None:
         return None
-    rest = sample_motion(row["recovery_coeffs"], row["recovery_durations"], num)
+    rest = sample_motion(row["recovery_coeffs"], row["recovery_durations"], num, air)
     return dataclasses.replace(rest, time=rest.time + np.sum(row["durations"]))
 
 
 def net_thrust(motion: SampledMotion, gravity: float) -> np.ndarray:
-    """Return the thrust per unit mass, acceleration minus gravity, at N times, (N, 3) [m/s^2]."""
-    return motion.acc + gravity * np.array([0.0, 0.0, 1.0])
+    """Return vectors (N, 3) [m/s^2] along the thrust, without drag the thrust per unit mass."""
+    load = add_drag(motion.air, motion.vel, motion.acc)  # type: ignore[arg-type]
+    return np.asarray(load) + gravity * np.array([0.0, 0.0, 1.0])
 
 
 def thrust_size(motion: SampledMotion, gravity: float) -> np.ndarray:
     """Return the magnitude of the thrust per unit mass at N times, (N,) [m/s^2]."""
-    return np.linalg.norm(net_thrust(motion, gravity), axis=1)
+    thrust, air = net_thrust(motion, gravity), motion.air
+    size = np.linalg.norm(thrust, axis=1)
+    if air is None:
+        return size
+    along = np.sum(thrust * (motion.vel - air.wind), axis=1) / size
+    return size + (air.thrust_drag - air.drag) * along
 
 
 def body_rate(motion: SampledMotion, gravity: float) -> np.ndarray:
@@ -111,8 +138,8 @@ def body_rate(motion: SampledMotion, gravity: float) -> np.ndarray:
     Hopf fibration. The result is NaN where f is zero or points straight down.
     """
     thrust = net_thrust(motion, gravity)
-    size = thrust_size(motion, gravity)
-    cross = np.cross(thrust, motion.jerk)
+    size = np.linalg.norm(thrust, axis=1)
+    cross = np.cross(thrust, add_drag_rate(motion.air, motion.acc, motion.jerk))  # type: ignore
     with np.errstate(all="ignore"):
         across = np.linalg.norm(cross, axis=1) / size**2
         return np.hypot(across, cross[:, 2] / (size * (size + thrust[:, 2])))

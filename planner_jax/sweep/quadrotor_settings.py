@@ -1,6 +1,7 @@
 """Settings of runs over many cases in which quadrotors hit or catch."""
 
 import dataclasses
+import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -43,6 +44,24 @@ def resolve_robot(given: object, tool: str) -> "QuadrotorModel | None":
     return found
 
 
+def wind_option() -> Any:
+    """Return the dataclass field of the setting `wind`."""
+    return option(None, "X Y Z", "velocity of the air [m/s], for a robot with drag (default: none)")
+
+
+def set_robot(settings: Any, tool: str) -> None:
+    """Replace the setting `robot` by a model with `tool`, and check the setting `wind`."""
+    robot = resolve_robot(settings.robot, tool)
+    object.__setattr__(settings, "robot", robot)
+    if settings.wind is not None:
+        wind = tuple(map(float, settings.wind))
+        sound = len(wind) == 3 and all(map(math.isfinite, wind))
+        require(sound, "wind", "three finite numbers", wind)
+        rule = "left out unless the file of the robot states its drag"
+        require(robot is not None and robot.drag is not None, "wind", rule, wind)
+        object.__setattr__(settings, "wind", wind)
+
+
 def robot_remark(parameters: Row) -> list[str]:
     """Return a sentence on the robot that a run's settings name; [] without a robot."""
     if (robot := parameters.get("robot")) is None:
@@ -57,6 +76,7 @@ class QuadrotorSettings(SweepSettings):
 
     limit_scale: float = option(1.0, "F", "factor on the limits of speed, body rate and thrust")
     robot: object = robot_option("the task's")
+    wind: tuple[float, ...] | None = wind_option()
     effort: str = option(EFFORTS[0], "NAME", f"how long the planner searches: {', '.join(EFFORTS)}")
     recovery: str = recovery_option()
 
@@ -67,7 +87,7 @@ class QuadrotorSettings(SweepSettings):
     def __post_init__(self) -> None:
         super().__post_init__()
         require_scale(self.limit_scale)
-        object.__setattr__(self, "robot", resolve_robot(self.robot, self.TOOL))
+        set_robot(self, self.TOOL)
         require_one_of(EFFORTS, "effort", self.effort)
         rule = f"left out for the planner {self.WITHOUT_EFFORT}, which minimises nothing"
         has_effort = self.effort == EFFORTS[0] or self.planner != self.WITHOUT_EFFORT

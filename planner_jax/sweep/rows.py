@@ -13,6 +13,7 @@ from planner_jax.robot.quadrotor import QuadrotorPlan
 from planner_jax.runs.manifest import Entries, Row
 from planner_jax.runs.run_folder import RunFolder
 from planner_jax.runs.settings import settings_of_manifest
+from planner_jax.sweep.quadrotor import air_of
 from planner_jax.sweep.report import read_finished
 from planner_jax.sweep.sweep import settings_of
 from planner_jax.trajectory.polynomial import PiecewisePolynomial
@@ -45,13 +46,14 @@ def read_plan(folder: RunFolder, row: int | None) -> tuple[Plan, str]:
 
 
 def quadrotor_plan(row: Row, setting: Entries) -> QuadrotorPlan:
-    """Restore a quadrotor's plan from a run's row; the manifest's `setting` holds the gravity."""
+    """Restore a quadrotor's plan from a run's row; the manifest's `setting` has gravity and air."""
     rest = row.get("recovery_durations")
     return QuadrotorPlan(
         **_outcome(row),
         trajectory=_polynomial(row["coeffs"], row["durations"], 3),
         gravity=_numbers(setting["gravity"]),
         recovery=None if rest is None else _polynomial(row["recovery_coeffs"], rest, 3),
+        air=air_of(setting),
     )
 
 

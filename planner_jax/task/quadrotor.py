@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -11,10 +10,10 @@ from jax.typing import DTypeLike
 from jaxtyping import PyTree
 
 from planner_jax.core import rules
-from planner_jax.core.checks import numbers_of, shape_of
+from planner_jax.core.checks import numbers_of
 from planner_jax.core.errors import ArgumentError, ArgumentTypeError
 from planner_jax.core.rules import Field, Table
-from planner_jax.robot.quadrotor import Air, QuadrotorLimits, RotorLimits
+from planner_jax.robot.quadrotor import QuadrotorLimits, RotorLimits
 from planner_jax.robot.quadrotor_model import NET, RECOVERY_TILT, QuadrotorModel, Tool
 
 _MOMENTS = rules.Rule("> 0", lambda x, _: (x > 0.0) | (np.arange(x.shape[-1]) > 2))
@@ -96,55 +95,36 @@ def start_state(
 
 
 def require_start(cases: PyTree) -> None:
-    """Raise `CaseError` if a quadrotor starts below `min_height`; JAX tracers are not checked."""
+    """Raise `CaseError` for a start below `min_height`, or a wind in which no hover is possible.
+
+    JAX tracers are not checked.
+    """
     heights = cases.head_state[..., 0, 2], cases.limits.min_height
     if any(isinstance(each, Tracer) for each in heights):
         return
     height, least = map(np.asarray, heights)
     words = "at a height >= min_height"
     rules.require_rule("start", height, height >= least, words, cases.batch_shape)
+    if cases.limits.air is not None:
+        from planner_jax.task.air import require_hover  # few cases have drag
+
+        require_hover(cases)
 
 
-def require_own_robot(robot: object, usual: QuadrotorModel, suite: str) -> None:
-    """Raise an error if `robot` differs from the default `usual`; `suite` has its own robot."""
-    if robot != usual:
-        raise ArgumentError("robot", f"left out with suite {suite!r}, which has its own", shown="")
-
-
-def air_of(rotor_drag: object, wind: object, leaf: Callable[..., Array]) -> Air | None:
-    """Return the drag and wind of arguments of `case`; None if both arguments are None.
-
-    `rotor_drag` is one number, or two numbers across and along the thrust.
-    """
-    if rotor_drag is None:
-        if wind is not None:
-            raise ArgumentError("wind", "left out without rotor_drag, as it acts by the drag")
-        return None
-    shape = (2,) if shape_of("rotor_drag", rotor_drag)[-1:] == (2,) else ()
-    drag = leaf("rotor_drag", rotor_drag, *shape)
-    across, along = (drag[..., 0], drag[..., 1]) if shape else (drag, drag)
-    return Air(across, along, leaf("wind", (0.0, 0.0, 0.0) if wind is None else wind, 3))
-
-
-def require_hover(cases: PyTree) -> None:
-    """Raise `CaseError` if the wind needs more thrust at hover than the limits allow."""
-    limits, gravity, air = cases.limits, cases.gravity, cases.limits.air
-    if air is None or any(isinstance(x, Tracer) for x in jax.tree.leaves((limits, gravity))):
-        return
-    wind, across, along = (np.asarray(leaf) for leaf in (air.wind, air.drag, air.thrust_drag))
-    force = -across[..., None] * wind
-    force[..., 2] += gravity
-    size = np.linalg.norm(force, axis=-1)
-    thrust = size - (along - across) * (force * wind).sum(axis=-1) / size
-    most = np.asarray(limits.thrust_bounds[1])
-    if (rotors := limits.rotors) is not None:
-        most = np.minimum(most, rotors.mixer.shape[-2] * rotors.max_thrust / rotors.mass)
-    words = f"weak enough to hover within {most.min():.3g} m/s^2 of thrust"
-    rules.require_rule("wind: thrust at hover", thrust, thrust <= most, words, cases.batch_shape)
+def require_own_robot(robot: object, usual: QuadrotorModel, suite: str, wind: object) -> None:
+    """Raise unless `robot` is the default `usual`, and `wind` None; `suite` has its own robot."""
+    if robot != usual or wind is not None:
+        name = "wind" if robot == usual else "robot"
+        raise ArgumentError(name, f"left out with suite {suite!r}, which has its own", shown="")
 
 
 def limits_of(
-    robot: QuadrotorModel, leaf: Callable[..., Array], *, air: Air | None, **given: object
+    robot: QuadrotorModel,
+    leaf: Callable[..., Array],
+    *,
+    rotor_drag: object,
+    wind: object,
+    **given: object,
 ) -> QuadrotorLimits:
     """Return a case's limits: the values in `given` that are not None, else the robot's limits.
 
@@ -165,6 +145,11 @@ def limits_of(
     if values["min_thrust"] is None and values["max_thrust"] is not None:
         values["min_thrust"] = 0.0
     arrays = {name: leaf(name, value) for name, value in values.items() if value is not None}
+    air = None
+    if any(each is not None for each in (rotor_drag, wind, robot.drag)):
+        from planner_jax.task.air import air_of  # few cases have drag
+
+        air = air_of(robot, rotor_drag, wind, leaf)
     return QuadrotorLimits(**arrays, rotors=_rotors_of(robot, leaf), air=air)
 
 

@@ -239,13 +239,13 @@ class CatchFlight(BallFlightTask):
 
     def world(self) -> World:
         """Return the simulated world, with as many balls as the settings request."""
-        robot = Quadrotor(self.robot)
+        robot = Quadrotor(self.robot, **self.settings.air())
         return dataclasses.replace(CATCH_WORLD, robot=robot, num_balls=self.settings.balls)
 
     @property
     def robot(self) -> QuadrotorModel:
-        """The model of the quadrotor; by default the quadrotor of [Yu2023catch]."""
-        return self.settings.robot or PAPER_CATCHER
+        """The quadrotor as plans know it; by default the quadrotor of [Yu2023catch]."""
+        return self.settings.known_robot() or PAPER_CATCHER
 
     def cases(self) -> Throws:
         """Draw all flights of the run from its seed."""

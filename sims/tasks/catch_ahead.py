@@ -60,6 +60,7 @@ def predict_case(loop: Loop, flights: FlightState, new: Array, horizon: Array) -
         robot=robot.model,
         gravity=loop.world.gravity,
         net_radius=_AIM * robot.tool.radius,
+        wind=robot.wind if robot.model.drag else None,
         **bounds(loop, LIMITS[0 if flights.plan is None else 1]),
     )
 

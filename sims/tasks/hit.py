@@ -170,6 +170,7 @@ def volleys(
     *,
     drag_error: float = 0.0,
     robot: QuadrotorModel = PAPER_HITTER,
+    wind: tuple[float, ...] | None = None,
 ) -> Volleys:
     """Draw serves, and return them at the start of their plans, `SEEN` seconds after the serve.
 
@@ -179,10 +180,11 @@ def volleys(
         seed: >= 0, of the serves and of the signs of the drag's errors.
         drag_error: relative error of the initial estimate of K_D, of random sign.
         robot: a quadrotor with a racket.
+        wind: (3,) [m/s], velocity of the air, for a robot with drag.
     """
     if not 0.0 <= drag_error < 1.0:
         raise ArgumentError("drag_error", ">= 0 and < 1", drag_error)
-    cases = to_cases(generate_serves(num, seed, names), delay=SEEN, robot=robot)
+    cases = to_cases(generate_serves(num, seed, names), delay=SEEN, robot=robot, wind=wind)
     sign = np.random.default_rng([seed, 1]).choice([-1.0, 1.0], num)
     true = np.asarray(cases.drag)
     believed = (true * (1.0 + drag_error * sign)).astype(np.float32)
@@ -294,12 +296,12 @@ class HitFlight(BallFlightTask):
 
     def world(self) -> World:
         """Return the simulated world with the drawn court."""
-        return dataclasses.replace(HIT_WORLD, robot=Quadrotor(self.robot))
+        return dataclasses.replace(HIT_WORLD, robot=Quadrotor(self.robot, **self.settings.air()))
 
     @property
     def robot(self) -> QuadrotorModel:
-        """The model of the quadrotor; by default the quadrotor of [Yu2023bat]."""
-        return self.settings.robot or PAPER_HITTER
+        """The quadrotor as plans know it; by default the quadrotor of [Yu2023bat]."""
+        return self.settings.known_robot() or PAPER_HITTER
 
     def cases(self) -> Volleys:
         """Draw all serves of the run from its suite (family of random serves) and seed."""
@@ -311,6 +313,7 @@ class HitFlight(BallFlightTask):
             settings.seed,
             drag_error=settings.drag_error,
             robot=self.robot,
+            wind=settings.wind,
         )
 
     def fly(self, cases: Volleys, record: bool) -> HitFlights:

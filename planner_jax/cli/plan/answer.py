@@ -18,7 +18,8 @@ from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import Status
 from planner_jax.core.registry import Task
 from planner_jax.planning.plan import plan
-from planner_jax.referee.rotors import rotor_thrusts
+from planner_jax.referee.quadrotor import pieces_of, read_flight
+from planner_jax.referee.rotors import rotor_range
 from planner_jax.robot.quadrotor import QuadrotorPlan
 from planner_jax.runs.style import draw
 from planner_jax.runs.table import align
@@ -137,7 +138,7 @@ class Single(abc.ABC, Generic[SingleT]):
 def sample_plan(found: QuadrotorPlan) -> SampledMotion:
     """Sample a plan of a quadrotor with its recovery trajectory at evenly spaced times."""
     coeffs, durations = _pieces(found)
-    return sample_motion(coeffs.ravel(), durations, _SAMPLES)
+    return sample_motion(coeffs.ravel(), durations, _SAMPLES, jax.tree.map(np.asarray, found.air))
 
 
 def _pieces(found: QuadrotorPlan) -> tuple[np.ndarray, np.ndarray]:
@@ -179,17 +180,16 @@ def _of_rotors(answer: Answer) -> list[Margin]:
     if rotors is None:
         return []
     coeffs, durations = _pieces(answer.plan)
-    starts = np.concatenate([[0.0], np.cumsum(durations)[:-1]])
-    times = durations[:, None] * np.linspace(0.0, 1.0, _SAMPLES // len(durations))
-    body = (np.asarray(each, float)[None] for each in (rotors.mass, rotors.inertia, rotors.mixer))
-    gravity = np.asarray(answer.case.gravity, float)[None]
+    one = lambda leaf: np.asarray(leaf, float)[None]  # noqa: E731
+    leaves = read_flight(*jax.tree.map(one, (answer.case, answer.plan)))
+    fractions = np.linspace(0.0, 1.0, _SAMPLES // len(durations))
     with np.errstate(all="ignore"):
-        thrusts = rotor_thrusts(np.moveaxis(coeffs, -1, 0)[:, None], times[None], gravity, *body)[0]
-    at = (starts[:, None] + times).ravel()
-    low, high = thrusts.min(axis=-1).ravel(), thrusts.max(axis=-1).ravel()
+        found = rotor_range(pieces_of(coeffs[None], durations[None]), leaves, fractions)
+    low, low_at, high, high_at = (float(each[0]) for each in found)
+    least, most = float(rotors.min_thrust), float(rotors.max_thrust)
     return [
-        closest_to(at, "rotor thrust, least [N]", low, rotors.min_thrust, least=True),
-        closest_to(at, "rotor thrust, greatest [N]", high, rotors.max_thrust),
+        Margin("rotor thrust, least [N]", low, least, low_at, least=True),
+        Margin("rotor thrust, greatest [N]", high, most, high_at),
     ]
 
 

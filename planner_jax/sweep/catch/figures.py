@@ -16,7 +16,7 @@ from planner_jax.runs.manifest import Entries, Row
 from planner_jax.runs.run_folder import RunRows
 from planner_jax.runs.style import Look
 from planner_jax.sweep.figures import DASHED, Drawn, quadrotor_figure
-from planner_jax.sweep.quadrotor import SampledMotion, net_thrust, sample_motion
+from planner_jax.sweep.quadrotor import SampledMotion, air_of, net_thrust, sample_motion
 
 
 def target_paths(row: Row) -> BallPath | HarmonicPath:
@@ -84,7 +84,7 @@ _TARGETS = (style.ORANGE, style.GREEN, style.PURPLE, style.SKY, "#8C564B", style
 def flight_figure(figure: Figure, run: RunRows) -> None:
     """Draw case `manifest["example"]` from the side and from above, with close-ups of catches."""
     setting, (_, row) = run.manifest["setting"], run.same_case()[0]
-    motion = sample_motion(row["coeffs"], row["durations"], _SAMPLES)
+    motion = sample_motion(row["coeffs"], row["durations"], _SAMPLES, air_of(setting))
     plan = sample_catch(row, motion, setting)
     ((left, right),) = figure.subfigures(1, 2, squeeze=False, width_ratios=[3.0, 1.6])
     low, high = _window(plan)

@@ -159,8 +159,8 @@ def case(
       acceleration, for a thrust equal to the weight; `gravity`: [m/s^2], magnitude.
     * `speed` [m/s], `body_rate` [rad/s]: greatest values; `min_height` [m] of the propeller plane;
       `min_thrust`, `max_thrust` [m/s^2], per unit mass.
-    * `rotor_drag` [1/s]: linear drag of the quadrotor per unit mass, one number, or two numbers
-      (..., 2) across and along the thrust; `wind`: (..., 3) [m/s], velocity of the air.
+    * `rotor_drag` [1/s]: linear drag of the quadrotor per unit mass, by default the robot's: one
+      number, or two numbers (..., 2) across and along the thrust; `wind`: (..., 3) [m/s].
     * `extras`: further constraints and costs such as `pj.KeepOut`; `dtype`: type of the numbers.
     * `origin`: (2,) x, y [m], world position that is subtracted from all positions in float64, by
       default the multiple of 100 m next to the first start. Positions in float64 are thus exact
@@ -203,7 +203,8 @@ def case(
         limits=quadrotor.limits_of(
             robot,
             leaf,
-            air=quadrotor.air_of(rotor_drag, wind, leaf),
+            rotor_drag=rotor_drag,
+            wind=wind,
             speed=speed,
             min_thrust=min_thrust,
             max_thrust=max_thrust,
@@ -216,7 +217,6 @@ def case(
     )
     require_sound(cases, _ARGUMENTS)
     quadrotor.require_start(cases)
-    quadrotor.require_hover(cases)
     return cases
 
 

@@ -5,7 +5,7 @@
 
 import dataclasses
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from types import ModuleType
 
@@ -62,6 +62,7 @@ def draw(
     first: int = 0,
     limit_scale: float = 1.0,
     robot: QuadrotorModel = PAPER_CATCHER,
+    wind: Sequence[float] | None = None,
     num_targets: int | None = None,
     dtype: DTypeLike = jnp.float32,
 ) -> CatchCase:
@@ -75,6 +76,7 @@ def draw(
     * `limit_scale`: factor on the limits of speed and body rate, and on the differences between
       the limits of the thrust and the thrust of hover.
     * `robot`: quadrotor with a net. Suites of other packages define their own robot.
+    * `wind`: (3,) [m/s], velocity of the air, for a robot with drag.
     * `num_targets`: number N of targets, at least the suite's. Additional targets are absent.
     """
     suite = suite_named(suite, "throws")
@@ -83,7 +85,7 @@ def draw(
     require_scalar("limit_scale", limit_scale)
     require_scale(limit_scale)
     if suite not in SUITES:
-        require_own_robot(robot, PAPER_CATCHER, suite)
+        require_own_robot(robot, PAPER_CATCHER, suite, wind)
         return TASK.other_suite(suite)(num, seed, first)
     own = SUITES[suite].num_targets
     size = own if num_targets is None else num_targets
@@ -99,6 +101,7 @@ def draw(
         horizon[:, place],
         present=np.arange(size) < own,
         robot=robot,
+        wind=wind,
         gravity=np.full(num, GRAVITY),
         optional=SUITES[suite].optional,
         dtype=dtype,

@@ -29,6 +29,7 @@ def draw(
     delay: float = 0.0,
     limit_scale: float = 1.0,
     robot: QuadrotorModel = PAPER_HITTER,
+    wind: Sequence[float] | None = None,
     dtype: DTypeLike = jnp.float32,
 ) -> HitCase:
     """Draw a batch of random cases: serves that a hovering quadrotor has to return.
@@ -44,6 +45,7 @@ def draw(
         delay: [s], time for which the ball has flown when planning starts.
         limit_scale: factor on the limits of speed, acceleration and body rate.
         robot: quadrotor with a racket. Suites of other packages define their own robot.
+        wind: (3,) [m/s], velocity of the air, for a robot with drag.
         dtype: type of every floating leaf.
 
     Raises:
@@ -51,7 +53,7 @@ def draw(
     """
     suite = suite_named(suite, "court")
     if suite not in TASK.suites:
-        require_own_robot(robot, PAPER_HITTER, suite)
+        require_own_robot(robot, PAPER_HITTER, suite, wind)
         return TASK.other_suite(suite)(num, seed, first)
     serves = generate_serves(num, seed, REAL_SCENARIOS.get(suite), first=first)
     return to_cases(
@@ -61,6 +63,7 @@ def draw(
         delay=delay,
         limit_scale=limit_scale,
         robot=robot,
+        wind=wind,
         dtype=dtype,
     )
 

@@ -140,8 +140,8 @@ def case(
         body_rate: [rad/s], greatest body rate.
         min_height: [m], least height of the propeller plane.
         rotor_drag: [1/s], linear drag of the quadrotor per unit mass: one number, or two numbers
-            (..., 2) across and along the thrust; None for no drag.
-        wind: (3,) or (..., 3) [m/s], velocity of the air; it acts by `rotor_drag`.
+            (..., 2) across and along the thrust; by default the robot's, or none.
+        wind: (3,) or (..., 3) [m/s], velocity of the air; it acts by the drag.
         hitting_speed: (3,) [m/s], greatest speed of the quadrotor at the impact on each axis.
         min_apex: [m], least apex of the returned ball.
         max_apex: [m], greatest apex of the returned ball.
@@ -189,7 +189,8 @@ def case(
         limits=quadrotor.limits_of(
             robot,
             leaf,
-            air=quadrotor.air_of(rotor_drag, wind, leaf),
+            rotor_drag=rotor_drag,
+            wind=wind,
             speed=speed,
             acceleration=acceleration,
             min_thrust=min_thrust,
@@ -208,7 +209,6 @@ def case(
     )
     require_sound(cases, _ARGUMENTS)
     quadrotor.require_start(cases)
-    quadrotor.require_hover(cases)
     height = np.asarray(cases.ball.pos)[..., 2]
     rules.require_rule("ball_pos", height, height >= 0.0, "at a height >= 0 m", batch)
     return cases

@@ -206,6 +206,7 @@ def to_cases(
     delay: float = 0.0,
     limit_scale: float = 1.0,
     robot: QuadrotorModel = PAPER_HITTER,
+    wind: Sequence[float] | None = None,
     dtype=jnp.float32,
 ) -> HitCase:
     """Make a batch of hits to plan from serves, by default with the numbers of [Yu2023bat].
@@ -213,6 +214,7 @@ def to_cases(
     `start` (3,) [m] is the hover position of the quadrotor `robot`. If it is "uniform", positions
     in the quadrotor's half court are drawn with `seed`. When planning starts, the balls have flown
     for `delay` [s]. `limit_scale` multiplies the limits of speed, acceleration and body rate.
+    `wind` (3,) [m/s] is the velocity of the air, for a robot with drag.
     """
     require_scalar("limit_scale", limit_scale)
     require_scalar("delay", delay)
@@ -234,6 +236,7 @@ def to_cases(
         start=head,
         drag=DRAG,
         gravity=GRAVITY,
+        wind=wind,
         dtype=dtype,
     )
     return dataclasses.replace(cases, limits=cases.limits.scale(limit_scale, cases.gravity))

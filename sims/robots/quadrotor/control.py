@@ -84,14 +84,16 @@ def control(
     R = rotation(state.quat_wxyz)
     half = 0.5 * world.timestep  # [s], by which MuJoCo's velocities are older than its positions
     ahead, faster = reference.pos - state.pos, reference.vel - half * reference.acc - state.vel
-    pull = net_thrust(reference.acc, gravity)
+    load = reference.acc if reference.load is None else reference.load
+    load_jerk = reference.jerk if reference.load_jerk is None else reference.load_jerk
+    pull = net_thrust(load, gravity)
     back = gains.position * ahead + gains.velocity * faster
     # The feedback is bounded: if the planned thrust is small, a large feedback could turn the
     # commanded thrust in any direction.
     most = gains.share * jnp.sqrt(jnp.sum(pull**2))
     back *= jnp.minimum(most / jnp.sqrt(jnp.maximum(jnp.sum(back**2), 1e-6)), 1.0)
-    acc = reference.acc + back
-    jerk = reference.jerk + gains.position * faster
+    acc = load + back
+    jerk = load_jerk + gains.position * faster
     R_wanted, rate_wanted = flat_attitude(acc, jerk, gravity)
     pull = net_thrust(acc, gravity)
     thrust = model.mass * (jnp.sum(pull * R[:, 2]) + reference.thrust_lead)

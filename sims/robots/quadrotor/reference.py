@@ -9,7 +9,7 @@ from flax import struct
 from jax import Array, lax
 
 from planner_jax.robot.attitude import flat_attitude
-from planner_jax.robot.quadrotor import net_thrust
+from planner_jax.robot.quadrotor import Air, add_drag, add_drag_rate, net_thrust, thrust_in_air
 from planner_jax.sims.model import World
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
 
@@ -30,6 +30,10 @@ class Reference:
     angular_acc: Array  # (3,) [rad/s^2], body frame
     # (3,) [rad/s^2], addition to the angular acceleration that compensates the rotors' lag.
     torque_lead: Array
+    # Acceleration (3,) [m/s^2] and jerk (3,) [m/s^3] that need the same thrust direction without
+    # drag and wind; None without drag, where they are `acc` and `jerk`.
+    load: Array | None = None
+    load_jerk: Array | None = None
 
 
 def with_rest(trajectory: PiecewisePolynomial) -> PiecewisePolynomial:
@@ -69,11 +73,12 @@ def with_rest(trajectory: PiecewisePolynomial) -> PiecewisePolynomial:
 
 
 def reference_at(
-    trajectory: PiecewisePolynomial, time: Array, lag: float, world: World
+    trajectory: PiecewisePolynomial, time: Array, lag: float, world: World, air: Air | None = None
 ) -> Reference:
     """Return the planned motion at a time () [s], with additions to the planned commands.
 
-    The additions compensate a first-order lag of the rotors with the time constant `lag` [s].
+    The additions compensate a first-order lag of the rotors with the time constant `lag` [s]. The
+    commands balance the drag and wind that the plan knows as `air`.
     """
     gravity = jnp.asarray(world.gravity, time.dtype)
     order = lambda k, at: evaluate(trajectory, at, k)  # noqa: E731
@@ -85,16 +90,23 @@ def reference_at(
     ahead = time + 0.5 * world.timestep
 
     def flat(at: Array) -> tuple[Array, Array]:
-        acc_then = order(2, at)
-        size = jnp.sqrt(jnp.sum(net_thrust(acc_then, gravity) ** 2))
-        return size, flat_attitude(acc_then, order(3, at), gravity)[1]
+        acc_then, jerk_then = order(2, at), order(3, at)
+        if air is None:
+            size = jnp.sqrt(jnp.sum(net_thrust(acc_then, gravity) ** 2))
+            return size, flat_attitude(acc_then, jerk_then, gravity)[1]
+        vel_then = order(1, at)
+        load = add_drag(air, vel_then, acc_then)
+        jerk_then = add_drag_rate(air, acc_then, jerk_then)
+        size = thrust_in_air(air, vel_then, load, gravity)
+        return size, flat_attitude(load, jerk_then, gravity)[1]
 
     (less, before), (size, rate), (more, after) = (flat(ahead + k * step) for k in (-1, 0, 1))
     # To invert a first-order lag, `lag` times the rate of change is added to the desired value.
     growth = (more - less) / (2.0 * step)
     angular_acc = (after - before) / (2.0 * step)
     angular_jerk = (after - 2.0 * rate + before) / step**2
-    now = jnp.sqrt(jnp.sum(net_thrust(acc, gravity) ** 2))
+    load = add_drag(air, vel, acc)
+    now = jnp.sqrt(jnp.sum(net_thrust(load, gravity) ** 2))
     return Reference(
         pos=pos,
         vel=vel,
@@ -103,4 +115,6 @@ def reference_at(
         thrust_lead=size + lag * growth - now,
         angular_acc=angular_acc,
         torque_lead=lag * angular_jerk,
+        load=None if air is None else load,
+        load_jerk=None if air is None else add_drag_rate(air, acc, jerk),
     )

@@ -12,7 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from planner_jax.robot.quadrotor_model import NET, RACKET, QuadrotorModel, Tool
+from planner_jax.robot.attitude import tilt_quaternion
+from planner_jax.robot.quadrotor import Air, add_drag, thrust_in_air
+from planner_jax.robot.quadrotor_model import NET, RACKET, QuadrotorModel, RotorDrag, Tool
 from planner_jax.sims.model import BALL_RADIUS, World
 from planner_jax.sims.robot import Physics, Shape, rotation
 from planner_jax.sims.robots.quadrotor.control import Gains, RobotState, control
@@ -27,8 +29,10 @@ _SEGMENTS = 12  # number of capsules of which the drawn hoop consists
 class Quadrotor:
     """The simulated quadrotor with a racket or a net; static under `jax.jit`."""
 
-    model: QuadrotorModel
+    model: QuadrotorModel  # as planner and controller know it
     gains: Gains = Gains()
+    wind: tuple[float, ...] = (0.0, 0.0, 0.0)  # [m/s], velocity of the air; it acts by the drag
+    drag: RotorDrag | None = None  # true drag of the rotors; None: the drag of `model`
 
     WORDS: ClassVar[str] = "rotors with lag, body-rate, attitude and position control"
     num_pos, num_vel, noise_shape = 7, 6, (4, 3)
@@ -62,6 +66,16 @@ class Quadrotor:
         )
         return body, motors
 
+    @property
+    def air(self) -> Air | None:
+        """The true drag and wind; None if there is no drag."""
+        drag = self.drag or self.model.drag
+        if drag is None:
+            return None
+        numbers = (drag.across, drag.along, self.wind)
+        across, along, wind = (jnp.asarray(each, jnp.float32) for each in numbers)
+        return Air(across, along, wind)
+
     def _tool_xml(self) -> str:
         """Return MJCF of the hoop as a ring of capsules over a plate, or of the racket's plate."""
         tool = self.tool
@@ -82,17 +96,27 @@ class Quadrotor:
 
     def at_rest(self, place: Array, gravity: float) -> tuple[Array, Array, Array]:
         """Return `qpos`, `qvel` and `act` (rotor thrusts) of a hover at `place` (3,) [m]."""
-        upright = jnp.array([1.0, 0.0, 0.0, 0.0], place.dtype)
-        lift = self.model.mass * gravity * self.model.rotors.shares
+        attitude, thrust = jnp.array([1.0, 0.0, 0.0, 0.0], place.dtype), gravity
+        if (air := self.air) is not None:
+            still, pull = jnp.zeros_like(place), jnp.asarray(gravity, place.dtype)
+            load = add_drag(air, still, still)
+            attitude = tilt_quaternion(load, pull)
+            thrust = thrust_in_air(air, still, load, pull)
+        lift = self.model.mass * thrust * self.model.rotors.shares
         return (
-            jnp.concatenate([place, upright]),
+            jnp.concatenate([place, attitude]),
             jnp.zeros(self.num_vel, place.dtype),
             jnp.asarray(lift, place.dtype),
         )
 
     def drive(self, physics: Physics, command: Array, timestep: float) -> tuple[Array, Array]:
-        """Return the command unchanged, as rotor thrusts (R,) [N], and zero extra forces."""
-        return command, jnp.zeros(self.num_vel, command.dtype)
+        """Return the command unchanged, as rotor thrusts (R,) [N], and the drag as extra forces."""
+        forces = jnp.zeros(self.num_vel, command.dtype)
+        if (air := self.air) is not None:
+            axis, vel = rotation(physics.qpos[3:7])[:, 2], physics.qvel[:3] - air.wind
+            along = (air.thrust_drag - air.drag) * jnp.sum(vel * axis) * axis
+            forces = forces.at[:3].set(-self.model.mass * (air.drag * vel + along))
+        return command, forces
 
     def state(self, physics: Physics) -> RobotState:
         """Return the true state of the quadrotor from the simulated physics."""
@@ -143,7 +167,7 @@ class Quadrotor:
         path = with_rest(plan.trajectory)
         lag = self.model.rotors.lag
         times = jnp.minimum(times, total_duration(path) - 2.0 * lag)
-        return jax.vmap(lambda time: reference_at(path, time, lag, world))(times)
+        return jax.vmap(lambda time: reference_at(path, time, lag, world, plan.air))(times)
 
     def command(self, state: RobotState, reference: Reference, world: World) -> Array:
         """Return the rotor thrusts (4,) [N] that track a reference (a planned state)."""
