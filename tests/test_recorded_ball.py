@@ -6,20 +6,27 @@ import numpy as np
 import pytest
 
 import planner_jax as pj
-from planner_jax.ball.spin import SpinningBall, Surroundings, spin_bounce, spin_flight
+from planner_jax.ball import spin
+from planner_jax.ball.spin import SpinningBall, Surroundings
 from planner_jax.cli.compilation import record_programs
 
 NUM, LANES = 20, 64  # Observations and recordings: all fits share two compiled programs.
+spin_flight = jax.jit(spin.spin_flight, static_argnames=("bounces", "steps"))
+spin_bounce = jax.jit(spin.spin_bounce)
 BALL = pj.ball.Ball.sphere(0.0027, 0.04)
+
+
+def as_floats(x):
+    return x if isinstance(x, jax.Array) else np.asarray(x, jnp.zeros(0).dtype)
 
 
 def air(height=0.0, gravity=9.81, restitution=0.9, friction=0.2, wind=(0.0, 0.0, 0.0)):
     numbers = (gravity, wind, height, restitution, friction, 0.4, 9.0)
-    return Surroundings(*(jnp.asarray(x, float) for x in numbers))
+    return Surroundings(*map(as_floats, numbers))
 
 
 def ball(pos, vel, drag=0.0, lift=(0.0, 0.0, 0.0)):
-    return SpinningBall(*(jnp.asarray(x, float) for x in (pos, vel, drag, lift)))
+    return SpinningBall(*map(as_floats, (pos, vel, drag, lift)))
 
 
 def flights(noise=0.001, seed=0, bounces=0, span=0.12):
@@ -84,15 +91,15 @@ def test_a_ball_that_is_dropped_returns_to_its_height_times_the_squared_restitut
 
 
 def test_gradients_through_a_bounce_equal_finite_differences(float64):
+    @jax.jit
     def height(x):
         start = SpinningBall(x[:3], x[3:6], x[6], x[7:10])
         numbers = air(restitution=x[10], friction=x[11])
         return spin_flight(start, jnp.asarray([0.3, 0.6]), numbers, bounces=1, steps=6)[0]
 
     x = jnp.asarray([0.1, 0.2, 0.5, 5.0, 1.0, -1.0, 0.14, 0.1, -0.2, 0.3, 0.9, 0.2])
-    slopes = jax.jacfwd(height)(x)
-    for k in range(12):
-        step = jnp.zeros(12).at[k].set(1e-6)
+    slopes = jax.jit(jax.jacfwd(height))(x)
+    for k, step in enumerate(1e-6 * np.eye(12)):
         difference = (height(x + step) - height(x - step)) / 2e-6
         np.testing.assert_allclose(slopes[..., k], difference, rtol=1e-5, atol=1e-7)
 

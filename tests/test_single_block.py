@@ -9,20 +9,36 @@ from PIL import Image
 
 import planner_jax as pj
 from planner_jax.cli.main import main
+from planner_jax.cli.plan.settings import SingleBlockSettings
 from planner_jax.sims import view
+from planner_jax.task.block.default_planner import StraightSearch
 from planner_jax.task.block.plan import make_empty_plan
+from planner_jax.task.block.suites import scene_for
 
 BALL = ["--pos", "9", "0.5", "0.3", "--vel", "-8", "-0.4", "5.4"]
 
 
-def test_the_command_writes_plan_setpoints_and_picture(tmp_path, capsys):
+@pytest.fixture
+def straight(monkeypatch):
+    """Let the command check straight motions alone, because other searches take long to compile."""
+    options = {"searches": (StraightSearch(straight=12, tries=0),)}
+    monkeypatch.setattr(SingleBlockSettings, "planner_options", lambda self: options)
+
+
+@pytest.mark.slow
+def test_the_command_plans_past_the_pole(capsys):
+    assert main(["plan", "block", *BALL]) == 0
+    assert capsys.readouterr().out.startswith("Blocked at ")
+
+
+def test_the_command_writes_plan_setpoints_and_picture(tmp_path, capsys, straight):
     out = tmp_path / "out"
-    assert main(["plan", "block", *BALL, "--out", str(out), "--rate", "50"]) == 0
+    assert main(["plan", "block", *BALL, "--no-pole", "--out", str(out), "--rate", "50"]) == 0
     assert {path.name for path in out.iterdir()} == {"plan.npz", "setpoints.csv", "block.png"}
     printed = capsys.readouterr().out
     plan = pj.block.BlockPlan.load(out / "plan.npz")
     assert printed.startswith(f"Blocked at {float(plan.contact_time):.3f} s, ")
-    case = pj.block.case((9.0, 0.5, 0.3), (-8.0, -0.4, 5.4))
+    case = pj.block.case((9.0, 0.5, 0.3), (-8.0, -0.4, 5.4), scene=scene_for(None, has_pole=False))
     assert pj.block.judge(case, plan).success
     sampled = plan.sample(4000.0)
     for k, joint in enumerate(case.arm.joint_names):
@@ -36,11 +52,11 @@ def test_the_command_writes_plan_setpoints_and_picture(tmp_path, capsys):
         assert len(list(csv.reader(line for line in file if line[0] != "#"))) > 10
 
 
-def test_a_plan_is_played_in_a_browser(monkeypatch, capsys):
+def test_a_plan_is_played_in_a_browser(monkeypatch, capsys, straight):
     pytest.importorskip("viser")
     shown = []
     monkeypatch.setattr(view.Viewer, "run", lambda viewer: shown.append(viewer))
-    assert main(["plan", "block", *BALL, "--view"]) == 0
+    assert main(["plan", "block", *BALL, "--no-pole", "--view"]) == 0
     (viewer,) = shown
     viewer.close()
     printed = capsys.readouterr().out
@@ -54,7 +70,7 @@ def test_a_plan_is_played_in_a_browser(monkeypatch, capsys):
     np.testing.assert_allclose(viewer.recording.contact[0, 0], wanted, atol=0.06)
 
 
-def test_a_ball_that_is_not_blocked_is_explained(capsys):
+def test_a_ball_that_is_not_blocked_is_explained(capsys, straight):
     assert main(["plan", "block", *BALL, "--delay", "0.9", "--no-pole"]) == 1
     printed = capsys.readouterr().out
     assert "Prospects: the ball is too early: the arm is ready " in printed

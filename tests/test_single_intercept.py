@@ -15,8 +15,8 @@ from planner_jax.cli.plan.answer import Answer
 from planner_jax.cli.plan.intercept import SingleIntercept, read_case
 from planner_jax.cli.plan.settings import SingleInterceptSettings
 from planner_jax.plane.maps import MapError
+from planner_jax.task.intercept.plan import make_straight_plan
 from planner_jax.task.intercept.spec import TASK
-from tests.planners import ONE_SEARCH
 
 CASE = {
     "target": {"position": [3.0, 4.6], "velocity": [0.0, -0.1]},
@@ -26,13 +26,6 @@ CASE = {
     "mover_velocities": [0, 0.4],
     "speed": 1.6,
 }
-
-
-@pytest.fixture
-def one_search(monkeypatch):
-    """Let the command plan by one search, because all searches compile for half a minute."""
-    options = {"searches": ONE_SEARCH}
-    monkeypatch.setattr(SingleInterceptSettings, "planner_options", lambda self: options)
 
 
 def write_case(folder, **fields):
@@ -87,15 +80,16 @@ def test_a_target_out_of_reach_is_reported_with_the_limit_that_fails(tmp_path, c
     assert "Referee on the best plan found: " in printed
 
 
-def test_limits_that_need_to_be_relaxed_are_printed_for_an_unsolved_case(tmp_path, one_search):
-    single = SingleIntercept(
-        TASK, SingleInterceptSettings(planner="spacetime", map=str(write_case(tmp_path)))
-    )
-    solved = single.answer()
-    tight = dataclasses.replace(solved.case.limits, acceleration=np.float32(1e-3))
-    case = dataclasses.replace(solved.case, limits=tight)
-    plan = dataclasses.replace(solved.plan, status=np.int32(pj.Status.INFEASIBLE))
-    lines = single.describe(Answer(case, plan, pj.intercept.judge(case, plan)))
+def test_limits_that_need_to_be_relaxed_are_printed_for_an_unsolved_case(tmp_path):
+    ahead = {"position": [3.95, 4.0]}  # which a car reaches that speeds up from 0.5 to 1 m/s
+    path = write_case(tmp_path, target=ahead, walls=None, movers=None, mover_velocities=None)
+    single = SingleIntercept(TASK, SingleInterceptSettings(planner="spacetime", map=str(path)))
+    usual = single.case()
+    drive = make_straight_plan(usual, 12).replace(speed=np.linspace(0.5, 1.0, 13, dtype=np.float32))
+    assert pj.intercept.judge(usual, drive).success
+    tight = dataclasses.replace(usual.limits, acceleration=np.float32(1e-3))
+    case = dataclasses.replace(usual, limits=tight)
+    lines = single.describe(Answer(case, drive, pj.intercept.judge(case, drive)))
     assert lines[1].startswith("Relaxation: a motion exists for the case with acceleration relaxed")
 
 
@@ -161,10 +155,11 @@ def test_a_bad_field_ends_the_command_with_code_2(tmp_path, capsys):
     assert line == f"planner-jax: error: {path}: speed must be > 0, got -1\n"
 
 
-def test_infinite_limits_have_no_row(tmp_path, one_search):
+def test_infinite_limits_have_no_row(tmp_path):
     settings = SingleInterceptSettings(map=str(write_case(tmp_path, steering_rate=float("inf"))))
-    task = pj.task_named("intercept")
-    single = SingleIntercept(task, settings.of(task))
-    answer = single.answer()
+    single = SingleIntercept(TASK, settings.of(TASK))
+    case = single.case()
+    plan = make_straight_plan(case, 12)
+    answer = Answer(case, plan, pj.intercept.judge(case, plan))
     names = [margin.limit for margin in single.margins(answer)]
     assert names[0] == "target to body's middle [m]" and len(names) == 5
