@@ -48,6 +48,7 @@ from .planning.warm_up import warm_up as warm_up
 from .recovery.planner import RecoveryPlanner as RecoveryPlanner
 from .recovery.with_recovery import RecoveringPlanner as RecoveringPlanner
 from .referee.judging import Verdict as Verdict
+from .robot.drag_fit import fit_drag as fit_drag
 from .robot.quadrotor import QuadrotorLimits as QuadrotorLimits
 from .robot.quadrotor import RotorLimits as RotorLimits
 from .robot.quadrotor_file import read_robot as read_robot

@@ -15,7 +15,7 @@ from planner_jax.runs.settings import Options, option, require_count
 from planner_jax.sims.noise import NOISES, PLANE_NOISES, PlaneSensing, Sensing, require_whole
 from planner_jax.sims.robots.arm.drives import ENCODERS, TORQUES, Drives
 from planner_jax.sweep.block.settings import REGIMES, ArmSettings, require_moderate
-from planner_jax.sweep.quadrotor_settings import robot_option, set_robot, wind_option
+from planner_jax.sweep.quadrotor_settings import WIND, resolve_robot, robot_option
 from planner_jax.task.block.spec import TASK as BLOCK
 from planner_jax.task.catch.spec import DECISIONS, TRAINED
 from planner_jax.task.catch.spec import TASK as CATCH
@@ -130,7 +130,7 @@ class BallFly(FlySettings):
         0.15, "F", "relative error of the initial estimate of the balls' drag, of random sign"
     )
     robot: Any = robot_option("the task's")
-    wind: tuple[float, ...] | None = wind_option()
+    wind: tuple[float, ...] | None = WIND
     rotor_drag_error: float = option(
         0.0, "F", "relative error of the robot's drag in plans; -1: plans know no drag"
     )
@@ -148,13 +148,16 @@ class BallFly(FlySettings):
     def air(self) -> dict[str, Any]:
         """Return the true drag and wind as arguments of the simulated robot."""
         drag = None if self.robot is None else self.robot.drag
-        return {"drag": drag} | ({} if self.wind is None else {"wind": self.wind})
+        return {"drag": drag} | ({} if self.wind is None else {"wind": tuple(self.wind)})
 
     def __post_init__(self) -> None:
         require_one_of(NOISES, "noise", self.noise)
         super().__post_init__()
         require(0.0 <= self.drag_error < 1.0, "drag_error", ">= 0 and < 1", self.drag_error)
-        set_robot(self, self.TOOL)
+        object.__setattr__(self, "robot", resolve_robot(self.robot, self.TOOL, self.wind))
+        if self.wind is not None:
+            is_wind = len(self.wind) == 3 and all(map(math.isfinite, self.wind))
+            require(is_wind, "wind", "three finite numbers", self.wind)
         error, has_drag = self.rotor_drag_error, bool(self.robot and self.robot.drag)
         require(-1.0 <= error < math.inf, "rotor_drag_error", "finite and >= -1", error)
         rule = "0 unless the file of the robot states its drag"

@@ -31,7 +31,8 @@ from planner_jax.sims.robot import Physics, rotation
 from planner_jax.sims.robots.quadrotor.reference import reference_at
 from planner_jax.sims.robots.quadrotor.robot import Quadrotor
 from planner_jax.sims.tasks.hit import HIT_WORLD, fly_hits, volleys
-from planner_jax.sweep.quadrotor import air_of, air_setting, body_rate, sample_motion, thrust_size
+from planner_jax.sweep.quadrotor import air_of, body_rate, sample_motion, thrust_size
+from planner_jax.sweep.sweep import first_values
 from planner_jax.task.hit.spec import REAL_SCENARIOS
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, sample_pieces
 
@@ -146,10 +147,11 @@ def test_curves_and_margins_of_a_plan_have_the_thrust_and_body_rate_in_wind():
     np.testing.assert_allclose(thrust_size(motion, GRAVITY), points["thrust"], rtol=1e-9)
     rates = np.linalg.norm(points["body_rate"], axis=1)
     np.testing.assert_allclose(body_rate(motion, GRAVITY), rates, rtol=1e-6)
-    stored = air_of(air_setting(jax.tree.map(lambda leaf: leaf[None], of)))
+    cases = bounds(air=of).replace(rotors=None)
+    stored = air_of(first_values(jax.tree.map(lambda leaf: leaf[None], cases)))
     for name, leaf in vars(of).items():
         np.testing.assert_allclose(vars(stored)[name], leaf, rtol=1e-6)
-    assert air_of(air_setting(None)) is None
+    assert air_of({}) is None
 
 
 @pytest.mark.parametrize("wind", [(0.0, 0.0, 0.0), (3.0, -2.0, 1.0)])

@@ -99,12 +99,17 @@ def _pull_and_rate(
     powers = np.moveaxis(coeffs, -1, 0)[..., None]
     pull, jerk = (np.moveaxis(derivative(powers, times, order), 0, -1) for order in (2, 3))
     pull[..., 2] += gravity[:, None, None]
+    return pull, angular_velocity(pull, jerk)
+
+
+def angular_velocity(pull: np.ndarray, jerk: np.ndarray) -> np.ndarray:
+    """Return angular velocities (..., 3) [rad/s], world frame, for thrusts per unit mass `pull`."""
     size = np.linalg.norm(pull, axis=-1)
     across = np.cross(pull, jerk)
     # The angular velocity is tau x jerk / |tau|^2 + r tau / |tau|, with the thrust per unit mass
     # tau. The Hopf fibration at zero heading determines the rate r about the thrust.
     about = -across[..., 2] / (size * (size + pull[..., 2]))
-    return pull, (across / size[..., None] + about[..., None] * pull) / size[..., None]
+    return (across / size[..., None] + about[..., None] * pull) / size[..., None]
 
 
 def _body_axes(pull: np.ndarray) -> np.ndarray:

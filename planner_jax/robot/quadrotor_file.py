@@ -73,7 +73,6 @@ _QUANTITY = re.compile(rf"\s*({_NUMBER}(?:{_MORE})*)\s*(\D.*?|1/s)?\s*", re.ASCI
 _LONGEST = 200  # greatest number of characters in the text of a quantity
 
 ENDINGS = (".yaml", ".yml", ".xml")
-# Sections of a robot's file; only "drag" may be left out.
 _PARTS = {"rotors": Rotors, "tool": Tool, "limits": FlightLimits, "drag": RotorDrag}
 
 
@@ -97,7 +96,7 @@ class _Quantity(NamedTuple):
 
 _LENGTH, _COORDINATES = _Quantity("length"), tuple(2 * count for count in COUNTS)
 # Section of a robot's file -> field -> format of its value, or None for a text. The sections are
-# "rotors", "tool", "limits" and "drag"; "" holds the fields outside of them.
+# "rotors", "tool", "limits" and, if given, "drag"; "" holds the fields outside of them.
 _FIELDS: dict[str, dict[str, _Quantity | None]] = {
     "": {
         "name": None,
@@ -167,10 +166,8 @@ def model_of(description: Mapping[str, Value], place: str = "robot") -> Quadroto
     """
     _require_known(description, [*_FIELDS[""], *_PARTS], "", place)
     parts: dict[str, Value] = {}
-    for part in _PARTS:
+    for part in [part for part in _PARTS if part != "drag" or description.get(part) is not None]:
         value = description.get(part)
-        if value is None and part == "drag":
-            continue
         if value is None:
             raise RobotError(f"{place}: {part} must be given, got nothing")
         if not isinstance(value, Mapping):

@@ -1,11 +1,12 @@
 """Columns of stored cases, and sampled trajectories, for runs of quadrotors that hit or catch."""
 
 import dataclasses
-from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from planner_jax.core.arithmetic import host_leaf
+from planner_jax.referee.rotors import angular_velocity
 from planner_jax.robot.quadrotor import Air, add_drag, add_drag_rate
 from planner_jax.runs.columns import LIST, VECTOR, Column, RefereedBatch, leaves_of
 from planner_jax.runs.manifest import Entries, Row
@@ -69,25 +70,14 @@ class SampledMotion:
     air: Air | None = None  # drag and wind, with NumPy leaves
 
 
-def air_setting(air: Air | None) -> Entries:
-    """Return drag and wind of the first case of a batch for the manifest's entry `setting`."""
-    leaves = {} if air is None else vars(air)
-    return {f"air_{k}": np.asarray(x, float)[0].round(6).tolist() for k, x in leaves.items()}
-
-
 def air_of(setting: Entries) -> Air | None:
     """Return the drag and wind in a manifest's entry `setting`, in float32; None if absent."""
-    if "air_drag" not in setting:
-        return None
-    names = ("drag", "thrust_drag", "wind")
-    return Air(*(host_leaf(setting[f"air_{name}"], np.float32) for name in names))
+    names = [name for name in ("air_drag", "air_thrust_drag", "air_wind") if name in setting]
+    return Air(*(host_leaf(setting[name], np.float32) for name in names)) if names else None
 
 
 def sample_motion(
-    coeffs: Sequence[float] | np.ndarray,
-    durations: Sequence[float] | np.ndarray,
-    num: int,
-    air: Air | None = None,
+    coeffs: ArrayLike, durations: ArrayLike, num: int, air: Air | None = None
 ) -> SampledMotion:
     """Sample a piecewise polynomial of M pieces at `num` evenly spaced times, in float64.
 
@@ -133,13 +123,9 @@ def thrust_size(motion: SampledMotion, gravity: float) -> np.ndarray:
 def body_rate(motion: SampledMotion, gravity: float) -> np.ndarray:
     """Return the magnitude [rad/s] of the body's angular velocity at N times, at zero heading.
 
-    With the thrust vector f and c = f x jerk, the angular velocity normal to the body z axis has
-    the magnitude |c| / |f|^2. The component about the z axis is -c_z / (|f| (|f| + f_z)) by the
-    Hopf fibration. The result is NaN where f is zero or points straight down.
+    The result is NaN where the thrust is zero or points straight down.
     """
     thrust = net_thrust(motion, gravity)
-    size = np.linalg.norm(thrust, axis=1)
-    cross = np.cross(thrust, add_drag_rate(motion.air, motion.acc, motion.jerk))  # type: ignore
+    jerk = add_drag_rate(motion.air, motion.acc, motion.jerk)  # type: ignore[arg-type]
     with np.errstate(all="ignore"):
-        across = np.linalg.norm(cross, axis=1) / size**2
-        return np.hypot(across, cross[:, 2] / (size * (size + thrust[:, 2])))
+        return np.linalg.norm(angular_velocity(thrust, np.asarray(jerk)), axis=1)

@@ -1,7 +1,6 @@
 """Settings of runs over many cases in which quadrotors hit or catch."""
 
 import dataclasses
-import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -13,6 +12,11 @@ from planner_jax.runs.settings import SweepSettings, option, recovery_option, re
 if TYPE_CHECKING:
     from planner_jax.robot.quadrotor_model import QuadrotorModel
 
+_DRAG = "left out unless the file of the robot states its drag"
+WIND: Any = option(
+    None, "X Y Z", "velocity of the air [m/s], for a robot with drag (default: none)"
+)
+
 
 def robot_option(usual: str) -> Any:
     """Return the dataclass field of the setting `robot`, in whose help `usual` is the default."""
@@ -20,12 +24,14 @@ def robot_option(usual: str) -> Any:
     return option(None, "NAME", words)
 
 
-def resolve_robot(given: object, tool: str) -> "QuadrotorModel | None":
+def resolve_robot(given: object, tool: str, wind: object = None) -> "QuadrotorModel | None":
     """Return the quadrotor that a name, file, model or dict of fields defines; None if not given.
 
-    An `ArgumentError` is raised unless the quadrotor carries `tool`, "net" or "racket".
+    An `ArgumentError` is raised unless the quadrotor carries `tool`, "net" or "racket", and unless
+    it has drag if `wind` is not None.
     """
     if given is None:
+        require(wind is None, "wind", _DRAG, wind)
         return None
     from planner_jax.robot.quadrotor_file import RobotError, model_of
     from planner_jax.robot.quadrotor_model import QuadrotorModel
@@ -41,25 +47,8 @@ def resolve_robot(given: object, tool: str) -> "QuadrotorModel | None":
     if found.tool.kind != tool:
         shown = f"{found.name!r} with a {found.tool.kind}"
         raise ArgumentError("robot", f"a {tool}", verb="carry", shown=shown)
+    require(wind is None or found.drag is not None, "wind", _DRAG, wind)
     return found
-
-
-def wind_option() -> Any:
-    """Return the dataclass field of the setting `wind`."""
-    return option(None, "X Y Z", "velocity of the air [m/s], for a robot with drag (default: none)")
-
-
-def set_robot(settings: Any, tool: str) -> None:
-    """Replace the setting `robot` by a model with `tool`, and check the setting `wind`."""
-    robot = resolve_robot(settings.robot, tool)
-    object.__setattr__(settings, "robot", robot)
-    if settings.wind is not None:
-        wind = tuple(map(float, settings.wind))
-        sound = len(wind) == 3 and all(map(math.isfinite, wind))
-        require(sound, "wind", "three finite numbers", wind)
-        rule = "left out unless the file of the robot states its drag"
-        require(robot is not None and robot.drag is not None, "wind", rule, wind)
-        object.__setattr__(settings, "wind", wind)
 
 
 def robot_remark(parameters: Row) -> list[str]:
@@ -76,7 +65,7 @@ class QuadrotorSettings(SweepSettings):
 
     limit_scale: float = option(1.0, "F", "factor on the limits of speed, body rate and thrust")
     robot: object = robot_option("the task's")
-    wind: tuple[float, ...] | None = wind_option()
+    wind: tuple[float, ...] | None = WIND
     effort: str = option(EFFORTS[0], "NAME", f"how long the planner searches: {', '.join(EFFORTS)}")
     recovery: str = recovery_option()
 
@@ -87,7 +76,7 @@ class QuadrotorSettings(SweepSettings):
     def __post_init__(self) -> None:
         super().__post_init__()
         require_scale(self.limit_scale)
-        set_robot(self, self.TOOL)
+        object.__setattr__(self, "robot", resolve_robot(self.robot, self.TOOL, self.wind))
         require_one_of(EFFORTS, "effort", self.effort)
         rule = f"left out for the planner {self.WITHOUT_EFFORT}, which minimises nothing"
         has_effort = self.effort == EFFORTS[0] or self.planner != self.WITHOUT_EFFORT

@@ -205,11 +205,13 @@ def first_values(tree: PyTree, names: Sequence[str] = (), prefix: str = "") -> E
     """Return fields of the first case of a batch as plain numbers, rounded to six decimals.
 
     `names` are names of fields of `tree`, by default all. In the result each name has the `prefix`.
-    Fields that are None or dataclasses are left out.
+    Fields that are None or dataclasses are left out, except for the fields of `air`.
     """
     found = {}
     for name in names or [field.name for field in dataclasses.fields(tree)]:
         value = vars(tree)[name]
         if value is not None and not dataclasses.is_dataclass(value):
             found[prefix + name] = np.asarray(value, float)[0].round(6).tolist()
+        elif name == "air" and value is not None:
+            found |= first_values(value, prefix="air_")
     return found

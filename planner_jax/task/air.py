@@ -3,6 +3,7 @@
 from collections.abc import Callable
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jax.core import Tracer
@@ -11,21 +12,17 @@ from jaxtyping import PyTree
 from planner_jax.core import rules
 from planner_jax.core.checks import shape_of
 from planner_jax.core.errors import ArgumentError
-from planner_jax.robot.quadrotor import Air
+from planner_jax.robot.quadrotor import Air, add_drag, thrust_in_air
 from planner_jax.robot.quadrotor_model import QuadrotorModel
 
 
 def air_of(
     robot: QuadrotorModel, rotor_drag: object, wind: object, leaf: Callable[..., Array]
 ) -> Air:
-    """Return the drag and wind of arguments of `case`; the robot's drag replaces None.
-
-    `rotor_drag` is one number, or two numbers across and along the thrust.
-    """
+    """Return the drag and wind of arguments of `case`; the robot's drag replaces None."""
     if rotor_drag is None:
         if robot.drag is None:
-            rule = "left out without rotor_drag, or a robot with drag, as it acts by the drag"
-            raise ArgumentError("wind", rule)
+            raise ArgumentError("wind", "left out without rotor_drag or a robot with drag", wind)
         rotor_drag = (robot.drag.across, robot.drag.along)
     shape = (2,) if shape_of("rotor_drag", rotor_drag)[-1:] == (2,) else ()
     drag = leaf("rotor_drag", rotor_drag, *shape)
@@ -38,11 +35,8 @@ def require_hover(cases: PyTree) -> None:
     limits, gravity, air = cases.limits, cases.gravity, cases.limits.air
     if air is None or any(isinstance(x, Tracer) for x in jax.tree.leaves((limits, gravity))):
         return
-    wind, across, along = (np.asarray(leaf) for leaf in (air.wind, air.drag, air.thrust_drag))
-    force = -across[..., None] * wind
-    force[..., 2] += gravity
-    size = np.linalg.norm(force, axis=-1)
-    thrust = size - (along - across) * (force * wind).sum(axis=-1) / size
+    still = jnp.zeros_like(air.wind)
+    thrust = np.asarray(thrust_in_air(air, still, add_drag(air, still, still), gravity))
     most = np.asarray(limits.thrust_bounds[1])
     if (rotors := limits.rotors) is not None:
         most = np.minimum(most, rotors.mixer.shape[-2] * rotors.max_thrust / rotors.mass)

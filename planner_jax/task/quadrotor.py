@@ -95,10 +95,7 @@ def start_state(
 
 
 def require_start(cases: PyTree) -> None:
-    """Raise `CaseError` for a start below `min_height`, or a wind in which no hover is possible.
-
-    JAX tracers are not checked.
-    """
+    """Raise `CaseError` for a start below `min_height` or too strong a wind; skip JAX tracers."""
     heights = cases.head_state[..., 0, 2], cases.limits.min_height
     if any(isinstance(each, Tracer) for each in heights):
         return
@@ -119,12 +116,7 @@ def require_own_robot(robot: object, usual: QuadrotorModel, suite: str, wind: ob
 
 
 def limits_of(
-    robot: QuadrotorModel,
-    leaf: Callable[..., Array],
-    *,
-    rotor_drag: object,
-    wind: object,
-    **given: object,
+    robot: QuadrotorModel, leaf: Callable[..., Array], air: tuple[object, object], **given: object
 ) -> QuadrotorLimits:
     """Return a case's limits: the values in `given` that are not None, else the robot's limits.
 
@@ -145,12 +137,12 @@ def limits_of(
     if values["min_thrust"] is None and values["max_thrust"] is not None:
         values["min_thrust"] = 0.0
     arrays = {name: leaf(name, value) for name, value in values.items() if value is not None}
-    air = None
-    if any(each is not None for each in (rotor_drag, wind, robot.drag)):
+    found = None
+    if any(each is not None for each in (*air, robot.drag)):
         from planner_jax.task.air import air_of  # few cases have drag
 
-        air = air_of(robot, rotor_drag, wind, leaf)
-    return QuadrotorLimits(**arrays, rotors=_rotors_of(robot, leaf), air=air)
+        found = air_of(robot, *air, leaf)
+    return QuadrotorLimits(**arrays, rotors=_rotors_of(robot, leaf), air=found)
 
 
 def _rotors_of(robot: QuadrotorModel, leaf: Callable[..., Array]) -> RotorLimits | None:

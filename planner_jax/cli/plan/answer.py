@@ -186,10 +186,9 @@ def _of_rotors(answer: Answer) -> list[Margin]:
     with np.errstate(all="ignore"):
         found = rotor_range(pieces_of(coeffs[None], durations[None]), leaves, fractions)
     low, low_at, high, high_at = (float(each[0]) for each in found)
-    least, most = float(rotors.min_thrust), float(rotors.max_thrust)
     return [
-        Margin("rotor thrust, least [N]", low, least, low_at, least=True),
-        Margin("rotor thrust, greatest [N]", high, most, high_at),
+        Margin("rotor thrust, least [N]", low, float(rotors.min_thrust), low_at, least=True),
+        Margin("rotor thrust, greatest [N]", high, float(rotors.max_thrust), high_at),
     ]
 
 

@@ -10,7 +10,7 @@ from planner_jax.core.registry import Task, split_name
 from planner_jax.runs.manifest import Entries
 from planner_jax.runs.settings import option, recovery_option, recovery_options
 from planner_jax.sweep.block.settings import REGIMES, ArmSettings
-from planner_jax.sweep.quadrotor_settings import robot_option, set_robot, wind_option
+from planner_jax.sweep.quadrotor_settings import WIND, resolve_robot, robot_option
 from planner_jax.task.catch.spec import DECISIONS, TRAINED
 from planner_jax.task.hit.spec import DRAG
 
@@ -101,7 +101,7 @@ class SingleSettings(PlanSettings):
     min_height: float | None = option(None, "Z", f"least height [m] {_OWN}")
     gravity: float | None = option(None, "G", "magnitude [m/s^2] (default: the task's)")
     robot: object = robot_option("the task's")
-    wind: tuple[float, ...] | None = wind_option()
+    wind: tuple[float, ...] | None = WIND
     recovery: str = recovery_option("brake")  # "brake", since controllers need a stop at the end
 
     PLANNER: ClassVar[tuple[str, ...]] = ()  # names of fields that are arguments of the planner
@@ -109,7 +109,7 @@ class SingleSettings(PlanSettings):
     TOOL: ClassVar[str]  # tool that the robot must carry, "net" or "racket"
 
     def __post_init__(self) -> None:
-        set_robot(self, self.TOOL)
+        object.__setattr__(self, "robot", resolve_robot(self.robot, self.TOOL, self.wind))
         require_one_of(CHOICES, "recovery", self.recovery)
         for field in dataclasses.fields(self):
             value = vars(self)[field.name]

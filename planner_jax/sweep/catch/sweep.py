@@ -12,7 +12,7 @@ from planner_jax.sweep.catch.columns import COLUMNS, FRAME
 from planner_jax.sweep.catch.figures import flight_figure, motion_figure
 from planner_jax.sweep.catch.settings import CatchSettings
 from planner_jax.sweep.figures import CAPTION as MOTION
-from planner_jax.sweep.quadrotor import air_setting, recovery_remark
+from planner_jax.sweep.quadrotor import recovery_remark
 from planner_jax.sweep.quadrotor_settings import robot_remark
 from planner_jax.sweep.rows import quadrotor_plan
 from planner_jax.sweep.sweep import RunFigure, Sweep, first_values
@@ -94,8 +94,7 @@ class CatchSweep(Sweep[CatchSettings]):
     def setting(self, cases: PyTree) -> Entries:
         """Return physics and limits that all cases share, for the manifest's entry `setting`."""
         net = first_values(cases.net, ["height", "radius", "max_angle"], "net_")
-        net |= first_values(cases.limits) | air_setting(cases.limits.air)
-        return first_values(cases, ["gravity"]) | net
+        return first_values(cases, ["gravity"]) | net | first_values(cases.limits)
 
     def tally(self, settings: CatchSettings) -> CatchTally:
         """Return a new counter of rows, from which the summary of a run is made."""

@@ -18,7 +18,7 @@ from planner_jax.sweep.figures import CAPTION as MOTION
 from planner_jax.sweep.hit.columns import COLUMNS, FRAME, SINGLE_COLUMNS
 from planner_jax.sweep.hit.figures import court_figure, motion_figure, path_figure
 from planner_jax.sweep.hit.settings import HitSettings
-from planner_jax.sweep.quadrotor import air_setting, recovery_remark
+from planner_jax.sweep.quadrotor import recovery_remark
 from planner_jax.sweep.quadrotor_settings import robot_remark
 from planner_jax.sweep.rows import quadrotor_plan
 from planner_jax.sweep.sweep import RunFigure, Sweep, first_values
@@ -114,7 +114,7 @@ class HitSweep(Sweep[HitSettings]):
     def setting(self, cases: PyTree) -> Entries:
         """Return physics and limits that all cases share, for the manifest's entry `setting`."""
         names = ("drag", "gravity", "restitution", "racket_height", "racket_radius")
-        setting = first_values(cases, names) | air_setting(cases.limits.air)
+        setting = first_values(cases, names)
         return setting | first_values(cases.limits) | first_values(cases.hit_limits)
 
     def table(self, manifest: Entries) -> RateTable:

@@ -203,8 +203,7 @@ def case(
         limits=quadrotor.limits_of(
             robot,
             leaf,
-            rotor_drag=rotor_drag,
-            wind=wind,
+            (rotor_drag, wind),
             speed=speed,
             min_thrust=min_thrust,
             max_thrust=max_thrust,

@@ -189,8 +189,7 @@ def case(
         limits=quadrotor.limits_of(
             robot,
             leaf,
-            rotor_drag=rotor_drag,
-            wind=wind,
+            (rotor_drag, wind),
             speed=speed,
             acceleration=acceleration,
             min_thrust=min_thrust,
