@@ -160,6 +160,19 @@ def test_each_leg_starts_where_the_previous_leg_ends(planned):
     np.testing.assert_array_equal(plan.legs.time[2:], 0.0)
 
 
+def test_a_picture_shows_every_meeting_and_the_verdict(planned):
+    groups, plans = planned[0], planned[1]["best"]
+    for k in (int(np.argmax(pj.are_solved(plans))), 5):
+        axes = pj.show(*pj.take((groups, plans), k)).axes[0]
+        verdict = pj.group.judge(*pj.take((groups, plans), k))
+        assert axes.get_title(loc="left") == verdict.sentence()
+        circles = [line.get_xydata()[0] for line in axes.lines if line.get_markersize() == 13]
+        assert len(circles) == vars(verdict)["leg"] + 1
+        if verdict.success:
+            met = [plans.legs.meeting[k, leg] for leg in (1, 0)]
+            np.testing.assert_allclose(circles, met, atol=1e-3)
+
+
 def test_one_target_is_planned_as_an_interception(planned):
     groups = dataclasses.replace(planned[0], present=np.broadcast_to(np.arange(4) < 1, (6, 4)))
     plans = pj.plan(planner("best"), groups)

@@ -92,6 +92,18 @@ def test_a_motion_through_a_box_is_rejected_by_planner_and_judge():
     assert not pj.are_solved(pj.plan(DIRECT, case))
 
 
+def test_a_picture_has_the_verdict_and_shows_arm_and_obstacles():
+    case, plan = reach(scene=WALL), pj.plan(DIRECT, reach())
+    figure = pj.show(case, plan)
+    assert figure.get_suptitle() == pj.reach.judge(case, plan).sentence()
+    _, side, rates = figure.axes
+    low, high = side.get_ylim()
+    assert -1.0 < low < 0.0 and 3.0 < high < 4.0  # from the base to the sphere, without a floor
+    assert len(rates.lines) == 6
+    with pytest.raises(pj.ArgumentError, match="case must be one case of hit, catch"):
+        pj.show(plan, plan)
+
+
 def test_a_mesh_is_judged_as_its_hull_and_planned_as_the_box_around_it():
     through = pj.plan(DIRECT, reach())
     corners = [(x, y, z) for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)]

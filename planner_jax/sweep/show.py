@@ -1,7 +1,10 @@
 """`pj.show`: a picture of one plan, for notebooks."""
 
+import functools
 import io
 
+import jax
+import numpy as np
 from jaxtyping import PyTree
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -9,9 +12,13 @@ from matplotlib.figure import Figure
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.registry import all_tasks
 from planner_jax.runs.style import context
-from planner_jax.sweep.sweep import sweep_of
+from planner_jax.sweep.sweep import Picture, sweep_of
+from planner_jax.task.block.drawing import SIZE, draw_motion
+from planner_jax.task.reach.api import judge
+from planner_jax.task.reach.case import ReachCase
+from planner_jax.task.reach.default_planner import ReachPlan
 
-_RULE = "one case of hit, catch, intercept or block"
+_RULE = "one case of hit, catch, intercept, group, block or reach"
 
 
 class PlanFigure(Figure):
@@ -23,11 +30,16 @@ class PlanFigure(Figure):
         return file.getvalue()
 
 
+def _draw_reach(case: ReachCase, plan: ReachPlan, figure: Figure) -> None:
+    parts = jax.tree.map(np.asarray, (case.arm, case.limits, case.scene, plan.motion))
+    draw_motion(figure, judge(case, plan), *parts)
+
+
 def show(case: PyTree, plan: PyTree) -> PlanFigure:
     """Draw one case and its plan: robot, target, and whether the referee accepts the plan.
 
     Args:
-        case: one case of `hit`, `catch`, `intercept` or `block`.
+        case: one case of `hit`, `catch`, `intercept`, `group`, `block` or `reach`.
         plan: its plan, solved or not.
 
     Returns:
@@ -37,15 +49,16 @@ def show(case: PyTree, plan: PyTree) -> PlanFigure:
     Raises:
         ArgumentError: the case is a batch, or a case of a task without pictures.
     """
-    homes = {task.home: task for task in all_tasks().values()}
-    task = homes.get(type(case).__module__.rpartition(".")[0])
-    shape = getattr(case, "batch_shape", None)
-    if task is None or shape != ():
+    home, shape = type(case).__module__.rpartition(".")[0], getattr(case, "batch_shape", None)
+    task = {task.home: task for task in all_tasks().values()}.get(home)
+    drawn: list[Picture] = []
+    if shape == () and isinstance(case, ReachCase):
+        drawn.append(Picture("reach.png", SIZE, functools.partial(_draw_reach, case, plan)))
+    elif shape == () and task is not None:
+        drawn += sweep_of(task).pictures(case, plan, task.judge(case, plan), "plan")
+    if not drawn:
         batch = f" of batch shape {shape}" if shape else ""
         raise ArgumentError("case", _RULE, shown=f"a {type(case).__name__}{batch}")
-    drawn = sweep_of(task).pictures(case, plan, task.judge(case, plan), "plan")
-    if not drawn:
-        raise ArgumentError("case", _RULE, shown=f"a case of {task.name}")
     with context():
         figure = PlanFigure(figsize=drawn[0].size)
         FigureCanvasAgg(figure)

@@ -36,6 +36,7 @@ class GroupSettings(SweepSettings):
     CPU_BATCH: ClassVar[int] = 64
     GPU_BATCH: ClassVar[int] = 512
     PLANNER: ClassVar[tuple[str, ...]] = ("decide",)
+    RUN: ClassVar[str] = "planner_jax.sweep.intercept.sweep:GroupSweep"
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -6,15 +6,22 @@ import numpy as np
 import pyarrow as pa
 from jaxtyping import PyTree
 
+from planner_jax.core.protocol import take
+from planner_jax.referee.intercept import InterceptVerdict
 from planner_jax.runs.manifest import Entries
 from planner_jax.runs.summary import COUNTED, Tally
 from planner_jax.sweep.figures import CAPTION as MOTION
 from planner_jax.sweep.intercept.columns import COLUMNS, FRAME
 from planner_jax.sweep.intercept.figures import motion_figure, plane_figure
-from planner_jax.sweep.intercept.settings import InterceptSettings
+from planner_jax.sweep.intercept.settings import GroupSettings, InterceptSettings
 from planner_jax.sweep.rows import car_plan
 from planner_jax.sweep.sweep import Picture, RunFigure, Sweep, first_values
-from planner_jax.task.intercept.drawing import draw_plan, figure_size
+from planner_jax.task.intercept.drawing import (
+    SampledDrive,
+    draw_judged,
+    figure_size,
+    sample_drive,
+)
 
 # Planners whose plans for one case of a run are drawn beside the plan of the run's own planner.
 COMPARED = ("lattice", "spacetime")
@@ -93,5 +100,21 @@ class InterceptSweep(Sweep[InterceptSettings]):
 
     def pictures(self, case: PyTree, plan: PyTree, verdict: PyTree, planner: str) -> list[Picture]:
         """Return one picture: walls, moving obstacles, target and car from above."""
-        size = figure_size(case, plan)
-        return [Picture("plane.png", size, lambda figure: draw_plan(case, plan, figure.subplots()))]
+        drive = sample_drive(case, [plan], [case.target], verdict)
+        return [_picture(drive, verdict)]
+
+
+class GroupSweep(Sweep[GroupSettings]):
+    """Sweeps that plan and judge many cases of a car that meets several targets in turn."""
+
+    def pictures(self, case: PyTree, plan: PyTree, verdict: PyTree, planner: str) -> list[Picture]:
+        """Return one picture from above, of the drives up to the first that the referee rejects."""
+        num = int(verdict.leg) + 1
+        legs = [take(plan.legs, k) for k in range(num)]
+        targets = [take(case.shared.target, int(k)) for k in plan.order[:num]]
+        return [_picture(sample_drive(case.shared, legs, targets, verdict), verdict)]
+
+
+def _picture(drive: SampledDrive, verdict: InterceptVerdict) -> Picture:
+    draw = lambda figure: draw_judged(drive, verdict, figure.subplots())  # noqa: E731
+    return Picture("plane.png", figure_size(drive), draw)

@@ -1,6 +1,7 @@
 """A drawing of one block: the arm from above and from the side, and the rates of its joints."""
 
 import itertools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,16 +14,21 @@ from scipy.spatial.transform import Rotation
 
 from planner_jax.core.checks import require_kind
 from planner_jax.core.choices import require
-from planner_jax.robot.arm import capsules, shield_pose
+from planner_jax.referee.judging import Verdict
+from planner_jax.robot.arm import Arm, ArmLimits, capsules, shield_pose
 from planner_jax.robot.capsule_fit import directions
 from planner_jax.runs import style
+from planner_jax.runs.style import Look
+from planner_jax.task.block.api import judge
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.plan import BlockPlan
 from planner_jax.task.block.scene import Box, Scene
-from planner_jax.trajectory.polynomial import evaluate
+from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
 
 SIZE = (11.0, 4.2)  # [inch], size of a figure
 _SHOWN, _SAMPLES = 5, 200  # numbers of drawn poses, and of samples of the rates
+_DEEP = 3.0  # [m], depth below the arm's base from which a floor is not drawn
+_VIEWS = [0, 1], [0, 2]  # axes of the panels from above and from the side
 
 
 def draw_plan(case: BlockCase, plan: BlockPlan, figure: Figure) -> None:
@@ -43,60 +49,79 @@ def draw_plan(case: BlockCase, plan: BlockPlan, figure: Figure) -> None:
     require_kind("case", case, BlockCase)
     require_kind("plan", plan, BlockPlan)
     require(case.batch_shape == (), "case", "one case", shown=f"batch shape {case.batch_shape}")
-    motion, arm = jax.tree.map(jnp.asarray, (plan.motion, case.arm))
     case, plan = jax.tree.map(np.asarray, (case, plan))
-    above, side, rates = figure.subplots(1, 3, width_ratios=(1.2, 1.2, 1.0))
-    end = float(jnp.sum(motion.durations))
-    times = jnp.linspace(0.0, end, _SHOWN)
-    angles = jax.vmap(lambda time: evaluate(motion, time))(times)
-    arms = np.asarray(jax.vmap(capsules, (None, 0))(arm, angles))
-    turns, middles = (np.asarray(x) for x in jax.vmap(shield_pose, (None, 0))(arm, angles))
-    outline = case.arm.shield_corners
-    corners = middles[:, None] + np.einsum("kij,cj->kci", turns[:, :, 1:], outline)
-    contact = float(plan.contact_time)
+    parts = case.arm, case.limits, case.scene, plan.motion
+    *panels, rates = draw_motion(figure, judge(case, plan), *parts, float(case.delay))
+    contact, scene = float(plan.contact_time), case.scene
     flown = np.linspace(0.0, contact, _SAMPLES)[:, None]
     ball = case.ball.pos + case.ball.vel * flown - 0.5 * case.gravity * flown**2 * np.eye(3)[2]
-    views = (above, (0, 1), "from above"), (side, (0, 2), "from the side")
-    for axes, (across, up), title in views:
-        _draw_scene(axes, case, across, up)
-        for k, (body, plate) in enumerate(zip(arms, corners, strict=True)):
-            look = {"alpha": (k + 1.0) / _SHOWN, "color": style.BLUE, "solid_capstyle": "round"}
-            for ends, radius in zip(body, case.arm.capsule_radius, strict=True):
-                axes.plot(ends[:, across], ends[:, up], linewidth=40.0 * radius, **look)
-            shape = {"color": style.ORANGE, "alpha": look["alpha"], "linewidth": 2.0}
-            axes.add_patch(Polygon(plate[:, [across, up]], zorder=4, **shape))
-        near = np.all(np.abs(ball - middles[-1]) < 1.5 * case.scene.outer.upper[0], axis=1)
-        axes.plot(ball[near, across], ball[near, up], "--", color=style.INK, zorder=5)
-        axes.plot(ball[-1, across], ball[-1, up], "o", color=style.RED, zorder=6)
-        axes.set_aspect("equal")
-        style.label(axes, "xyz"[across] + " [m]", "xyz"[up] + " [m]", title)
-    at = jnp.linspace(0.0, end, _SAMPLES)
-    speeds = np.asarray(jax.vmap(lambda time: evaluate(motion, time, 1))(at))
-    for name, rate in zip(case.arm.joint_names, (speeds / case.limits.velocity).T, strict=True):
-        rates.plot(float(case.delay) + at, rate, label=name)
-    rates.axvline(contact, color=style.RED, linestyle=":")
-    rates.set_ylim(-1.1, 1.6)  # leaves room for the legend
-    rates.legend(fontsize="x-small", ncols=2, loc="upper center")
-    style.label(rates, "time [s]", "rate / limit", "joints; dotted: contact")
-
-
-def _draw_scene(axes: Axes, case: BlockCase, across: int, up: int) -> None:
-    scene, arm = case.scene, case.arm
-    base = Box(lower=arm.base_box[0], upper=arm.base_box[1])
+    near = np.all(np.abs(ball - ball[-1]) < 1.5 * scene.outer.upper[0], axis=1)
     inner = Box(scene.inner.lower - scene.inner_radius, scene.inner.upper + scene.inner_radius)
     around = "-" if scene.inner_ends is None else ":"  # the box around an oblique capsule
-    for box, look in (
-        (scene.outer, {"fill": False, "linestyle": ":", "edgecolor": style.GREY}),
-        (inner, {"fill": False, "linestyle": around, "edgecolor": style.GREEN}),
-        (base, {"facecolor": style.PALE}),
-    ):
-        corner, size = box.lower[[across, up]], (box.upper - box.lower)[[across, up]]
-        axes.add_patch(Rectangle(tuple(corner), *size, **look))
+    for axes, view in zip(panels, _VIEWS, strict=True):
+        _draw_box(axes, scene.outer, view, fill=False, linestyle=":", edgecolor=style.GREY)
+        _draw_box(axes, inner, view, fill=False, linestyle=around, edgecolor=style.GREEN)
+        axes.plot(*ball[near][:, view].T, "--", color=style.INK, zorder=5)
+        axes.plot(*ball[-1, view], "o", color=style.RED, zorder=6)
+    rates.axvline(contact, color=style.RED, linestyle=":")
+    rates.set_title("joints; dotted: contact", loc="left")
+
+
+def draw_motion(
+    figure: Figure,
+    verdict: Verdict,
+    arm: Arm,
+    limits: ArmLimits,
+    scene: Scene,
+    motion: PiecewisePolynomial,
+    begin: float = 0.0,
+) -> np.ndarray:
+    """Draw a motion of an arm from the time `begin` [s] in three panels, which are returned."""
+    figure.suptitle(verdict.sentence(), x=0.01, ha="left", fontsize="medium")
+    panels = figure.subplots(1, 3, width_ratios=(1.2, 1.2, 1.0))
+    motion, moved = jax.tree.map(jnp.asarray, (motion, arm))
+    end = float(jnp.sum(motion.durations))
+    angles = jax.vmap(lambda time: evaluate(motion, time))(jnp.linspace(0.0, end, _SHOWN))
+    arms = np.asarray(jax.vmap(capsules, (None, 0))(moved, angles))
+    turns, middles = (np.asarray(x) for x in jax.vmap(shield_pose, (None, 0))(moved, angles))
+    corners = middles[:, None] + np.einsum("kij,cj->kci", turns[:, :, 1:], arm.shield_corners)
+    turn = np.linspace(0.0, 2.0 * np.pi, 24)
+    around = np.stack([np.cos(turn), np.sin(turn)], axis=1)
+    for axes, view, title in zip(panels, _VIEWS, ("from above", "from the side"), strict=False):
+        _draw_scene(axes, scene, arm, view)
+        for k, (body, plate) in enumerate(zip(arms, corners, strict=True)):
+            look: Look = {"alpha": ((k + 1.0) / _SHOWN) ** 2, "zorder": 4, "linewidth": 0.6}
+            for ends, radius in zip(body[:, :, view], arm.capsule_radius, strict=True):
+                _draw_hull(axes, (ends[:, None] + radius * around).reshape(-1, 2), style.BLUE, look)
+            _draw_hull(axes, plate[:, view], style.ORANGE, look)
+        axes.autoscale_view()
+        axes.set_aspect("equal")
+        style.label(axes, f"{'xyz'[view[0]]} [m]", f"{'xyz'[view[1]]} [m]", title)
+    at = jnp.linspace(0.0, end, _SAMPLES)
+    speeds = np.asarray(jax.vmap(lambda time: evaluate(motion, time, 1))(at))
+    for name, rate in zip(arm.joint_names, (speeds / limits.velocity).T, strict=True):
+        panels[2].plot(begin + at, rate, label=name)
+    panels[2].set_ylim(-1.1, 1.6)  # leaves room for the legend
+    panels[2].legend(fontsize="x-small", ncols=2, loc="upper center")
+    style.label(panels[2], "time [s]", "rate / limit", "joints")
+    return panels
+
+
+def _draw_box(axes: Axes, box: Box, view: list[int], **look: Any) -> None:
+    corner, size = box.lower[view], (box.upper - box.lower)[view]
+    axes.add_patch(Rectangle(tuple(corner), *size, **look))
+
+
+def _draw_hull(axes: Axes, points: np.ndarray, colour: str, look: Look) -> None:
+    corners = points[ConvexHull(points, qhull_options="QJ").vertices]
+    axes.add_patch(Polygon(corners, facecolor=colour, edgecolor="white", **look))
+
+
+def _draw_scene(axes: Axes, scene: Scene, arm: Arm, view: list[int]) -> None:
+    _draw_box(axes, Box(*arm.base_box), view, facecolor=style.PALE)
     for points in obstacle_points(scene):
-        flat = points[:, [across, up]]
-        corners = flat[ConvexHull(flat, qhull_options="QJ").vertices]
-        axes.add_patch(Polygon(corners, color=style.GREY))
-    if up == 2:
+        _draw_hull(axes, points[:, view], style.GREY, {})
+    if view[1] == 2 and scene.floor > arm.base_box[0][2] - _DEEP:
         axes.axhline(float(scene.floor), color=style.INK, linewidth=1.0)
 
 

@@ -1,6 +1,7 @@
 """Drawings of interceptions from above: map, obstacles, target, and the car along its plan."""
 
 import dataclasses
+import functools
 from collections.abc import Callable, Sequence
 
 import jax
@@ -23,7 +24,8 @@ from scipy.spatial import ConvexHull
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.protocol import take
 from planner_jax.plane.obstacles import Obstacles, Placement, place
-from planner_jax.plane.target import rotate
+from planner_jax.plane.target import PlanePath, rotate
+from planner_jax.referee.intercept import InterceptVerdict
 from planner_jax.robot.car import knots_at, pose_at
 from planner_jax.runs import style
 from planner_jax.runs.style import Look
@@ -54,6 +56,8 @@ class SampledDrive:
     speed: np.ndarray  # (K,) [m/s]
     acceleration: np.ndarray  # (K,) [m/s^2], along the path
     curvature: np.ndarray  # (K,) [1/m]
+    # Paths (101, 2) [m] of other targets, each up to its meeting with the car.
+    earlier: Sequence[np.ndarray] = ()
 
     @property
     def middle(self) -> np.ndarray:
@@ -132,16 +136,45 @@ def draw_plan(
         verdict = dataclasses.replace(verdict, **fields)
     elif index is not None:
         raise ArgumentError("index", "None for one case", index)
-    drive = SampledDrive(
-        bounds=_bounds_of(case, plan),
+    return draw_judged(sample_drive(case, [plan], [case.target], verdict), verdict, ax)
+
+
+def sample_drive(
+    case: InterceptCase,
+    legs: Sequence[InterceptPlan],
+    targets: Sequence[PlanePath],
+    verdict: InterceptVerdict,
+) -> SampledDrive:
+    """Sample the drives to one or more targets, one after another, from the start of a case."""
+    parts = [sample_motion(x.start, x.time, x.speed, x.curvature, _SAMPLES) for x in legs]
+    ends = np.cumsum([part["time"][-1] for part in parts])
+    for part, end in zip(parts, ends, strict=True):
+        part["time"] += end - part["time"][-1]
+    motion = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+    def follow(target: PlanePath, times: np.ndarray) -> np.ndarray:
+        return np.asarray(jax.vmap(lambda t: target.at(t).pos)(jnp.asarray(times, jnp.float32)))
+
+    *earlier, _ = (
+        follow(each, np.linspace(0.0, end, 101)) for each, end in zip(targets, ends, strict=True)
+    )
+    target_at = functools.partial(follow, targets[-1])
+    places = [motion["pose"][:, :2], target_at(motion["time"]), *earlier]
+    return SampledDrive(
+        bounds=_bounds_of(case, np.concatenate(places)),
         walls=find_outlines(case.walls, 0.0),
         movers_at=lambda time: find_outlines(case.movers, time),
-        target_at=lambda times: np.asarray(jax.vmap(lambda t: case.target.at(t).pos)(times)),
+        target_at=target_at,
         due=float(case.time),
         size=(float(case.body.length), float(case.body.width), float(case.body.rear_overhang)),
         failed=None if verdict.success else float(np.nan_to_num(verdict.failed_time)),
-        **sample_motion(plan.start, plan.time, plan.speed, plan.curvature, _SAMPLES),
+        earlier=earlier,
+        **motion,
     )
+
+
+def draw_judged(drive: SampledDrive, verdict: InterceptVerdict, ax: Axes | None = None) -> Axes:
+    """Draw a drive from above as `draw_plan` does, with the referee's verdict as its title."""
     colours = ScalarMappable(
         Normalize(0.0, max(float(np.nan_to_num(drive.speed).max()), 1e-9)), COLOURS
     )
@@ -149,7 +182,7 @@ def draw_plan(
         if ax is None:
             import matplotlib.pyplot as plt
 
-            ax = plt.subplots(figsize=figure_size(case, plan))[1]
+            ax = plt.subplots(figsize=figure_size(drive))[1]
         draw_drive(ax, drive, colours, by_speed=True)
         ax.figure.colorbar(colours, ax=ax, label="speed of the car [m/s]", fraction=0.045, pad=0.02)
         below = offset_copy(
@@ -162,20 +195,16 @@ def draw_plan(
     return ax
 
 
-def _bounds_of(case: InterceptCase, plan: InterceptPlan) -> np.ndarray:
+def _bounds_of(case: InterceptCase, places: np.ndarray) -> np.ndarray:
     """Return the corners (2, 2) [m] of the rectangle that is drawn.
 
-    It holds the map, or if the map is unbounded the car's and the target's path.
+    It holds the map, or if the map is unbounded the `places` (K, 2) [m] of the car and the targets.
     """
     sides = np.array([case.lower, case.upper], float)
     points = np.stack(np.meshgrid(*sides.T), axis=-1).reshape(-1, 2)
-    points = np.asarray(rotate(jnp.asarray(points), case.map_heading))
-    margin = 0.0
+    points, margin = np.asarray(rotate(jnp.asarray(points), case.map_heading)), 0.0
     if not np.isfinite(sides).all():
-        margin = 3.0 * float(case.body.length)
-        motion = sample_motion(plan.start, plan.time, plan.speed, plan.curvature, _SAMPLES)
-        target = jax.vmap(lambda time: case.target.at(time).pos)(jnp.asarray(motion["time"]))
-        points = np.concatenate([motion["pose"][:, :2], target])
+        points, margin = places, 3.0 * float(case.body.length)
     return np.array([points.min(axis=0) - margin, points.max(axis=0) + margin])
 
 
@@ -200,10 +229,9 @@ def _place_corners(group: Obstacles, time: Array) -> tuple[Placement, Array]:
     return place(group, time[None]), group.vertices(time)
 
 
-def figure_size(case: InterceptCase, plan: InterceptPlan) -> tuple[float, float]:
-    """Return width and height [inch] of a figure in which `draw_plan` draws one case."""
-    lower, upper = _bounds_of(case, plan)
-    wide, tall = upper - lower
+def figure_size(drive: SampledDrive) -> tuple[float, float]:
+    """Return width and height [inch] of a figure in which `draw_judged` draws a drive."""
+    wide, tall = np.diff(drive.bounds, axis=0)[0]
     scale = 6.4 / max(wide, tall)
     return max(scale * wide, 3.9) + 1.6, max(scale * tall, 1.2) + 1.3
 
@@ -248,6 +276,10 @@ def draw_drive(
     is_met = drive.failed is None
     (meeting,) = drive.target_at(np.array([end]))
     axes.plot(*meeting, mec=style.INK if is_met else style.RED, **look)
+    for other in drive.earlier:
+        axes.plot(*other.T, color=style.INK, linewidth=1.0, linestyle=(0, (4, 2)), zorder=3)
+        axes.plot(*other[0], "o", zorder=6, color=style.INK, markersize=5.5)
+        axes.plot(*other[-1], mec=style.INK, **look)
     if drive.failed is not None:
         moment = drive.pose_at(drive.failed)
         axes.plot(*moment[:2], "X", color=style.RED, markersize=10, mec="white", zorder=8)
