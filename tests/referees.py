@@ -21,7 +21,7 @@ def flight(leaves, **optional):
     limits |= {"recovery_tilt": None, "air": None}
     case.limits = SimpleNamespace(**limits | vars(case.limits))
     case.trajectory = SimpleNamespace(coeffs=case.coeffs, durations=case.durations)
-    case.recovery = None
+    case.recovery = case.heading = None
     return case
 
 

@@ -71,7 +71,7 @@ def case_of(limits, num=1):
 def test_steady_flight_against_wind_tilts_by_the_arc_tangent_of_drag_over_gravity():
     steady = PiecewisePolynomial(np.array([[[0.0, 0.0, 2.0], [3.0, 0.0, 0.0]]]), np.ones(1))
     of = air(0.5, 0.5, (-1.0, 0.0, 0.0))
-    points = jax.jit(setpoint_at)((steady, GRAVITY, of), np.array(0.3))
+    points = jax.jit(setpoint_at)((steady, GRAVITY, of, None), np.array(0.3))
     w, x, y, z = points["quat_wxyz"]
     assert 2.0 * np.arctan2(y, w) == pytest.approx(np.arctan(0.5 * 4.0 / GRAVITY), rel=1e-12)
     assert x == z == 0.0 and np.abs(points["body_rate"]).max() < 1e-12
@@ -142,8 +142,8 @@ def test_zero_drag_equals_none_and_a_batch_equals_a_loop():
 def test_curves_and_margins_of_a_plan_have_the_thrust_and_body_rate_in_wind():
     flown, of = path(pieces=1), air()
     motion = sample_motion(flown.coeffs.ravel(), flown.durations, 9, of)
-    at = jax.jit(jax.vmap(setpoint_at, ((None, None, None), 0)))
-    points = at((flown, GRAVITY, of), motion.time)
+    at = jax.jit(jax.vmap(setpoint_at, ((None, None, None, None), 0)))
+    points = at((flown, GRAVITY, of, None), motion.time)
     np.testing.assert_allclose(thrust_size(motion, GRAVITY), points["thrust"], rtol=1e-9)
     rates = np.linalg.norm(points["body_rate"], axis=1)
     np.testing.assert_allclose(body_rate(motion, GRAVITY), rates, rtol=1e-6)
@@ -175,7 +175,7 @@ def test_the_references_of_a_flight_balance_the_drag_that_the_plan_knows():
     once = jax.jit(setpoint_at)
     for known in (of, None):
         now, later = (at(flown, np.array(0.2 + k * 0.5 * world.timestep), known) for k in (0, 1))
-        point = once((flown, GRAVITY, known), np.array(0.2 + 0.5 * world.timestep))
+        point = once((flown, GRAVITY, known, None), np.array(0.2 + 0.5 * world.timestep))
         load = now.acc if known is None else now.load
         thrust = np.linalg.norm(load + GRAVITY * UP) + now.thrust_lead  # half a step ahead
         np.testing.assert_allclose(thrust, point["thrust"], rtol=1e-12)

@@ -16,7 +16,7 @@ from planner_jax.core.errors import ArgumentError, NoRecovery
 from planner_jax.recovery import after_plan
 from planner_jax.recovery.after_plan import append_recovery, is_rested
 from planner_jax.recovery.case import RecoveryCase, end_state
-from planner_jax.referee import quadrotor as referee
+from planner_jax.referee import recovery
 from planner_jax.referee.block import referee_blocks
 from planner_jax.referee.intercept import referee_intercepts
 from planner_jax.robot import quadrotor_model
@@ -100,13 +100,13 @@ def test_a_recovery_that_does_not_rest_fails_by_name(hits, braked):
 
 def test_the_tilt_of_recoveries_is_limited(hits, braked):
     for name in ("RECOVERY_TILT", "MORE_TILT"):
-        assert vars(referee)[name] == vars(quadrotor_model)[name]
+        assert vars(recovery)[name] == vars(quadrotor_model)[name]
     tilt = pj.hit.judge(hits, braked).max_tilt
     strict = hits.limits.replace(recovery_tilt=np.float32(0.2) * tilt.astype(np.float32))
     verdict = pj.hit.judge(dataclasses.replace(hits, limits=strict), braked)
     starts = np.stack([end_state(pj.take(braked.trajectory, k))[2] for k in range(NUM)])
-    allowed = np.arctan2(np.hypot(*starts.T[:2]), starts[:, 2] + hits.gravity) + referee.MORE_TILT
-    assert (tilt <= np.maximum(referee.RECOVERY_TILT, allowed) * 1.001).all()
+    allowed = np.arctan2(np.hypot(*starts.T[:2]), starts[:, 2] + hits.gravity) + recovery.MORE_TILT
+    assert (tilt <= np.maximum(recovery.RECOVERY_TILT, allowed) * 1.001).all()
     np.testing.assert_array_equal(verdict.failed_limit == "tilt", tilt > allowed * 1.001)
     assert (verdict.failed_limit == "tilt").any()
 

@@ -7,7 +7,8 @@ import numpy as np
 from planner_jax.export.csv_rows import write_table
 from planner_jax.export.frames import to_ned, to_ned_yaw, yaw_of
 from planner_jax.export.setpoints import require_near, setpoints_of
-from planner_jax.robot.quadrotor import QuadrotorPlan, QuadrotorSetpoints
+from planner_jax.robot.attitude import QuadrotorSetpoints
+from planner_jax.robot.quadrotor import QuadrotorPlan
 
 _VECTORS = ("position", "velocity", "acceleration", "jerk")
 

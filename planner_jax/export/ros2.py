@@ -19,8 +19,8 @@ from planner_jax.export.frames import rotate
 from planner_jax.export.setpoints import DEFAULT_RATE, Joints, joints_of, setpoints_of
 from planner_jax.recovery.after_plan import is_rested
 from planner_jax.robot.arm import ArmPlan, ArmSetpoints
+from planner_jax.robot.attitude import QuadrotorSetpoints
 from planner_jax.robot.car import CarSetpoints
-from planner_jax.robot.quadrotor import QuadrotorSetpoints
 
 Json = Any  # plain numbers and texts, lists and dictionaries
 WORLD, BODY = "world", "base_link"

@@ -16,8 +16,9 @@ from planner_jax.core.plan_files import PlanFileError, leaves_by_name, load_fitt
 from planner_jax.core.protocol import Plan, Status, is_solved, take
 from planner_jax.recovery.after_plan import is_rested
 from planner_jax.robot.arm import ArmPlan, ArmSetpoints
+from planner_jax.robot.attitude import QuadrotorSetpoints
 from planner_jax.robot.car import CarPlan, CarSetpoints
-from planner_jax.robot.quadrotor import QuadrotorPlan, QuadrotorSetpoints
+from planner_jax.robot.quadrotor import QuadrotorPlan
 from planner_jax.trajectory.polynomial import PiecewisePolynomial
 
 MOST = 100_000  # greatest number of setpoints of a plan

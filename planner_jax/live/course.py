@@ -92,7 +92,7 @@ def setpoints_of(num: int, _: None, query: Query) -> Float[Array, "K 20"]:
     end = total_duration(path)
 
     def at(time: Array) -> Array:
-        moving = setpoint_at((path, gravity, query.course.air), jnp.minimum(time, end))
+        moving = setpoint_at((path, gravity, query.course.air, None), jnp.minimum(time, end))
         zero = jnp.zeros(3, time.dtype)
         upright = jnp.asarray([1.0, 0.0, 0.0, 0.0], time.dtype)
         still = {**dict.fromkeys(("vel", "acc", "jerk", "body_rate"), zero), "pos": moving["pos"]}

@@ -63,7 +63,7 @@ def _end_flight(case: PyTree, found: QuadrotorPlan, to: str) -> QuadrotorPlan:
     rest_case = recovery_cases(cases, plans)
     rest = plan(RecoveryPlanner(to=to), rest_case)
     if is_solved(rest.status[0]):
-        return take(dataclasses.replace(plans, recovery=rest.trajectory), 0)
+        return take(dataclasses.replace(plans, recovery=rest.trajectory).with_heading(cases), 0)
     motion = sample_pieces(take(rest.trajectory, 0), _NODES)
     limits = take(rest_case.limits, 0)
     flown = relative_excess(limits, flight_excess(motion, case.gravity, limits))

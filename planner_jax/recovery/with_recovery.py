@@ -66,9 +66,9 @@ class RecoveringPlanner(PlannerAround[CaseT, PlanT]):
         xp: ModuleType = jnp if drive.is_pure else np
         whole, recovers = is_solved(plans.status), is_solved(recoveries.status)
         lacking, worst = whole & ~recovers, xp.maximum(plans.violation, recoveries.violation)
+        plans = dataclasses.replace(plans, recovery=recoveries.trajectory).with_heading(cases)
         plans = dataclasses.replace(
             plans,
-            recovery=recoveries.trajectory,
             violation=xp.where(whole, worst, plans.violation),
             iterations=plans.iterations + recoveries.iterations,
             status=xp.where(lacking, Status.INFEASIBLE, plans.status).astype(np.int32),

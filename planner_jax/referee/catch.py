@@ -22,6 +22,7 @@ from planner_jax.referee.recovery import append_recovery
 
 _ORDER_OF_MOTION = (
     *("head state", "continuity", "speed", "thrust low", "thrust high", "body rate"),
+    *("heading start", "heading jump", "yaw rate"),
     *("acceleration", "rotor low", "rotor high", "tilt", "ground", "extra", "recovery"),
 )
 _SENTENCES = {

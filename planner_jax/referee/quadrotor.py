@@ -63,6 +63,9 @@ MOTION_SENTENCES = {
     "head state": "the trajectory starts {excess:.3g} m off the head state",
     "continuity": "the trajectory jumps by {excess:.3g} m at {time:.3f} s",
     **dict.fromkeys(("speed", "acceleration", "body rate"), ABOVE_LIMIT),
+    "heading start": "the heading or its rate is {excess:.3g} off its case's, in rad or rad/s",
+    "heading jump": "the heading or its rate jumps by {excess:.3g} at {time:.3f} s, rad or rad/s",
+    "yaw rate": ABOVE_LIMIT,
     "thrust low": "{excess:.2%} below the least thrust at {time:.3f} s",
     "thrust high": "{excess:.2%} above the greatest thrust at {time:.3f} s",
     "rotor low": "a rotor's thrust is {excess:.2%} of the greatest below the least at {time:.3f} s",
@@ -78,9 +81,6 @@ MOTION_UNBOUNDED = {"body rate": "no thrust or upside down, so without attitude,
 # [s] An error e of the n-th derivative of the position counts as the displacement |e| h^n / n!,
 # where h is the mean duration of a piece, but at least this number.
 SHORTEST_PIECE = 0.1
-# [rad], at least this much more than the tilt at its start is allowed to a recovery
-MORE_TILT = math.radians(10.0)
-RECOVERY_TILT = math.radians(40.0)  # [rad], greatest tilt of recoveries if their case states none
 _INTERVALS = 400  # least number of intervals between samples, from contact to contact
 _FEWEST_INTERVALS = 16  # least number of intervals between samples in one polynomial piece
 # Greatest number of multiplications in one matrix product, and of plans whose maxima are searched
@@ -120,6 +120,10 @@ def read_flight(cases, plans) -> dict[str, np.ndarray]:
     if (air := cases.limits.air) is not None:
         shapes = {"drag": (), "thrust_drag": (), "wind": (3,)}
         leaves |= read_leaves(air, shapes, num_lanes, "limits.air.")
+    if plans.heading is not None or cases.heading is not None:
+        from planner_jax.referee.heading import read_heading  # few plans have a heading
+
+        leaves |= read_heading(cases, plans, num_lanes)
     if plans.recovery is not None:
         coeffs = check_coeffs(plans.recovery.coeffs)
         shapes = {"coeffs": coeffs.shape[1:], "durations": coeffs.shape[1:2]}
@@ -147,32 +151,28 @@ def norm_squared(vector: np.ndarray) -> np.ndarray:
     return vector[0] ** 2 + vector[1] ** 2 + vector[2] ** 2
 
 
-def _tilt(gravity, acc: np.ndarray) -> np.ndarray:
-    """Return sin^2(theta / 2) for the angle theta between thrust and vertical; 1 without thrust."""
-    up, squared = acc[2] + gravity, _thrust_squared(gravity, acc)
-    cosine = np.where(squared > 0.0, up / np.sqrt(squared), -1.0)
-    return np.maximum(0.5 - 0.5 * cosine, 0.0)
-
-
-def _thrust_squared(gravity, acc: np.ndarray) -> np.ndarray:
+def thrust_squared(gravity, acc: np.ndarray) -> np.ndarray:
+    """Return the squared thrust per unit mass (...) [m^2/s^4] of accelerations (3, ...)."""
     return acc[0] ** 2 + acc[1] ** 2 + (acc[2] + gravity) ** 2
 
 
-def _body_rate_squared(gravity, acc: np.ndarray, jerk: np.ndarray) -> np.ndarray:
-    """Return the squared body rate |omega|^2 of the Hopf fibration at zero heading.
+def body_rate_squared(gravity, acc: np.ndarray, jerk: np.ndarray, yaw_rate=0.0) -> np.ndarray:
+    """Return the squared body rate |omega|^2 of the Hopf fibration.
 
     With the thrust per unit mass tau and c = tau x jerk, the thrust direction z has
     z' = (c / |tau|^2) x z, so |z'| = |c| / |tau|^2. The rate about z is
-    (z_y z_x' - z_x z_y') / (1 + z_z) = -c_z / (|tau| (|tau| + tau_z)). The result is infinite
-    without thrust and upside down, where the attitude is undefined.
+    (z_y z_x' - z_x z_y') / (1 + z_z) = -c_z / (|tau| (|tau| + tau_z)), plus the derivative of the
+    heading. The result is infinite without thrust and upside down, where there is no attitude.
     """
     tau_x, tau_y, tau_z = acc[0], acc[1], acc[2] + gravity
     c_x = tau_y * jerk[2] - tau_z * jerk[1]
     c_y = tau_z * jerk[0] - tau_x * jerk[2]
     c_z = tau_x * jerk[1] - tau_y * jerk[0]
     size_squared = tau_x**2 + tau_y**2 + tau_z**2
-    upright = np.sqrt(size_squared) + tau_z
-    rate = ((c_x**2 + c_y**2 + c_z**2) / size_squared + (c_z / upright) ** 2) / size_squared
+    size = np.sqrt(size_squared)
+    upright = size + tau_z
+    about = c_z / upright - yaw_rate * size
+    rate = ((c_x**2 + c_y**2 + c_z**2) / size_squared + about**2) / size_squared
     return np.where(upright > 0.0, rate, np.inf)
 
 
@@ -183,14 +183,15 @@ def _body_rate_squared(gravity, acc: np.ndarray, jerk: np.ndarray) -> np.ndarray
 _MEASURES = {
     "speed": ((1,), lambda gravity, vel: norm_squared(vel)),
     "acceleration": ((2,), lambda gravity, acc: norm_squared(acc)),
-    "body rate": ((2, 3), _body_rate_squared),
+    "body rate": ((2, 3), body_rate_squared),
     "depth": ((0,), lambda gravity, pos: -pos[2]),
-    "thrust": ((2,), _thrust_squared),
-    "weakness": ((2,), lambda gravity, acc: -_thrust_squared(gravity, acc)),
+    "thrust": ((2,), thrust_squared),
+    "weakness": ((2,), lambda gravity, acc: -thrust_squared(gravity, acc)),
 }
 
 
-def _tops(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def find_tops(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return indices of maxima of samples (N, M, S), the maxima, and indices of vertices (N,)."""
     line, rows = values.ravel(), flat(values)
     top = rows.argmax(axis=1)
     greatest = rows[np.arange(len(rows)), top]
@@ -228,13 +229,13 @@ def _peaks(pieces: Pieces, gravity: np.ndarray, u: np.ndarray) -> dict[str, tupl
         np.concatenate(parts, axis=-1) for parts in zip(*sampled, strict=True)
     )
     peaks = {
-        name: _greater(
-            _search(measure, pieces, gravity, likeliest[i], u),
-            (greatest[i], _time(pieces, top[i], u)),
+        name: select_greater(
+            search_peak(measure, pieces, gravity, likeliest[i], u),
+            (greatest[i], time_of(pieces, top[i], u)),
         )
         for i, (name, measure) in enumerate(_MEASURES.items())
     }
-    peaks["body rate"] = _greater(peaks["body rate"], (turn, _time(pieces, sharpest, u)))
+    peaks["body rate"] = select_greater(peaks["body rate"], (turn, time_of(pieces, sharpest, u)))
     return peaks
 
 
@@ -244,18 +245,20 @@ def _sample(pieces: Pieces, gravity: np.ndarray, u: np.ndarray) -> tuple:
     values = np.empty((len(_MEASURES), *motion[0].shape[1:]))
     for i, (orders, measure) in enumerate(_MEASURES.values()):
         values[i] = measure(gravity, *[motion[order] for order in orders])
-    tops = _tops(values.reshape(-1, *values.shape[2:]))
+    tops = find_tops(values.reshape(-1, *values.shape[2:]))
     turn = _fastest_turn(motion[2], gravity, pieces, u)
     return *(found.reshape(values.shape[:2]) for found in tops), *turn
 
 
-def _time(pieces: Pieces, index: np.ndarray, u: np.ndarray) -> np.ndarray:
+def time_of(pieces: Pieces, index: np.ndarray, u: np.ndarray) -> np.ndarray:
+    """Return times (B,) [s] of the samples with these indices among all samples of B plans."""
     piece, sample = np.divmod(index, len(u))
     lanes = np.arange(len(index))
     return pieces.starts[lanes, piece] + pieces.durations[lanes, piece] * u[sample]
 
 
-def _search(measured: tuple, pieces: Pieces, gravity, likeliest, u: np.ndarray) -> tuple:
+def search_peak(measured: tuple, pieces: Pieces, gravity, likeliest, u: np.ndarray) -> tuple:
+    """Return the greatest value of a measure near the sample `likeliest`, and its time."""
     orders, measure = measured
     piece, sample = np.divmod(likeliest, len(u))
     lanes = np.arange(len(piece))
@@ -270,7 +273,8 @@ def _search(measured: tuple, pieces: Pieces, gravity, likeliest, u: np.ndarray) 
     return value, pieces.starts[lanes, piece] + centre * span
 
 
-def _greater(first: tuple, second: tuple) -> tuple[np.ndarray, np.ndarray]:
+def select_greater(first: tuple, second: tuple) -> tuple[np.ndarray, np.ndarray]:
+    """Return the greater of two values (B,), and its time."""
     better = second[0] > first[0]
     return np.where(better, second[0], first[0]), np.where(better, second[1], first[1])
 
@@ -349,8 +353,15 @@ def judge_motion(
         found["body rate"] = peaks(load, case["gravity"], intervals)["body rate"]
         thrust = thrust_along(pieces, case, u)
         for name, sign in (("thrust", 1.0), ("weakness", -1.0)):
-            top, greatest, _ = _tops(sign * thrust**2)
-            found[name] = greatest, _time(pieces, top, u)
+            top, greatest, _ = find_tops(sign * thrust**2)
+            found[name] = greatest, time_of(pieces, top, u)
+    turned: dict = {}
+    if "heading.coeffs" in case:
+        from planner_jax.referee.heading import judge_heading  # few plans have a heading
+
+        turns, rates, turned = judge_heading(load, case, u, relative, continuity)
+        pairs = zip(rates, found["body rate"], strict=True)
+        found["body rate"] = tuple(np.where(turns, *pair) for pair in pairs)
     head, jump, jump_time, scale = joint_errors(pieces, case["head_state"])
     measured = {
         "max_speed": np.sqrt(found["speed"][0]),
@@ -373,6 +384,7 @@ def judge_motion(
         "head state": (head > allowed, head, np.zeros_like(head)),
         "continuity": (jump > allowed, jump, jump_time),
         "extra": (beyond > relative, beyond, at),
+        **turned,
     }
     # For each test by name: the quantity in `found`, the name of the measurement, the field of the
     # case that holds the limit, and 1 for an upper limit or -1 for a lower limit.
@@ -395,35 +407,10 @@ def judge_motion(
         measured, tests = measured | of_rotors, tests | rotor_tests
     else:
         measured |= dict.fromkeys(("min_rotor_thrust", "max_rotor_thrust"), np.full(num, np.nan))
-    measured["max_tilt"], found_tilt = _judge_tilt(case, load, u, relative)
-    tests |= found_tilt
-    if "recovery.coeffs" in case:
-        from planner_jax.referee.recovery import judge_rest  # few plans have a recovery
+    measured["max_tilt"] = np.full(num, np.nan)
+    if "recovery.coeffs" in case or "limits.max_tilt" in case:
+        from planner_jax.referee.recovery import judge_rest, judge_tilt  # few flights have them
 
-        tests |= judge_rest(case, pieces, continuity)
+        measured["max_tilt"], of_tilt = judge_tilt(case, load, u, relative)
+        tests |= of_tilt | judge_rest(case, pieces, continuity)
     return measured, tests
-
-
-def _judge_tilt(case: dict, pieces: Pieces, u: np.ndarray, relative: float) -> tuple:
-    """Measure the greatest tilt [rad] of the parts of B flights that have a limit, and test it."""
-    tilt, gravity, tests = np.full(len(case["gravity"]), np.nan), case["gravity"], []
-    parts = [(pieces, case["limits.max_tilt"])] if "limits.max_tilt" in case else []
-    if "recovery.coeffs" in case:
-        num = case["recovery.durations"].shape[1]
-        rest = pieces.of(slice(None), slice(-num, None))
-        start = derivative(np.moveaxis(rest.coeffs[:, :, 0], -1, 0), np.zeros(tilt.shape), 2)
-        usual = case.get("limits.recovery_tilt", RECOVERY_TILT)
-        start_tilt = 2.0 * np.arcsin(_tilt(gravity, start) ** 0.5)
-        parts.append((rest, np.maximum(usual, start_tilt + MORE_TILT)))
-    for part, limit in parts:
-        top, greatest, likeliest = _tops(_tilt(gravity[:, None, None], motion_of(part, u)[2]))
-        found = _search(((2,), _tilt), part, gravity, likeliest, u)
-        sine, at = _greater(found, (greatest, _time(part, top, u)))
-        sine = np.sqrt(np.minimum(sine, 1.0))
-        tilt = np.fmax(tilt, 2.0 * np.arcsin(sine))
-        tests.append(above(sine, np.sin(0.5 * np.minimum(limit, math.pi)), relative, at))
-    if not tests:
-        return tilt, {}
-    failed, excess, at = (np.array(each) for each in zip(*tests, strict=True))
-    worst, lanes = excess.argmax(axis=0), np.arange(len(tilt))
-    return tilt, {"tilt": (failed.any(axis=0), excess[worst, lanes], at[worst, lanes])}

@@ -1,13 +1,16 @@
 """Thrusts of the rotors of a quadrotor along a trajectory, for the referee, in float64 NumPy.
 
-Attitude and body rate follow from thrust and jerk (Hopf fibration at zero heading). The angular
+Attitude and body rate follow from thrust, jerk and heading (Hopf fibration). The angular
 acceleration is a central difference of body rates, so that the referee is independent of the
 planners, which compute it from the snap.
 """
 
+from collections.abc import Callable
+
 import numpy as np
 
 from planner_jax.referee.air import load_pieces, thrust_along
+from planner_jax.referee.heading import headings_of, turn_axes
 from planner_jax.referee.judging import cut, derivative
 from planner_jax.referee.quadrotor import Pieces
 
@@ -39,7 +42,11 @@ def rotor_range(pieces: Pieces, case: dict, u: np.ndarray) -> tuple[np.ndarray, 
     times = pieces.durations[:, :, None] * u
     body = (case[f"limits.rotors.{name}"] for name in ("mass", "inertia", "mixer"))
     load, (mass, inertia, mixer) = load_pieces(pieces, case), body
-    thrusts = rotor_thrusts(load.coeffs, times, case["gravity"], mass, inertia, mixer)
+    turn = None
+    if "heading.coeffs" in case:
+        headings = headings_of(case)
+        turn = lambda times: headings(times + pieces.starts[:, :, None])  # noqa: E731
+    thrusts = rotor_thrusts(load.coeffs, times, case["gravity"], mass, inertia, mixer, turn)
     if load is not pieces:  # the drag along the thrust adds to the total thrust only
         pull = _pull_and_rate(load.coeffs, times, case["gravity"])[0]
         more = thrust_along(pieces, case, u) - np.linalg.norm(pull, axis=-1)
@@ -60,6 +67,7 @@ def rotor_thrusts(
     mass: np.ndarray,
     inertia: np.ndarray,
     mixer: np.ndarray,
+    turn: Callable | None = None,
 ) -> np.ndarray:
     """Return the thrusts (B, M, S, R) [N] of R rotors at S times in M pieces of B trajectories.
 
@@ -74,15 +82,19 @@ def rotor_thrusts(
         inertia: (B, 3) or (B, 6) [kg m^2], about the body's axes: I_xx, I_yy, I_zz, and maybe
             I_xy, I_xz, I_yz.
         mixer: (B, R, 4), matrix from thrust [N] and torques [N m] to the thrusts of the rotors.
+        turn: function of `times` that returns the headings (B, M, S) [rad] and their derivatives;
+            None for a heading of zero.
     """
-    pull, rate = _pull_and_rate(coeffs, times, gravity)
+    pull, rate = _pull_and_rate(coeffs, times, gravity, turn)
     before, after = (
-        _pull_and_rate(coeffs, times + step, gravity)[1] for step in (-_MOMENT, _MOMENT)
+        _pull_and_rate(coeffs, times + step, gravity, turn)[1] for step in (-_MOMENT, _MOMENT)
     )
     # The derivatives of the angular velocity omega in the world frame and in the body frame are
     # equal, because they differ by omega x omega = 0.
     change = (after - before) / (2.0 * _MOMENT)
     axes = _body_axes(pull)
+    if turn is not None:
+        axes = turn_axes(axes, turn(times)[0])
     own = np.einsum("...ij,...i->...j", axes, rate)
     turning = np.einsum("...ij,...i->...j", axes, change)
     x, y, z, xy, xz, yz = np.pad(inertia, ((0, 0), (0, 6 - inertia.shape[1]))).T
@@ -94,21 +106,21 @@ def rotor_thrusts(
 
 
 def _pull_and_rate(
-    coeffs: np.ndarray, times: np.ndarray, gravity: np.ndarray
+    coeffs: np.ndarray, times: np.ndarray, gravity: np.ndarray, turn: Callable | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
     powers = np.moveaxis(coeffs, -1, 0)[..., None]
     pull, jerk = (np.moveaxis(derivative(powers, times, order), 0, -1) for order in (2, 3))
     pull[..., 2] += gravity[:, None, None]
-    return pull, angular_velocity(pull, jerk)
+    return pull, angular_velocity(pull, jerk, 0.0 if turn is None else turn(times)[1])
 
 
-def angular_velocity(pull: np.ndarray, jerk: np.ndarray) -> np.ndarray:
+def angular_velocity(pull: np.ndarray, jerk: np.ndarray, yaw_rate=0.0) -> np.ndarray:
     """Return angular velocities (..., 3) [rad/s], world frame, for thrusts per unit mass `pull`."""
     size = np.linalg.norm(pull, axis=-1)
     across = np.cross(pull, jerk)
     # The angular velocity is tau x jerk / |tau|^2 + r tau / |tau|, with the thrust per unit mass
     # tau. The Hopf fibration at zero heading determines the rate r about the thrust.
-    about = -across[..., 2] / (size * (size + pull[..., 2]))
+    about = yaw_rate - across[..., 2] / (size * (size + pull[..., 2]))
     return (across / size[..., None] + about[..., None] * pull) / size[..., None]
 
 

@@ -2,16 +2,19 @@
 
 The body z axis is along the net thrust per unit mass  tau = a + g e_3 , for the acceleration a, the
 magnitude g of gravity, and the upward unit vector e_3. The heading is zero in the sense of the Hopf
-fibration [Watterson2020]. Attitude and body rate are then functions of tau and the jerk alone.
+fibration [Watterson2020]. Attitude and body rate are then functions of tau and the jerk alone. At a
+constant heading psi the body rate is turned by R_z(-psi), so that only limits of rotors differ.
 """
 
 import dataclasses
+from typing import TYPE_CHECKING, Self
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jax import Array
+from jaxtyping import PyTree
 
 from planner_jax.core.arithmetic import (
     Components,
@@ -25,6 +28,9 @@ from planner_jax.core.origin import Located, to_world
 from planner_jax.core.protocol import Plan
 from planner_jax.robot.quadrotor_model import MORE_TILT, RECOVERY_TILT
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, join
+
+if TYPE_CHECKING:
+    from planner_jax.robot.attitude import QuadrotorSetpoints
 
 # Factor on the limits when `beyond_reach` computes how far a quadrotor can fly. Solved plans exceed
 # their limits by far less than 1 %.
@@ -42,6 +48,7 @@ class RotorLimits:
     mixer: Array  # (R, 4), from total thrust [N] and torque [N m] to the R rotors' thrusts [N]
     min_thrust: Array  # () [N], least thrust of one rotor
     max_thrust: Array  # () [N], greatest thrust of one rotor
+    heading: Array | None = None  # () [rad], constant heading of the flight; None: 0
 
 
 @struct.dataclass
@@ -288,25 +295,6 @@ def _length(x: Array, y: Array, z: Array) -> Array:
     return jnp.sqrt(x * x + y * y + z * z)
 
 
-@dataclasses.dataclass(frozen=True)
-class QuadrotorSetpoints:
-    """Samples of a quadrotor's plan at K equally spaced times; body x forward, z along the thrust.
-
-    In a batch every array but `time` has a leading axis B. Entries after a plan's end are NaN.
-    """
-
-    time: np.ndarray  # (K,) [s] since the start of the plan
-    pos: np.ndarray  # (K, 3) [m], centre of the propeller plane
-    vel: np.ndarray  # (K, 3) [m/s]
-    acc: np.ndarray  # (K, 3) [m/s^2]
-    jerk: np.ndarray  # (K, 3) [m/s^3]
-    # (K, 4), unit quaternions, body to world, at zero heading of the Hopf fibration: the shortest
-    # rotation from upright to the thrust, so that z is always 0
-    quat_wxyz: np.ndarray
-    body_rate: np.ndarray  # (K, 3) [rad/s], body frame
-    thrust: np.ndarray  # (K,) [m/s^2], per unit mass
-
-
 @struct.dataclass
 class QuadrotorPlan(Plan, Located):
     """A quadrotor's plan: the trajectory of the centre of the propeller plane.
@@ -319,24 +307,35 @@ class QuadrotorPlan(Plan, Located):
     # Trajectory from the last contact to standstill; None if none was requested.
     recovery: PiecewisePolynomial | None = struct.field(default=None, kw_only=True)
     air: Air | None = struct.field(default=None, kw_only=True)  # drag and wind of the case
+    # Heading [rad] over time, a polynomial of one dimension, up to the end of `whole`; None: 0.
+    heading: PiecewisePolynomial | None = struct.field(default=None, kw_only=True)
 
     @property
     def whole(self) -> PiecewisePolynomial:
         """The trajectory and the recovery, joined to one polynomial, of a plan or of a batch."""
         return self.trajectory if self.recovery is None else join(self.trajectory, self.recovery)
 
-    def sample(self, rate: float) -> QuadrotorSetpoints:
+    def with_heading(self, case: PyTree) -> Self:
+        """Return the plan, or batch, with the heading that its case requests, if any."""
+        if case.heading is None:
+            return self
+        from planner_jax.robot import heading  # few cases request a heading
+
+        find = heading.plan_headings if case.batch_shape else heading.plan_heading
+        return dataclasses.replace(self, heading=find(self, case))
+
+    def sample(self, rate: float) -> "QuadrotorSetpoints":
         """Sample the plan, or the batch, `rate` times a second, including a recovery trajectory.
 
         Raises:
             ValueError: the rate is not positive.
         """
         # These modules are imported only if needed.
-        from planner_jax.robot.attitude import setpoint_at
+        from planner_jax.robot.attitude import QuadrotorSetpoints, setpoint_at
         from planner_jax.robot.setpoints import sample_at_rate
 
         path = jax.tree.map(np.asarray, self).whole
         ends = np.sum(path.durations, axis=-1)
-        air = jax.tree.map(np.asarray, self.air)
-        found = sample_at_rate(rate, ends, (path, self.gravity, air), setpoint_at)
+        leaves = jax.tree.map(np.asarray, (path, self.gravity, self.air, self.heading))
+        found = sample_at_rate(rate, ends, leaves, setpoint_at)
         return QuadrotorSetpoints(**{**found, "pos": to_world(found["pos"], self.origin)})

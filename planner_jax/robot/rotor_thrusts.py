@@ -1,5 +1,7 @@
 """Thrusts that the rotors of a quadrotor need for a motion, for limits of single rotors."""
 
+from collections.abc import Sequence
+
 import jax
 import jax.numpy as jnp
 from jax import Array
@@ -15,14 +17,23 @@ def rotor_thrusts(
     gravity: Array,
     rotors: RotorLimits,
     pull: Array | None = None,
+    turn: tuple[Array, Array, Array] | None = None,
 ) -> tuple[Array, ...]:
-    """Return the thrusts (...) [N] that R rotors need for a motion at zero heading.
+    """Return the thrusts (...) [N] that R rotors need for a motion.
 
     Acceleration [m/s^2], jerk [m/s^3] and snap [m/s^4] are (..., 3), gravity is () [m/s^2]. `pull`
-    is the thrust per unit mass (...) [m/s^2], by default |acceleration + gravity e_3|.
+    is the thrust per unit mass (...) [m/s^2], by default |acceleration + gravity e_3|. `turn` has
+    the heading and its two derivatives (...), by default the constant `rotors.heading`.
     """
     a, j, s = (tuple(components(each)) for each in (acc, jerk, snap))
     rate, turning = jax.jvp(lambda acc, jerk: body_rate(acc, jerk, gravity), (a, j), (j, s))
+    if turn is None and rotors.heading is not None:
+        turn = rotors.heading, jnp.zeros_like(rate[2]), jnp.zeros_like(rate[2])
+    if turn is not None:
+        angle, speed, growth = turn
+        rate = (*turn_back(angle, rate), rate[2] + speed)
+        across, against = turn_back(angle, turning)
+        turning = (across + speed * rate[1], against - speed * rate[0], turning[2] + growth)
     x, y, z = a
     if pull is None:
         pull = jnp.sqrt(at_least(x * x + y * y + (z + gravity) ** 2, 1e-4))
@@ -45,3 +56,9 @@ def rotor_thrusts(
         row[..., 0] * thrust + row[..., 1] * roll + row[..., 2] * pitch + row[..., 3] * yaw
         for row in rows
     )
+
+
+def turn_back(heading: Array, vector: Sequence[Array]) -> tuple[Array, Array]:
+    """Return the x and y components of  R_z(-psi) v  for headings psi [rad] and vectors v."""
+    cosine, sine = jnp.cos(heading), jnp.sin(heading)
+    return cosine * vector[0] + sine * vector[1], cosine * vector[1] - sine * vector[0]

@@ -43,6 +43,8 @@ ARGUMENTS = {
     "head_state": "start",
     **{f"limits.air.{name}": "rotor_drag" for name in ("drag", "thrust_drag")},
     "limits.air.wind": "wind",
+    "heading.angles": "heading",
+    "heading.max_yaw_rate": "max_yaw_rate",
     **{
         f"limits.{name}": name
         for name in ("speed", "acceleration", "body_rate", "min_thrust", "max_thrust", "min_height")
@@ -74,7 +76,7 @@ def start_state(
 
     The rows are the position [m], the velocity [m/s], the acceleration [m/s^2], and a jerk of 0. An
     `attitude` (4,), a quaternion w x y z, replaces the acceleration: the thrust is along body z,
-    and equal to the weight. Its heading has no effect.
+    and equal to the weight.
     """
     head = np.zeros(batch + (4, 3))
     rows = {"start": start, "start_velocity": velocity, "start_acceleration": acceleration}
@@ -113,6 +115,15 @@ def require_own_robot(robot: object, usual: QuadrotorModel, suite: str, wind: ob
     if robot != usual or wind is not None:
         name = "wind" if robot == usual else "robot"
         raise ArgumentError(name, f"left out with suite {suite!r}, which has its own", shown="")
+
+
+def add_heading(cases: PyTree, leaf: Callable[..., Array], *given: object) -> PyTree:
+    """Return cases with the arguments heading, max_yaw_rate, start_attitude in `given`, if any."""
+    if all(each is None for each in given[:2]):
+        return cases
+    from planner_jax.robot.heading import add_request  # few cases request a heading
+
+    return add_request(cases, leaf, *given)
 
 
 def limits_of(

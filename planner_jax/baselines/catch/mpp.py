@@ -156,7 +156,7 @@ class MppCatch(Planner):
             decided_times=case.times,
             times=times,
             **outcome(energy / jnp.maximum(jnp.sum(durations_flown), _SHORTEST), violation),
-        )
+        ).with_heading(case)
 
     def times(self, context: CatchContext) -> tuple[Array, Array]:
         """Return increasing catching times (N,) [s] of N targets, and their violations (N,).

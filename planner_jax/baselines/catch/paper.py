@@ -296,4 +296,4 @@ class PaperCatch(OptimisedPlanner):
             decided_times=context.times,
             times=catch.times,
             **pending(violation),
-        )
+        ).with_heading(context.case)

@@ -320,7 +320,7 @@ class BatHit(OptimisedPlanner):
         trajectory = proportional_trajectory(self.maps, rows, offsets, duration)
         return HitPlan(
             trajectory=trajectory, gravity=case.gravity, stroke=impact.stroke, **pending(violation)
-        )
+        ).with_heading(case)
 
 
 def bat_lite(**options: Any) -> BatHit:

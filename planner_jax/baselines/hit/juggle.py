@@ -112,7 +112,7 @@ class JuggleHit(Planner):
             gravity=case.gravity,
             stroke=impact.stroke,
             **outcome(mean_jerk, violation),
-        )
+        ).with_heading(case)
 
     def impact(self, context: HitContext) -> Impact:
         """Return the hit where the ball falls through the fixed height.

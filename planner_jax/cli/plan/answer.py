@@ -162,6 +162,10 @@ def _of_flight(answer: Answer) -> list[Margin]:
     limits, gravity = answer.case.limits, float(answer.case.gravity)
     motion = sample_plan(answer.plan)
     sizes = {name: values(motion, gravity) for name, (_, _, values) in PANELS.items()}
+    if answer.plan.heading is not None:  # the figures show the body rate at zero heading
+        points = answer.plan.sample(_SAMPLES / motion.time[-1])
+        rates = np.linalg.norm(points.body_rate, axis=-1)
+        sizes["body_rate"] = np.interp(motion.time, points.time, rates)
     closest = functools.partial(closest_to, motion.time)
     found = [
         closest(f"{name.replace('_', ' ')} [{unit}]", sizes[name], vars(limits)[name])

@@ -1,5 +1,6 @@
 """Options of the command `planner-jax plan` for each task, checked before JAX is imported."""
 
+import contextlib
 import dataclasses
 import math
 from dataclasses import MISSING
@@ -94,6 +95,10 @@ class SingleSettings(PlanSettings):
     start_attitude: tuple[float, ...] | None = option(
         None, "W X Y Z", "at the start, instead of the acceleration, with a thrust of the weight"
     )
+    heading: str | float | None = option(
+        None, "ANGLE", "of the quadrotor: an angle [rad], velocity or ball (default: 0)"
+    )
+    max_yaw_rate: float | None = option(None, "W", "of the heading [rad/s] (default: 2)")
     speed: float | None = option(None, "V", f"greatest speed [m/s] {_OWN}")
     body_rate: float | None = option(None, "W", f"greatest body rate [rad/s] {_OWN}")
     min_thrust: float | None = option(None, "A", f"least thrust over mass [m/s^2] {_OWN}")
@@ -111,6 +116,8 @@ class SingleSettings(PlanSettings):
     def __post_init__(self) -> None:
         object.__setattr__(self, "robot", resolve_robot(self.robot, self.TOOL, self.wind))
         require_one_of(CHOICES, "recovery", self.recovery)
+        with contextlib.suppress(ValueError, TypeError):  # a word, or no heading
+            object.__setattr__(self, "heading", float(self.heading))  # type: ignore[arg-type]
         for field in dataclasses.fields(self):
             value = vars(self)[field.name]
             if isinstance(value, list):  # argparse returns several numbers as a list

@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 from collections.abc import Sequence
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import jax.numpy as jnp
 import numpy as np
@@ -24,6 +24,9 @@ from planner_jax.robot.quadrotor import QuadrotorLimits
 from planner_jax.robot.quadrotor_model import NET, PAPER_CATCHER, QuadrotorModel
 from planner_jax.task import quadrotor
 from planner_jax.task.arguments import array_of
+
+if TYPE_CHECKING:
+    from planner_jax.robot.heading import Heading
 
 
 def _is_ahead(horizon: Numbers, case: PyTree) -> Numbers:
@@ -96,6 +99,7 @@ class CatchCase(Located):
     extras: tuple[Extra, ...] = ()  # the user's further constraints and costs
     # Whether targets may be left out; the number of caught targets is then maximised.
     optional: bool = struct.field(pytree_node=False, default=False)
+    heading: "Heading | None" = None  # requested heading; None: 0
 
     @property
     def batch_shape(self) -> tuple[int, ...]:
@@ -123,6 +127,8 @@ def case(
     start_velocity=(0.0, 0.0, 0.0),
     start_acceleration=(0.0, 0.0, 0.0),
     start_attitude=None,
+    heading=None,
+    max_yaw_rate=None,
     gravity: ArrayLike = GRAVITY,
     net_height=None,
     net_radius=None,
@@ -157,6 +163,10 @@ def case(
     * `start`, `start_velocity`, `start_acceleration`: (..., 3), of the quadrotor at time 0; or
       `start_attitude`: (..., 4), quaternion w x y z from body to world, instead of the
       acceleration, for a thrust equal to the weight; `gravity`: [m/s^2], magnitude.
+    * `heading`: requested heading of the quadrotor: an angle [rad], or one for each case; a pair of
+      times (..., H) [s] and angles (..., H) [rad], linear in between; "velocity", along the
+      horizontal velocity; or "ball", towards the next ball until its catch. None: 0. It starts at
+      the heading of `start_attitude`, if any. `max_yaw_rate` [rad/s]: of this heading, default 2.
     * `speed` [m/s], `body_rate` [rad/s]: greatest values; `min_height` [m] of the propeller plane;
       `min_thrust`, `max_thrust` [m/s^2], per unit mass.
     * `rotor_drag` [1/s]: linear drag of the quadrotor per unit mass, by default the robot's: one
@@ -214,6 +224,7 @@ def case(
         optional=optional,
         origin=None if shift is None else leaf("origin", shift, 2),
     )
+    cases = quadrotor.add_heading(cases, leaf, heading, max_yaw_rate, start_attitude)
     require_sound(cases, _ARGUMENTS)
     quadrotor.require_start(cases)
     return cases

@@ -305,7 +305,7 @@ class ExactCatch(ChainPlanner[CatchCase, CatchPlan]):
             decided_times=context.times,
             times=ends.contact,
             **pending(violation),
-        )
+        ).with_heading(context.case)
 
     def replanner(self) -> "ReplanCatch":
         """Return the planner that `pj.replan` uses."""

@@ -20,6 +20,7 @@ from planner_jax.core.checks import require_path
 from planner_jax.optimise.planner import OptimisedPlanner
 from planner_jax.optimise.settings import Evaluation, LbfgsConfig, Round
 from planner_jax.planning.replan import Replanning, check_elapsed, planned_state, resolve_argument
+from planner_jax.robot.heading import continue_heading
 from planner_jax.robot.quadrotor import add_drag, body_z
 from planner_jax.task.catch.case import CatchCase
 from planner_jax.task.catch.context import CatchContext, targets_at
@@ -127,7 +128,8 @@ class ReplanCatch(OptimisedPlanner):
 
     def prepare(self, task: Replanning) -> ReplanContext:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Return the remaining catches, and the previous plan as a starting point of the search."""
-        context = self.planner.prepare(task.case)
+        case = continue_heading(task.case, task.previous, task.elapsed)
+        task, context = dataclasses.replace(task, case=case), self.planner.prepare(case)
         left = _segments(task)[1][0]
         return ReplanContext(
             catch=context,
@@ -242,4 +244,4 @@ def _remainder(task: Replanning, context: CatchContext) -> CatchPlan:
         order=task.case.order,
         times=jnp.maximum(times, 0.0),
         iterations=jnp.zeros_like(previous.iterations),
-    )
+    ).with_heading(task.case)

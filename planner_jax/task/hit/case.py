@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Sequence
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import jax.numpy as jnp
 import numpy as np
@@ -20,6 +20,9 @@ from planner_jax.robot.quadrotor_model import PAPER_HITTER, RACKET, QuadrotorMod
 from planner_jax.task import quadrotor
 from planner_jax.task.arguments import array_of, batch_of
 from planner_jax.task.hit.spec import DRAG, START
+
+if TYPE_CHECKING:
+    from planner_jax.robot.heading import Heading
 
 # Shapes and ranges that `pj.require_sound` checks for the arrays of a `HitCase`.
 RULES: Table = (
@@ -78,6 +81,7 @@ class HitCase(Located):
     hit_limits: HitLimits
     extras: tuple[Extra, ...] = ()  # the user's further constraints and costs
     racket_radius: Array | None = None  # () [m]; None: the contact's offset is not limited
+    heading: "Heading | None" = None  # requested heading; None: 0
 
     @property
     def batch_shape(self) -> tuple[int, ...]:
@@ -95,6 +99,8 @@ def case(
     start_velocity=(0.0, 0.0, 0.0),
     start_acceleration=(0.0, 0.0, 0.0),
     start_attitude=None,
+    heading=None,
+    max_yaw_rate=None,
     drag=DRAG,
     gravity=GRAVITY,
     restitution=None,
@@ -126,7 +132,12 @@ def case(
         start_velocity: (3,) or (..., 3) [m/s], its velocity at time 0.
         start_acceleration: (3,) or (..., 3) [m/s^2], its acceleration at time 0.
         start_attitude: (4,) or (..., 4), quaternion w x y z from body to world at time 0, instead
-            of the acceleration, for a thrust equal to the weight. Its heading has no effect.
+            of the acceleration, for a thrust equal to the weight. Its heading is the heading at
+            time 0 if a `heading` is requested.
+        heading: requested heading of the quadrotor: an angle [rad], or one for each case; a pair of
+            times (..., H) [s] and angles (..., H) [rad], linear in between; "velocity", along the
+            horizontal velocity; or "ball", towards the ball until the impact. None: 0.
+        max_yaw_rate: [rad/s], greatest derivative of a requested heading, by default 2.
         drag: [1/m], coefficient K_D of quadratic drag. The drag and every following number is one
             value for all cases, or one value for each case.
         gravity: [m/s^2], magnitude.
@@ -206,6 +217,7 @@ def case(
         racket_radius=leaf("racket_radius", racket_radius),
         origin=None if shift is None else leaf("origin", shift, 2),
     )
+    cases = quadrotor.add_heading(cases, leaf, heading, max_yaw_rate, start_attitude)
     require_sound(cases, _ARGUMENTS)
     quadrotor.require_start(cases)
     height = np.asarray(cases.ball.pos)[..., 2]

@@ -336,7 +336,7 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
             air=context.case.limits.air,
             stroke=ends.contact,
             **pending(violation),
-        )
+        ).with_heading(context.case)
 
     def replanner(self) -> "ReplanHit":
         """Return the planner by which `pj.replan` updates plans of this planner in flight."""

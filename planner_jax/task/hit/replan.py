@@ -19,6 +19,7 @@ from planner_jax.core.checks import require_beginning, require_kind
 from planner_jax.optimise.planner import OptimisedPlanner
 from planner_jax.optimise.settings import Evaluation, LbfgsConfig, Round
 from planner_jax.planning.replan import Replanning, check_elapsed, planned_state, resolve_argument
+from planner_jax.robot.heading import continue_heading
 from planner_jax.robot.quadrotor import add_drag, net_thrust, tangent_basis
 from planner_jax.task.hit.case import HitCase
 from planner_jax.task.hit.context import HitContext
@@ -86,7 +87,8 @@ class ReplanHit(OptimisedPlanner):
 
     def prepare(self, task: Replanning) -> ReplanHitContext:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Return the data of the remaining hit, and a starting point from the previous impact."""
-        return ReplanHitContext(hit=self.planner.prepare(task.case), start=self._start(task))
+        case = continue_heading(task.case, task.previous, task.elapsed)
+        return ReplanHitContext(hit=self.planner.prepare(case), start=self._start(task))
 
     def _start(self, task: Replanning) -> Array:
         planner, stroke = self.planner, task.previous.stroke
