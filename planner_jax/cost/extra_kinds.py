@@ -34,14 +34,17 @@ class KeepOut:
 
 
 @struct.dataclass
-class KeepOutBox:
-    """A box along the world's axes, with finite sides, that the quadrotor must not enter."""
-
+class _Box:
     rules: ClassVar[Table] = (Field("low", None, below("high")),)
     positions: ClassVar[dict] = {"low": (), "high": ()}
 
     low: Numbers  # (3,) [m]
     high: Numbers  # (3,) [m]
+
+
+@struct.dataclass
+class KeepOutBox(_Box):
+    """A box along the world's axes, with finite sides, that the quadrotor must not enter."""
 
     def excess(self, pos: Numbers, vel: Numbers, acc: Numbers) -> Numbers:
         """Return the depth below the nearest face of the box, divided by half its shortest side."""
@@ -67,14 +70,8 @@ class Plane:
 
 
 @struct.dataclass
-class Geofence:
+class Geofence(_Box):
     """A box, with finite sides, that the quadrotor must not leave."""
-
-    rules: ClassVar[Table] = (Field("low", None, below("high")),)
-    positions: ClassVar[dict] = {"low": (), "high": ()}
-
-    low: Numbers  # (3,) [m]
-    high: Numbers  # (3,) [m]
 
     def excess(self, pos: Numbers, vel: Numbers, acc: Numbers) -> Numbers:
         """Return the distance [m] outside of the box, along the axis where it is greatest."""

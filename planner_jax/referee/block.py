@@ -104,9 +104,7 @@ class BlockVerdict(judging.Verdict):
     base_clearance: np.ndarray  # (B,) [m], least distance of shield and links from the base
     self_clearance: np.ndarray  # (B,) [m], least distance between two parts of the arm
     miss: np.ndarray  # (B,) [m], ball to the shield's middle at the contact, in the face's plane
-    height: (
-        np.ndarray
-    )  # (B,) [m], of the ball's nearest point above the face's plane at the contact
+    height: np.ndarray  # (B,) [m], least height of the ball above the face at the contact
     tilt: np.ndarray  # (B,) [rad], angle between shield's normal and minus the ball's velocity
 
     def success_message(self, k: int | tuple) -> str:

@@ -1,10 +1,7 @@
 """`pj.show`: a picture of one plan, for notebooks."""
 
-import functools
 import io
 
-import jax
-import numpy as np
 from jaxtyping import PyTree
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -16,7 +13,6 @@ from planner_jax.sweep.sweep import Picture, sweep_of
 from planner_jax.task.block.drawing import SIZE, draw_motion
 from planner_jax.task.reach.api import judge
 from planner_jax.task.reach.case import ReachCase
-from planner_jax.task.reach.default_planner import ReachPlan
 
 _RULE = "one case of hit, catch, intercept, group, block or reach"
 
@@ -28,11 +24,6 @@ class PlanFigure(Figure):
         file = io.BytesIO()
         self.savefig(file, format="png")
         return file.getvalue()
-
-
-def _draw_reach(case: ReachCase, plan: ReachPlan, figure: Figure) -> None:
-    parts = jax.tree.map(np.asarray, (case.arm, case.limits, case.scene, plan.motion))
-    draw_motion(figure, judge(case, plan), *parts)
 
 
 def show(case: PyTree, plan: PyTree) -> PlanFigure:
@@ -53,7 +44,8 @@ def show(case: PyTree, plan: PyTree) -> PlanFigure:
     task = {task.home: task for task in all_tasks().values()}.get(home)
     drawn: list[Picture] = []
     if shape == () and isinstance(case, ReachCase):
-        drawn.append(Picture("reach.png", SIZE, functools.partial(_draw_reach, case, plan)))
+        parts = judge(case, plan), case.arm, case.limits, case.scene, plan.motion
+        drawn.append(Picture("reach.png", SIZE, lambda figure: draw_motion(figure, *parts)))
     elif shape == () and task is not None:
         drawn += sweep_of(task).pictures(case, plan, task.judge(case, plan), "plan")
     if not drawn:

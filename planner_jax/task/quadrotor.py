@@ -64,20 +64,15 @@ def require_tool(robot: object, kind: str) -> Tool:
 
 
 def start_state(
-    start: object,
-    velocity: object,
-    acceleration: object,
-    attitude: object,
-    gravity: object,
-    batch: tuple[int, ...],
-    dtype: DTypeLike,
+    start: object, motion: tuple, gravity: object, batch: tuple[int, ...], dtype: DTypeLike
 ) -> Array:
     """Return states (*batch, 4, 3) at time 0 from arguments of `case`, which are named `start...`.
 
-    The rows are the position [m], the velocity [m/s], the acceleration [m/s^2], and a jerk of 0. An
-    `attitude` (4,), a quaternion w x y z, replaces the acceleration: the thrust is along body z,
-    and equal to the weight.
+    The rows are the position [m], and of `motion` the velocity [m/s], the acceleration [m/s^2], and
+    a jerk of 0. An attitude (4,) at the end of `motion`, a quaternion w x y z, replaces the
+    acceleration: the thrust is along body z, and equal to the weight.
     """
+    velocity, acceleration, attitude = motion
     head = np.zeros(batch + (4, 3))
     rows = {"start": start, "start_velocity": velocity, "start_acceleration": acceleration}
     for k, (name, value) in enumerate(rows.items()):

@@ -16,12 +16,8 @@ from planner_jax.sweep.intercept.figures import motion_figure, plane_figure
 from planner_jax.sweep.intercept.settings import GroupSettings, InterceptSettings
 from planner_jax.sweep.rows import car_plan
 from planner_jax.sweep.sweep import Picture, RunFigure, Sweep, first_values
-from planner_jax.task.intercept.drawing import (
-    SampledDrive,
-    draw_judged,
-    figure_size,
-    sample_drive,
-)
+from planner_jax.task.intercept import drawing
+from planner_jax.task.intercept.drawing import SampledDrive, sample_drive
 
 # Planners whose plans for one case of a run are drawn beside the plan of the run's own planner.
 COMPARED = ("lattice", "spacetime")
@@ -116,5 +112,5 @@ class GroupSweep(Sweep[GroupSettings]):
 
 
 def _picture(drive: SampledDrive, verdict: InterceptVerdict) -> Picture:
-    draw = lambda figure: draw_judged(drive, verdict, figure.subplots())  # noqa: E731
-    return Picture("plane.png", figure_size(drive), draw)
+    draw = lambda figure: drawing.draw_judged(drive, verdict, figure.subplots())  # noqa: E731
+    return Picture("plane.png", drawing.figure_size(drive), draw)

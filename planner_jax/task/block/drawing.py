@@ -80,6 +80,7 @@ def draw_motion(
     figure.suptitle(verdict.sentence(), x=0.01, ha="left", fontsize="medium")
     panels = figure.subplots(1, 3, width_ratios=(1.2, 1.2, 1.0))
     motion, moved = jax.tree.map(jnp.asarray, (motion, arm))
+    arm, limits, scene = jax.tree.map(np.asarray, (arm, limits, scene))
     end = float(jnp.sum(motion.durations))
     angles = jax.vmap(lambda time: evaluate(motion, time))(jnp.linspace(0.0, end, _SHOWN))
     arms = np.asarray(jax.vmap(capsules, (None, 0))(moved, angles))

@@ -15,10 +15,7 @@ from planner_jax.task.block.default_planner import OnlineBlock
 from planner_jax.task.block.end_poses import end_poses, flight_of
 from planner_jax.task.block.motion import least_times
 
-_POINTS, _PIECES = (
-    192,
-    10,
-)  # points of the ball's path for which poses are computed; see `end_poses`
+_POINTS, _PIECES = 192, 10  # number of points of the ball's path with poses; see `end_poses`
 
 
 @dataclasses.dataclass(frozen=True)

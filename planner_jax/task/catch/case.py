@@ -188,6 +188,9 @@ def case(
     leaf = functools.partial(array_of, batch=batch, dtype=dtype)
     require_path("targets", targets, shape, 3, "horizon")
     tool = quadrotor.require_tool(robot, NET)
+    motion = start_velocity, start_acceleration, start_attitude
+    limits = {"speed": speed, "body_rate": body_rate, "min_height": min_height}
+    limits |= {"min_thrust": min_thrust, "max_thrust": max_thrust}
     shares = np.arange(1, num + 1) / (num + 1.0)
     cases = CatchCase(
         targets=near("targets", targets, is_strict=origin is None),
@@ -195,31 +198,14 @@ def case(
         horizon=leaf("horizon", horizon, num),
         order=jnp.asarray(np.broadcast_to(np.arange(num, dtype=np.int32), shape), jnp.int32),
         times=leaf("horizon", shares * np.asarray(horizon)[..., :1], num),
-        head_state=quadrotor.start_state(
-            near("start", start),
-            start_velocity,
-            start_acceleration,
-            start_attitude,
-            gravity,
-            batch,
-            dtype,
-        ),
+        head_state=quadrotor.start_state(near("start", start), motion, gravity, batch, dtype),
         gravity=leaf("gravity", gravity),
         net=Net(
             height=leaf("net_height", tool.height if net_height is None else net_height),
             radius=leaf("net_radius", tool.radius if net_radius is None else net_radius),
             max_angle=leaf("max_angle", tool.max_angle if max_angle is None else max_angle),
         ),
-        limits=quadrotor.limits_of(
-            robot,
-            leaf,
-            (rotor_drag, wind),
-            speed=speed,
-            min_thrust=min_thrust,
-            max_thrust=max_thrust,
-            body_rate=body_rate,
-            min_height=min_height,
-        ),
+        limits=quadrotor.limits_of(robot, leaf, (rotor_drag, wind), **limits),
         extras=for_batch(near("extras", extras, is_strict=origin is None), batch, dtype),
         optional=optional,
         origin=None if shift is None else leaf("origin", shift, 2),

@@ -177,37 +177,22 @@ def case(
     near = functools.partial(move, by=None if shift is None else -shift, dtype=dtype)
 
     leaf = functools.partial(array_of, batch=batch, dtype=dtype)
+    motion = start_velocity, start_acceleration, start_attitude
+    limits = {"speed": speed, "body_rate": body_rate, "min_height": min_height}
+    limits |= {"min_thrust": min_thrust, "max_thrust": max_thrust, "acceleration": acceleration}
     racket_height = tool.height if racket_height is None else racket_height
     racket_radius = tool.radius if racket_radius is None else racket_radius
     cases = HitCase(
         ball=BallState(
             pos=leaf("ball_pos", near("ball_pos", ball_pos), 3), vel=leaf("ball_vel", ball_vel, 3)
         ),
-        head_state=quadrotor.start_state(
-            near("start", start),
-            start_velocity,
-            start_acceleration,
-            start_attitude,
-            gravity,
-            batch,
-            dtype,
-        ),
+        head_state=quadrotor.start_state(near("start", start), motion, gravity, batch, dtype),
         target=leaf("target", near("target", target), 3),
         drag=leaf("drag", drag),
         gravity=leaf("gravity", gravity),
         restitution=leaf("restitution", tool.restitution if restitution is None else restitution),
         racket_height=leaf("racket_height", racket_height),
-        limits=quadrotor.limits_of(
-            robot,
-            leaf,
-            (rotor_drag, wind),
-            speed=speed,
-            acceleration=acceleration,
-            min_thrust=min_thrust,
-            max_thrust=max_thrust,
-            body_rate=body_rate,
-            min_height=min_height,
-        ),
+        limits=quadrotor.limits_of(robot, leaf, (rotor_drag, wind), **limits),
         hit_limits=HitLimits(
             hitting_speed=leaf("hitting_speed", hitting_speed, 3),
             min_apex=leaf("min_apex", min_apex),

@@ -175,9 +175,8 @@ def sample_drive(
 
 def draw_judged(drive: SampledDrive, verdict: InterceptVerdict, ax: Axes | None = None) -> Axes:
     """Draw a drive from above as `draw_plan` does, with the referee's verdict as its title."""
-    colours = ScalarMappable(
-        Normalize(0.0, max(float(np.nan_to_num(drive.speed).max()), 1e-9)), COLOURS
-    )
+    most = max(float(np.nan_to_num(drive.speed).max()), 1e-9)
+    colours = ScalarMappable(Normalize(0.0, most), COLOURS)
     with style.context():
         if ax is None:
             import matplotlib.pyplot as plt
@@ -185,9 +184,8 @@ def draw_judged(drive: SampledDrive, verdict: InterceptVerdict, ax: Axes | None 
             ax = plt.subplots(figsize=figure_size(drive))[1]
         draw_drive(ax, drive, colours, by_speed=True)
         ax.figure.colorbar(colours, ax=ax, label="speed of the car [m/s]", fraction=0.045, pad=0.02)
-        below = offset_copy(
-            ax.transAxes, ax.get_figure(root=True), y=-0.45
-        )  # [inch], below the label of the axis
+        # 0.45 inch below the axes, which is below the label of the axis
+        below = offset_copy(ax.transAxes, ax.get_figure(root=True), y=-0.45)
         look: Look = {"loc": "upper center", "bbox_to_anchor": (0.5, 0.0), "ncols": 3}
         ax.legend(handles=entries(colours, by_speed=True), bbox_transform=below, **look)
         style.label(ax, "x [m]", "y [m]")
