@@ -17,6 +17,8 @@ from jax import Array, lax
 from planner_jax.ball.flight import BallState, fly
 from planner_jax.core.compiled import QUICK_OPTIONS
 from planner_jax.core.errors import ArgumentError
+from planner_jax.robot.attitude import turn_quaternion
+from planner_jax.robot.heading import Heading
 from planner_jax.sims import sensing as sight
 from planner_jax.sims.loop_state import FlightState, Loop
 from planner_jax.sims.model import at_rest, place_balls
@@ -65,6 +67,16 @@ def ready(loop: Loop, starts: Array, keys: Array) -> FlightState:
         )
 
     return jax.vmap(one)(starts, keys)
+
+
+def turn_robots(flights: FlightState, heading: Heading | None) -> FlightState:
+    """Return flights of B quadrotors at standstill, at the headings at which their cases start."""
+    if heading is None:
+        return flights
+    qpos = flights.physics.qpos
+    quat = jax.vmap(turn_quaternion)(qpos[:, 3:7], heading.start[:, 0])
+    physics = dataclasses.replace(flights.physics, qpos=qpos.at[:, 3:7].set(quat))
+    return dataclasses.replace(flights, physics=physics)
 
 
 def launch_ball(

@@ -265,3 +265,18 @@ def test_a_missing_package_is_named(tmp_path, monkeypatch, package, module, name
     with pytest.raises(MissingExtra, match=says):
         export_file(tmp_path, to=to, name=name)
     assert not list(tmp_path.iterdir())
+
+
+def test_the_yaw_of_a_crazyflie_is_the_heading_of_the_plan():
+    durations = np.full(6, 0.1, np.float32)
+    rates = np.array([0.0, 0.5, 1.0, 0.2, -0.4, -0.1, 0.0])
+    angles = np.append(0.3, 0.3 + np.cumsum(0.05 * (rates[1:] + rates[:-1])))
+    coeffs = np.stack([angles[:-1], rates[:-1], np.diff(rates) / 0.2], axis=1)[..., None]
+    heading = pj.PiecewisePolynomial(coeffs=coeffs.astype(np.float32), durations=durations)
+    rows = poly4d(quadrotor(num=2).replace(heading=heading)).astype(float)
+    starts = np.cumsum(rows[:, 0]) - rows[:, 0]
+    for start, row in zip(starts, rows, strict=True):
+        for share in (0.0, 0.3, 0.7, 1.0):
+            yaw = np.polynomial.polynomial.polyval(share * row[0], row[25:])
+            time = np.float32(min(start + share * row[0], 0.6))
+            assert yaw == pytest.approx(pj.evaluate(heading, time)[0].item(), abs=5e-3)

@@ -393,3 +393,16 @@ def test_hits_are_planned_too():
     answers = throw.fly(40)
     planner.close()
     assert answers[-1].motion is Motion.PLAN and planner.report.compiled == 0
+
+
+@pytest.mark.slow
+def test_setpoints_follow_the_requested_heading(path):
+    planner = LivePlanner(CatchStroke(heading="ball", max_yaw_rate=1.0), deadline=30.0)
+    planner.warm_up()
+    answers = balls_of(Throw(planner, path, 1).fly(90))
+    planner.close()
+    assert planner.report.compiled == 0 and last_plan(answers).reason is Reason.NONE
+    quat = first_column(answers, "quat_wxyz")
+    yaw = 2.0 * np.arctan2(quat[:, 3], quat[:, 0])
+    ball = np.arctan2(path[0, 1], path[0, 0])
+    assert np.ptp(yaw) > 0.1 * abs(ball) and np.abs(np.diff(yaw)).max() <= 1.02 * STEP

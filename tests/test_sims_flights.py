@@ -14,6 +14,8 @@ from test_solve import GOALS, Well, WellPlanner
 import planner_jax as pj
 from planner_jax.core.protocol import Status, is_solved, is_unsolved
 from planner_jax.planning.plan import plan
+from planner_jax.robot.attitude import yaw_at
+from planner_jax.robot.heading import Heading
 from planner_jax.sims.loop_state import Loop
 from planner_jax.sims.noise import NOISES
 from planner_jax.sims.robots.quadrotor.robot import Quadrotor
@@ -251,3 +253,26 @@ def test_compiling_ahead_also_accepts_a_planner_on_the_host():
 
     compile_attempts(OnHost(), Well(GOALS))
     assert tried == [WellPlanner().rounds[0]]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("follows", ["angles", "ball"])
+def test_flights_follow_the_heading_of_their_plans(follows):
+    served = volleys(3, REAL_SCENARIOS["S.1"], seed=1)
+    angle = 0.8 if follows == "angles" else 0.0
+    rows = {"angles": [angle] * 2, "times": [0.0, 1.0], "max_yaw_rate": 2.0, "start": [angle, 0.0]}
+    tiled = {name: np.array([row] * 3, np.float32) for name, row in rows.items()}
+    cases = served.cases.replace(heading=Heading(**tiled, follows=follows))
+    flights = fly_hits(Loop(HIT_WORLD, record=True), dataclasses.replace(served, cases=cases))
+    assert flights.success.all() and flights.flown.tracking[:, 1].max() < 0.03
+    record, flown = flights.flown.record, flights.flown
+    quat = record.physics.qpos[..., 3:7]
+    yaw = 2.0 * np.arctan2(quat[..., 3], quat[..., 0])
+    before = record.time <= flown.contact.time.max()
+    if follows == "angles":
+        assert np.abs(yaw[before] - angle).max() < 0.05
+    else:
+        since = np.clip(record.time - flown.began[:, None], 0.0, None)
+        wanted = jax.vmap(jax.vmap(yaw_at, (None, 0)))(flown.plan.heading, since)[..., 0]
+        late = before & (record.time >= flown.began[:, None])
+        assert np.abs(yaw - wanted)[late].max() < 0.05

@@ -2,6 +2,7 @@
 
 The memory holds 132 bytes for each piece: eight coefficients each of x, y, z [m] and yaw [rad], the
 constant first, then the duration [s], all little-endian float32. The frame is the library's, z up.
+The yaw is the plan's heading.
 """
 
 from typing import BinaryIO
@@ -11,10 +12,13 @@ import numpy as np
 from planner_jax.core.errors import ArgumentError
 from planner_jax.export.csv_rows import write_table
 from planner_jax.export.setpoints import pieces_of, require_near
+from planner_jax.referee.heading import headings_of
 from planner_jax.robot.quadrotor import QuadrotorPlan
+from planner_jax.trajectory.polynomial import PiecewisePolynomial
 
 MEMORY = 4096  # [bytes], memory for trajectories in the firmware
 POWERS = 8  # number of coefficients of a polynomial
+_WEIGHT = 1e3  # of the values and rates at the ends of the pieces, in fits of a heading
 _BYTES = 4 * (4 * POWERS + 1)  # [bytes], memory of one piece
 
 
@@ -36,6 +40,8 @@ def poly4d(plan: QuadrotorPlan) -> np.ndarray:
         rule = f"at most {MEMORY // _BYTES} pieces, which fill a Crazyflie's {MEMORY} bytes"
         raise ArgumentError("plan", rule, num, verb="have")
     rows = np.zeros((num, 4, POWERS), np.float32)
+    if plan.heading is not None:
+        rows[:, 3] = _fit_heading(plan.heading, np.asarray(pieces.durations, float))
     stored = min(powers, POWERS)
     with np.errstate(over="ignore"):
         rows[:, :3, :stored] = np.swapaxes(pieces.coeffs[:, :stored], 1, 2)
@@ -44,6 +50,23 @@ def poly4d(plan: QuadrotorPlan) -> np.ndarray:
         raise ArgumentError("plan", "numbers that float32 holds", verb="have", shown="larger ones")
     require_near(np.asarray(pieces.coeffs)[:, 0])
     return table
+
+
+def _fit_heading(heading: PiecewisePolynomial, durations: np.ndarray) -> np.ndarray:
+    """Return polynomials (M, 8) that fit a heading [rad] in M pieces, with its rate at both ends.
+
+    Least squares at 33 times; the values and rates at the ends have weights that make them exact.
+    """
+    u, powers = np.linspace(0.0, 1.0, 33), np.arange(POWERS)
+    leaves = {f"heading.{k}": np.asarray(v, float)[None] for k, v in vars(heading).items()}
+    times = (np.cumsum(durations) - durations)[:, None] + durations[:, None] * u
+    angle, rate = (each[0] for each in headings_of(leaves)(times[None]))
+    ends = [0, -1]
+    matrix, slope = u[:, None] ** powers, powers * u[ends, None] ** np.maximum(powers - 1, 0)
+    matrix = np.concatenate([matrix, _WEIGHT * matrix[ends], _WEIGHT * slope])
+    wanted = [angle, _WEIGHT * angle[:, ends], _WEIGHT * durations[:, None] * rate[:, ends]]
+    scaled = np.linalg.lstsq(matrix, np.concatenate(wanted, axis=1).T, rcond=None)[0]
+    return scaled.T / durations[:, None] ** powers
 
 
 def write_csv(plan: QuadrotorPlan, rate: None, file: BinaryIO) -> None:

@@ -14,7 +14,8 @@ from planner_jax.live.packets import FIELDS
 from planner_jax.planning.programs import solve_one
 from planner_jax.recovery.case import RecoveryCase
 from planner_jax.recovery.planner import RecoveryPlanner
-from planner_jax.robot.attitude import setpoint_at, tilt_quaternion
+from planner_jax.robot.attitude import setpoint_at, tilt_quaternion, turn_quaternion, yaw_at
+from planner_jax.robot.heading import KNOTS
 from planner_jax.robot.quadrotor import (
     Air,
     QuadrotorLimits,
@@ -34,6 +35,7 @@ class Course:
     path: PiecewisePolynomial  # M pieces of a plan, then the pieces of the recovery trajectory
     gravity: Array  # () [m/s^2], magnitude
     air: Air | None = None  # drag and wind
+    heading: PiecewisePolynomial | None = None  # [rad], constant after its end; None: 0
 
 
 def without_recovery(path: PiecewisePolynomial, gravity: Array, air: Air | None = None) -> Course:
@@ -87,12 +89,12 @@ class Query:
 
 def setpoints_of(num: int, _: None, query: Query) -> Float[Array, "K 20"]:
     """Return K = `num` setpoints: pos, vel, acc, jerk, quat_wxyz, body_rate, thrust."""
-    path, gravity = query.course.path, query.course.gravity
+    path, gravity, heading = query.course.path, query.course.gravity, query.course.heading
     times = query.elapsed + query.period * np.arange(num)
     end = total_duration(path)
 
     def at(time: Array) -> Array:
-        moving = setpoint_at((path, gravity, query.course.air, None), jnp.minimum(time, end))
+        moving = setpoint_at((path, gravity, query.course.air, heading), jnp.minimum(time, end))
         zero = jnp.zeros(3, time.dtype)
         upright = jnp.asarray([1.0, 0.0, 0.0, 0.0], time.dtype)
         still = {**dict.fromkeys(("vel", "acc", "jerk", "body_rate"), zero), "pos": moving["pos"]}
@@ -101,6 +103,8 @@ def setpoints_of(num: int, _: None, query: Query) -> Float[Array, "K 20"]:
             load = add_drag(air, zero, zero)
             still["quat_wxyz"] = tilt_quaternion(load, gravity)
             still["thrust"] = thrust_in_air(air, zero, load, gravity)
+        if heading is not None:
+            still["quat_wxyz"] = turn_quaternion(still["quat_wxyz"], yaw_at(heading, time)[0])
         rows = [jnp.where(time < end, moving[name], still[name]) for name in FIELDS]
         return jnp.concatenate([row.ravel() for row in rows])
 
@@ -119,3 +123,18 @@ def state_of(course: Course, elapsed: float) -> Float[np.ndarray, "4 3"]:
 def state_on(path: PiecewisePolynomial, elapsed: float) -> Float[np.ndarray, "4 3"]:
     """Return position, velocity, acceleration and jerk at the time `elapsed` [s], as float32."""
     return states_at(path, np.asarray(elapsed)).astype(np.float32)
+
+
+def hold_heading(angle: float) -> PiecewisePolynomial:
+    """Return a constant heading [rad], with as many pieces as the heading of a plan."""
+    coeffs: Any = np.zeros((KNOTS, 3, 1), np.float32)
+    coeffs[:, 0] = angle
+    durations: Any = np.zeros(KNOTS, np.float32)
+    return PiecewisePolynomial(coeffs, durations)
+
+
+def yaw_of(course: Course, elapsed: float) -> Float[np.ndarray, " 2"] | None:
+    """Return heading and derivative [rad], [rad/s] at `elapsed` [s]; None without a heading."""
+    if (heading := course.heading) is None:
+        return None
+    return state_on(heading, min(elapsed, float(np.sum(heading.durations))))[:2, 0]

@@ -23,11 +23,13 @@ from planner_jax.live.arrivals import Arrivals
 from planner_jax.live.course import (
     Course,
     Query,
+    hold_heading,
     recovery_from,
     setpoints_of,
     state_of,
     with_recovery,
     without_recovery,
+    yaw_of,
 )
 from planner_jax.live.packets import (
     BALL,
@@ -141,7 +143,7 @@ class LivePlanner(Generic[CaseT, PlanT]):
             pos = tuple(state[0] + (4.0 - 0.1 * k, 0.0, 0.1 * k))
             ball, _ = self._sight.see(0, pos, 0.01 * k, 0.01 * k)
         assert ball is not None
-        plan = self._worker.submit(self.stroke.first, ball, state).result()
+        plan = self._worker.submit(self.stroke.first, ball, state, self._yaw(None, 0.0)).result()
         say("Compiled the estimate of a ball and plans from scratch, part 2 of 3.")
         self._worker.submit(self.stroke.again, plan, 0.01, ball).result()
         say("Compiled plans that continue earlier ones, part 3 of 3.")
@@ -214,7 +216,16 @@ class LivePlanner(Generic[CaseT, PlanT]):
     def _recover(self, state: np.ndarray, start: float) -> _Flight[PlanT]:
         course, is_within = recovery_from(state, self.stroke.pieces, self._gravity, self._limits)
         self.report.counts["hard_rests"] += not is_within
+        if (yaw := self._yaw(self._flight, start)) is not None:
+            course = dataclasses.replace(course, heading=hold_heading(yaw[0]))
         return _Flight(course, start)
+
+    def _yaw(self, flight: _Flight[PlanT] | None, due: float) -> np.ndarray | None:
+        """Return the heading and its derivative (2,) at the time `due`; None without a request."""
+        if flight is not None:
+            return yaw_of(flight.course, due - flight.start)
+        request = self.stroke.case.heading
+        return None if request is None else np.asarray(request.start)
 
     def _use_ball(self, packet: Packet, due: float, received: float) -> Fault:
         begun, number = self._sight.begun, packet.ball
@@ -262,7 +273,8 @@ class LivePlanner(Generic[CaseT, PlanT]):
                 return self._flight_of(plan, number, due)
             self.report.counts["refused"] += 1
         with stages["first"].measure():
-            plan = self.stroke.first(ball, state_of(flight.course, elapsed))
+            yaw = self._yaw(flight, due)
+            plan = self.stroke.first(ball, state_of(flight.course, elapsed), yaw)
         if is_solved(plan.status):
             return self._flight_of(plan, number, due)
         self.report.counts["refused"] += 1
@@ -272,6 +284,7 @@ class LivePlanner(Generic[CaseT, PlanT]):
 
     def _flight_of(self, plan: PlanT, ball: int, due: float) -> _Flight[PlanT]:
         course = without_recovery(plan.trajectory, self._gravity, self._limits.air)
+        course = dataclasses.replace(course, heading=plan.heading)
         return _Flight(course, due, plan, due + self.stroke.contact(plan), ball)
 
     def _collect(self, due: float) -> None:
@@ -301,6 +314,7 @@ class LivePlanner(Generic[CaseT, PlanT]):
             return
         with self.report.stages["rest"].measure():
             course, is_within = with_recovery(flight.plan.trajectory, self._gravity, self._limits)
+        course = dataclasses.replace(course, heading=flight.course.heading)
         self.report.counts["endless"] += not is_within
         self._flight = dataclasses.replace(flight, course=course) if is_within else before
         self._reason = self._reason if is_within else Reason.NO_RECOVERY

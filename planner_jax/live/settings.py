@@ -1,5 +1,6 @@
 """Options of the command `planner-jax serve`, checked before the slow import of JAX."""
 
+import contextlib
 import dataclasses
 import pkgutil
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -24,6 +25,10 @@ class ServeSettings:
     horizon: int = option(10, "K", "number of setpoints in an answer")
     deadline: float = option(0.01, "S", "longest time from a packet to its answer [s]")
     noise: float = option(0.005, "M", "standard deviation of an observed coordinate [m]")
+    heading: str | float | None = option(
+        None, "ANGLE", "of the robot: an angle [rad], velocity or ball (default: 0)"
+    )
+    max_yaw_rate: float | None = option(None, "W", "of the heading [rad/s] (default: 2)")
     seconds: float | None = option(None, "S", "end after this time (default: never)")
     report: bool = option(False, "", "print counts, times and memory at the end")
 
@@ -42,12 +47,14 @@ class ServeSettings:
         if self.seconds is not None:
             require(0.0 < self.seconds <= 1e7, "seconds", "> 0 and at most 1e7", self.seconds)
         object.__setattr__(self, "robot", resolve_robot(vars(self)["robot"], self.TOOL))
+        with contextlib.suppress(ValueError, TypeError):  # a word, or no heading
+            object.__setattr__(self, "heading", float(self.heading))  # type: ignore[arg-type]
         drag = vars(self)["drag"]
         require(0.0 <= drag <= self.MOST_DRAG, "drag", f"from 0 to {self.MOST_DRAG:g}", drag)
 
     def stroke(self) -> "Stroke":
         """Make the task that the server plans, such as a `HitStroke`, from these options."""
-        names = {"robot", "target", "drag"} & vars(self).keys()
+        names = {"robot", "target", "drag", "heading", "max_yaw_rate"} & vars(self).keys()
         given = {name: vars(self)[name] for name in names if vars(self)[name] is not None}
         return pkgutil.resolve_name(f"planner_jax.live.strokes:{self.STROKE}")(**given)
 

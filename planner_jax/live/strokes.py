@@ -25,6 +25,7 @@ from planner_jax.optimise.planner import OptimisedPlanner
 from planner_jax.optimise.settings import LbfgsConfig, Round
 from planner_jax.planning.programs import call_packed, solve_cases
 from planner_jax.planning.replan import Replanning
+from planner_jax.robot.heading import with_request
 from planner_jax.robot.quadrotor_model import PAPER_CATCHER, PAPER_HITTER, QuadrotorModel
 from planner_jax.task.catch.case import CatchCase
 from planner_jax.task.catch.case import case as catch_case
@@ -76,9 +77,19 @@ class Stroke(abc.ABC, Generic[CaseT, PlanT]):
         self._solve_first, self._solve_again = solvers
         self.pieces = self._planner.num_pieces  # number of polynomial pieces of a plan
 
-    def first(self, ball: BallState, head_state: Float[np.ndarray, "4 3"]) -> PlanT:
-        """Plan from `head_state`: the robot's position, velocity, acceleration, jerk at time 0."""
+    def first(
+        self,
+        ball: BallState,
+        head_state: Float[np.ndarray, "4 3"],
+        yaw: Float[np.ndarray, " 2"] | None = None,
+    ) -> PlanT:
+        """Plan from `head_state`: the robot's position, velocity, acceleration, jerk at time 0.
+
+        `yaw` has the heading at time 0 and its derivative; None without a requested heading.
+        """
         case = dataclasses.replace(self._with_ball(ball), head_state=head_state)
+        if yaw is not None and case.heading is not None:
+            case = with_request(case, dataclasses.replace(case.heading, start=yaw))
         return call_packed(self._solve_first, self._planner.rounds[1], self._planner, case)
 
     def again(self, plan: PlanT, elapsed: float, ball: BallState) -> PlanT:
@@ -117,6 +128,7 @@ class HitStroke(Stroke[HitCase, HitPlan]):
         robot: quadrotor with a racket.
         target: (3,) [m], desired landing point.
         drag: K_D [1/m], quadratic drag of the ball.
+        **turn: arguments `heading` and `max_yaw_rate` of `pj.hit.case`.
     """
 
     shortest = 0.2
@@ -127,8 +139,10 @@ class HitStroke(Stroke[HitCase, HitPlan]):
         *,
         target: Sequence[float] = TARGET,
         drag: float = HIT_DRAG,
+        **turn: Any,
     ) -> None:
-        case = hit_case((6.0, 0.0, 2.0), (-1.0, 0.0, 0.0), target, robot=robot, drag=drag)
+        ball = (6.0, 0.0, 2.0), (-1.0, 0.0, 0.0)
+        case = hit_case(*ball, target, robot=robot, drag=drag, **turn)
         planner = ExactHit(drag_after_impact=True)
         planners = planner, ReplanHit(planner, rounds=(_AGAIN,))
         super().__init__(case, rk4_step, drag, planners, (_solve, _hit_again))
@@ -180,14 +194,17 @@ class CatchStroke(Stroke[CatchCase, CatchPlan]):
     Args:
         robot: quadrotor with a net.
         drag: K_i [1/s], linear drag of the ball, equal on all axes.
+        **turn: arguments `heading` and `max_yaw_rate` of `pj.catch.case`.
     """
 
     shortest = 0.15
 
-    def __init__(self, robot: QuadrotorModel = PAPER_CATCHER, *, drag: float = CATCH_DRAG) -> None:
+    def __init__(
+        self, robot: QuadrotorModel = PAPER_CATCHER, *, drag: float = CATCH_DRAG, **turn: Any
+    ) -> None:
         zero, gravity = jnp.zeros((1, 3)), jnp.full(1, GRAVITY, jnp.float32)
         path = BallPath(BallState(zero, zero), jnp.full((1, 3), drag, jnp.float32), gravity)
-        case = catch_case(path, np.ones(1, np.float32), robot=robot)
+        case = catch_case(path, np.ones(1, np.float32), robot=robot, **turn)
         planner = ExactCatch()
         planners = planner, ReplanCatch(planner, rounds=(_AGAIN,))
         solvers = _catch_first, _catch_again

@@ -71,6 +71,13 @@ def tilt_quaternion(acc: Array, gravity: Array) -> Array:
     return jnp.stack([cosine, sine * turn_x, sine * turn_y, jnp.zeros_like(z)])
 
 
+def turn_quaternion(quat: Array, heading: Array) -> Array:
+    """Return the attitude (4,) at a heading () [rad] for an attitude at zero heading."""
+    w, x, y, _ = components(quat)
+    half = 0.5 * heading
+    return jnp.stack([w * jnp.cos(half), *turn_back(half, (x, y)), w * jnp.sin(half)])
+
+
 def yaw_at(heading: PiecewisePolynomial, time: Array) -> Array:
     """Return the heading (2,) [rad], [rad/s] and its derivative at a time () [s].
 
@@ -116,9 +123,7 @@ def setpoint_at(
     quat, yaw = tilt_quaternion(load, gravity), None
     if heading is not None:
         yaw = yaw_at(heading, time)
-        w, x, y, _ = components(quat)
-        cosine, sine = jnp.cos(0.5 * yaw[0]), jnp.sin(0.5 * yaw[0])
-        quat = jnp.stack([w * cosine, *turn_back(0.5 * yaw[0], (x, y)), w * sine])
+        quat = turn_quaternion(quat, yaw[0])
     return {
         "pos": pos,
         "vel": vel,

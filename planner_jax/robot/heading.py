@@ -28,7 +28,7 @@ from planner_jax.robot.rotor_thrusts import rotor_thrusts
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
 
 MAX_YAW_RATE = 2.0  # [rad/s], default of cases with a heading
-_KNOTS, _FINE = 64, 8  # pieces of a heading, and intervals of each, at whose ends limits are tested
+KNOTS, _FINE = 64, 8  # pieces of a heading, and intervals of each, at whose ends limits are tested
 _LAG = 0.25  # [s], time constant with which the heading approaches the requested heading
 _SHARE = 0.99  # fraction of the limit of the body rate, for peaks between the tested times
 _SLOWER = (1.0, 0.5, 0.25, 0.0)  # factors on the yaw rate, until every rotor keeps its limits
@@ -87,12 +87,13 @@ def add_request(
         first, angles = start, angles + leaf("heading", 2.0 * np.pi * turns)[..., None]
     start = leaf("heading", np.stack([first, 0.0 * first], axis=-1), 2)
     most = leaf("max_yaw_rate", MAX_YAW_RATE if most is None else most)
-    return _with(cases, Heading(angles, times, most, start, follows))
+    return with_request(cases, Heading(angles, times, most, start, follows))
 
 
-def _with(cases: PyTree, heading: Heading) -> PyTree:
+def with_request(cases: PyTree, heading: Heading) -> PyTree:
+    """Return cases with a requested heading, at whose start limited rotors keep their limits."""
     limits = cases.limits
-    if limits.rotors is not None:  # they keep their limits at the heading of the start
+    if limits.rotors is not None:
         rotors = dataclasses.replace(limits.rotors, heading=heading.start[..., 0])
         limits = dataclasses.replace(limits, rotors=rotors)
     return dataclasses.replace(cases, heading=heading, limits=limits)
@@ -104,7 +105,7 @@ def continue_heading(case: PyTree, previous: PyTree, elapsed: Numbers) -> PyTree
     if heading is None or previous.heading is None:
         return case
     start, times = yaw_at(previous.heading, jnp.asarray(elapsed)), heading.times - elapsed
-    return _with(case, dataclasses.replace(heading, start=start, times=times))
+    return with_request(case, dataclasses.replace(heading, start=start, times=times))
 
 
 def plan_heading(plan: PyTree, case: PyTree) -> PiecewisePolynomial:
@@ -116,8 +117,8 @@ def plan_heading(plan: PyTree, case: PyTree) -> PiecewisePolynomial:
     slower by the factor 1/2, 1/4 or 0 over the whole plan. The plan ends with psi' = 0.
     """
     path, limits, gravity = plan.whole, case.limits, case.gravity
-    step = jnp.sum(path.durations) / _KNOTS
-    times = step * jnp.asarray(np.arange(_KNOTS * _FINE + 1) / _FINE, step.dtype)
+    step = jnp.sum(path.durations) / KNOTS
+    times = step * jnp.asarray(np.arange(KNOTS * _FINE + 1) / _FINE, step.dtype)
     orders = range(1, 4 if limits.rotors is None else 5)
     flown = [jax.vmap(lambda t, k=k: evaluate(path, t, k))(times) for k in orders]
     load = add_drag(limits.air, flown[0], flown[1])
@@ -126,7 +127,7 @@ def plan_heading(plan: PyTree, case: PyTree) -> PiecewisePolynomial:
     square = (_SHARE * limits.body_rate) ** 2 - x * x - y * y
     spare = jnp.where(square > 0.0, jnp.sqrt(jnp.where(square > 0.0, square, 1.0)), 0.0)
     # The interval of psi' at every knot; linear between knots, psi' is then within it at all times.
-    within = np.arange(_KNOTS)[:, None] * _FINE + np.arange(_FINE + 1)[None]
+    within = np.arange(KNOTS)[:, None] * _FINE + np.arange(_FINE + 1)[None]
     room = jnp.stack([jnp.maximum(spare + twist, 0.0), jnp.maximum(spare - twist, 0.0)])
     room = jnp.min(room[:, within], axis=2)  # of -psi' and of psi', in each piece
     room = jnp.concatenate([jnp.minimum(room[:, 1:], room[:, :-1]), room[:, -1:]], axis=1)
@@ -194,7 +195,7 @@ def _turn(
     gain = 1.0 / jnp.maximum(_LAG, 2.0 * step)  # for longer steps the recursion would oscillate
     rise = most * gain * step
     # Limits that are not yet in force leave the time to brake.
-    index = rise * jnp.asarray(np.arange(_KNOTS), step.dtype)[None]
+    index = rise * jnp.asarray(np.arange(KNOTS), step.dtype)[None]
     room = lax.cummin(jnp.minimum(room, most) + index, axis=1, reverse=True) - index
 
     def nearest(turn: Array) -> Array:
@@ -214,7 +215,7 @@ def _turn(
     (requests, weights), (angle, rate) = wanted, heading.start
     state = angle, rate, angle + weights[0] * nearest(requests[0] - angle), weights[0]
     _, coeffs = lax.scan(advance, state, (requests[1:], weights[1:], *room))
-    return PiecewisePolynomial(coeffs[..., None], jnp.broadcast_to(step, (_KNOTS,)))
+    return PiecewisePolynomial(coeffs[..., None], jnp.broadcast_to(step, (KNOTS,)))
 
 
 _of_batch = jax.jit(jax.vmap(plan_heading))

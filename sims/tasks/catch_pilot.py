@@ -13,6 +13,7 @@ from planner_jax.ball.prediction import PathTable, predict_path
 from planner_jax.core.protocol import is_better
 from planner_jax.optimise.settings import LbfgsConfig, Round
 from planner_jax.planning.replan import Replanning
+from planner_jax.robot.heading import continue_heading
 from planner_jax.sims.loop_state import Outlook, shapes_of_plans
 from planner_jax.sims.scoring import passage
 from planner_jax.task.arguments import find_decision
@@ -109,7 +110,7 @@ class CatchPilot:
         return plan, good & (plan.violation <= jnp.maximum(excess, asked.previous.violation))
 
     def _decide_again(self, asked: Replanning[CatchCase, CatchPlan]) -> CatchPlan:
-        left = asked.case
+        left = continue_heading(asked.case, asked.previous, asked.elapsed)
         choices = find_decision(DECISIONS, self.decide, TRAINED).propose(left)
         choice = jax.tree.map(lambda leaf: leaf[0], choices)
         planner, case = self.planner.planner, left.with_choice(choice)

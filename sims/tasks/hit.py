@@ -20,7 +20,14 @@ from planner_jax.planning.replan import Replanning
 from planner_jax.robot.quadrotor_model import PAPER_HITTER, QuadrotorModel
 from planner_jax.runs.columns import BOOL, NUMBER, VECTOR, Column
 from planner_jax.runs.summary import percent
-from planner_jax.sims.launch import flight_keys, launch_ball, ready, require_plan, require_world
+from planner_jax.sims.launch import (
+    flight_keys,
+    launch_ball,
+    ready,
+    require_plan,
+    require_world,
+    turn_robots,
+)
 from planner_jax.sims.loop import begin_compiling, fly_leg, predict_balls
 from planner_jax.sims.loop_state import (
     FlightState,
@@ -256,7 +263,7 @@ def fly_hits(
     truth = jax.tree.map(jnp.asarray, truth)
     keys = flight_keys(seed, cases.index)
     drag = truth.drag[:, None]
-    flight = ready(loop, truth.head_state[:, 0], keys)
+    flight = turn_robots(ready(loop, truth.head_state[:, 0], keys), truth.heading)
     compiled = begin_compiling(loop, pilot, flight, truth, drag)
     balls = jax.tree.map(lambda leaf: leaf[:, None], truth.ball)
     guess = jnp.asarray(cases.believed)[:, None]

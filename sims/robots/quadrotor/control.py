@@ -1,8 +1,8 @@
 """Cascaded SE(3) control by differential flatness and the Hopf fibration.
 
 The cascade follows [Yu2023bat, Section VI-C] and [Yu2023catch, Section VII-A]. Feedback of position
-and velocity, with the plan's acceleration and jerk as feedforward, gives the desired thrust. With
-the heading zero, thrust and jerk determine the desired attitude and body rate [Watterson2020]. The
+and velocity, with the plan's acceleration and jerk as feedforward, gives the desired thrust. The
+thrust, the jerk and the heading determine the desired attitude and body rate [Watterson2020]. The
 attitude error corrects the body rate. The error of the body rate gives a torque. Feedforward
 commands are taken from ahead in time, to compensate the rotors' lag.
 
@@ -94,7 +94,7 @@ def control(
     back *= jnp.minimum(most / jnp.sqrt(jnp.maximum(jnp.sum(back**2), 1e-6)), 1.0)
     acc = load + back
     jerk = load_jerk + gains.position * faster
-    R_wanted, rate_wanted = flat_attitude(acc, jerk, gravity)
+    R_wanted, rate_wanted = flat_attitude(acc, jerk, gravity, reference.yaw)
     pull = net_thrust(acc, gravity)
     thrust = model.mass * (jnp.sum(pull * R[:, 2]) + reference.thrust_lead)
     stiffness = jnp.array([gains.attitude, gains.attitude, gains.heading], acc.dtype)

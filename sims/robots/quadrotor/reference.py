@@ -8,7 +8,7 @@ import numpy as np
 from flax import struct
 from jax import Array, lax
 
-from planner_jax.robot.attitude import flat_attitude
+from planner_jax.robot.attitude import flat_attitude, yaw_at
 from planner_jax.robot.quadrotor import Air, add_drag, add_drag_rate, net_thrust, thrust_in_air
 from planner_jax.sims.model import World
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
@@ -34,6 +34,7 @@ class Reference:
     # drag and wind; None without drag, where they are `acc` and `jerk`.
     load: Array | None = None
     load_jerk: Array | None = None
+    yaw: Array | None = None  # (2,) [rad], [rad/s], heading and its derivative; None: 0
 
 
 def with_rest(trajectory: PiecewisePolynomial) -> PiecewisePolynomial:
@@ -73,12 +74,17 @@ def with_rest(trajectory: PiecewisePolynomial) -> PiecewisePolynomial:
 
 
 def reference_at(
-    trajectory: PiecewisePolynomial, time: Array, lag: float, world: World, air: Air | None = None
+    trajectory: PiecewisePolynomial,
+    time: Array,
+    lag: float,
+    world: World,
+    air: Air | None = None,
+    heading: PiecewisePolynomial | None = None,
 ) -> Reference:
     """Return the planned motion at a time () [s], with additions to the planned commands.
 
     The additions compensate a first-order lag of the rotors with the time constant `lag` [s]. The
-    commands balance the drag and wind that the plan knows as `air`.
+    commands balance the drag and wind that the plan knows as `air`, and follow its `heading`.
     """
     gravity = jnp.asarray(world.gravity, time.dtype)
     order = lambda k, at: evaluate(trajectory, at, k)  # noqa: E731
@@ -91,14 +97,15 @@ def reference_at(
 
     def flat(at: Array) -> tuple[Array, Array]:
         acc_then, jerk_then = order(2, at), order(3, at)
+        turn = None if heading is None else yaw_at(heading, at)
         if air is None:
             size = jnp.sqrt(jnp.sum(net_thrust(acc_then, gravity) ** 2))
-            return size, flat_attitude(acc_then, jerk_then, gravity)[1]
+            return size, flat_attitude(acc_then, jerk_then, gravity, turn)[1]
         vel_then = order(1, at)
         load = add_drag(air, vel_then, acc_then)
         jerk_then = add_drag_rate(air, acc_then, jerk_then)
         size = thrust_in_air(air, vel_then, load, gravity)
-        return size, flat_attitude(load, jerk_then, gravity)[1]
+        return size, flat_attitude(load, jerk_then, gravity, turn)[1]
 
     (less, before), (size, rate), (more, after) = (flat(ahead + k * step) for k in (-1, 0, 1))
     # To invert a first-order lag, `lag` times the rate of change is added to the desired value.
@@ -117,4 +124,5 @@ def reference_at(
         torque_lead=lag * angular_jerk,
         load=None if air is None else load,
         load_jerk=None if air is None else add_drag_rate(air, acc, jerk),
+        yaw=None if heading is None else yaw_at(heading, time),
     )
