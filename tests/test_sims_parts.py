@@ -22,8 +22,8 @@ from planner_jax.sims.loop_state import Loop, shapes_of_plans
 from planner_jax.sims.model import BALL_MASS, at_rest, mujoco_model, place_balls, step
 from planner_jax.sims.noise import NOISES, Sensing
 from planner_jax.sims.robots.quadrotor.allocation import rotor_thrusts
-from planner_jax.sims.robots.quadrotor.control import Gains, rotation_error
-from planner_jax.sims.robots.quadrotor.reference import with_rest
+from planner_jax.sims.robots.quadrotor.control import Gains, RobotState, control, rotation_error
+from planner_jax.sims.robots.quadrotor.reference import Reference, with_rest
 from planner_jax.sims.robots.quadrotor.robot import Quadrotor
 from planner_jax.sims.scenery import machine_parts, outlines
 from planner_jax.sims.scoring import Moment, nearest, no_contact, passage
@@ -75,6 +75,27 @@ def test_a_torque_raises_a_weak_thrust_by_at_most_the_spare_thrust():
     thrust, roll = (ROTORS.allocation @ found)[:2]
     assert 0.0 < roll < 2.0
     np.testing.assert_allclose(thrust, 1.0 + 4.0 * SPARE, rtol=1e-5)
+
+
+@pytest.mark.parametrize("part", [0, 1], ids=["angular_acc", "torque_lead"])
+def test_a_jump_of_the_planned_angular_acceleration_is_followed_only_up_to_the_bound(part):
+    still = jnp.zeros(3)
+    robot = RobotState(still, still, jnp.array([1.0, 0.0, 0.0, 0.0]), still)
+    exact = dataclasses.replace(CATCH_WORLD, timestep=1e-9)
+    robot_model, most = CATCH_WORLD.robot.model, Gains().feedforward[part]
+
+    def torque(size):
+        jumps = [still, still]
+        jumps[part] = jnp.array([size, 0.0, 0.0])
+        reference = Reference(still, still, still, still, jnp.zeros(()), *jumps)
+        return ROTORS.allocation @ np.asarray(
+            control(robot, reference, robot_model, Gains(), exact)
+        )
+
+    turning = robot_model.inertia[0] * most
+    weight = 9.81 * robot_model.mass
+    np.testing.assert_allclose(torque(0.5 * most), [weight, 0.5 * turning, 0, 0], atol=1e-4)
+    np.testing.assert_allclose(torque(30.0 * most), [weight, turning, 0, 0], atol=1e-4)
 
 
 @rotors_of_either

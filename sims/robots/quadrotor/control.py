@@ -40,6 +40,10 @@ class Gains:
     rate: float = 32.0  # [1/s], angular acceleration per body rate error
     share: float = 0.3  # greatest feedback acceleration, as a fraction of the plan's thrust
     correction: float = 10.0  # [rad/s], greatest body rate that corrects an attitude error
+    # [rad/s^2], greatest feedforward of the plan's angular acceleration, and of the addition that
+    # compensates the rotors' lag. The snap of a plan jumps when the plan is replaced. The planned
+    # angular acceleration is then far greater than rotors can follow, above all at weak thrust.
+    feedforward: tuple[float, float] = (100.0, 50.0)
     # Greatest increase of a rotor's thrust that serves to produce a torque, divided by the rotor's
     # greatest thrust. The increase is 1 N for the quadrotors of [Yu2023bat] and [Yu2023catch].
     spare: float = 1.0 / 11.8
@@ -104,7 +108,10 @@ def control(
     back = jnp.clip(stiffness * rotation_error(R, R_wanted), -gains.correction, gains.correction)
     rate = turn - half * reference.angular_acc + back
     inertia = jnp.asarray(model.inertia_matrix, acc.dtype)
-    angular_acc = reference.angular_acc + reference.torque_lead
+    planned = jnp.stack([reference.angular_acc, reference.torque_lead])
+    most = jnp.asarray(gains.feedforward, acc.dtype)
+    size = jnp.sqrt(jnp.maximum(jnp.sum(planned**2, axis=1), 1e-6))
+    angular_acc = jnp.sum(planned * jnp.minimum(most / size, 1.0)[:, None], axis=0)
     angular_acc += gains.rate * (rate - state.rate)
     spin = jnp.matmul(inertia, state.rate, precision=highest)
     torque = jnp.matmul(inertia, angular_acc, precision=highest) + jnp.cross(state.rate, spin)
