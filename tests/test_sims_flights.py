@@ -155,6 +155,25 @@ def test_the_next_ball_is_given_up_only_where_no_limits_admit_both(
     assert plans.violation[0] == (pair if chosen[0] else alone)[chosen[1]]
 
 
+@pytest.mark.parametrize(("violation", "share"), [(-0.1, 0.5), (0.3, 1.0)], ids=["slow", "fast"])
+def test_a_single_ball_is_caught_at_half_speed_where_such_a_plan_exists(
+    monkeypatch, violation, share
+):
+    both = jax.tree.map(np.asarray, pj.catch.draw(1, "parabola2", seed=4))
+    full = both.limits.speed[0].item()
+
+    def fake_plan_all(_, cases):
+        single = -0.1 if cases.limits.speed[0] > 0.6 * full else violation
+        found = 0.3 if cases.present.all() else single
+        status = Status.CONVERGED if found <= 0.0 else Status.INFEASIBLE
+        return Outcome(np.array([status]), np.array([found]))
+
+    monkeypatch.setattr(catch_ahead, "plan_all", fake_plan_all)
+    known, plans = plan_ahead(pj.catch.planner(), within(both, WIDER[0]), 0, WIDER)
+    assert not known.present.all() and plans.violation[0] == -0.1
+    np.testing.assert_allclose(known.limits.speed, share * full)
+
+
 def in_lab(num_balls):
     world = dataclasses.replace(CATCH_WORLD, num_balls=num_balls)
     return Loop(world, NOISES["lab"], replan=100.0)

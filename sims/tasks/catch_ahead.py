@@ -35,6 +35,9 @@ _AIM = 0.4
 # first catch use the first pair, so that the next plan can start within its limits. Plans of later
 # catches use the second pair. If no plan satisfies a pair, the next pair is used.
 LIMITS = ((2.0 / 7.0, 0.6), (1.0 / 7.0, 0.9), (0.0, 1.0))
+# Fraction of the robot's speed limit for plans of a single catch, if there is such a plan. The
+# earliest catch of a high ball is often at full speed upwards, out of reach of the next ball.
+_GENTLE = 0.5
 
 
 @functools.partial(jax.jit, static_argnames="loop", compiler_options=QUICK_OPTIONS)
@@ -186,8 +189,9 @@ def plan_ahead(
 
     If no plan for both balls is solved, both balls are planned again with wider limits of thrust
     and body rate, since after a plan for the first ball alone the next ball may be out of reach. If
-    a plan still violates a limit by more than 10 %, the first ball is planned alone. If no plan for
-    this ball is solved, the plan with the least violation is returned.
+    a plan still violates a limit by more than 10 %, the first ball is planned alone, at first
+    with half of the speed limit. If no plan for this ball is solved, the plan with the least
+    violation is returned.
 
     Args:
         planner: planner of catches, which also decides their order.
@@ -204,7 +208,8 @@ def plan_ahead(
     wider = limits[1 if ball == 0 else 2 :]
     tries: list[tuple[np.ndarray, dict[str, Any] | None]] = [(both, each) for each in wider]
     if ball < known.num_targets - 1:
-        tries += [(alone, each) for each in (None, *wider)]
+        slow = {"speed": _GENTLE * known.limits.speed[0].item()}
+        tries += [(alone, each) for each in (slow, None, *wider)]
     cases, plans = known, plan_all(planner, known)
     for balls, wide in tries:
         tried = known.present & balls
@@ -231,7 +236,7 @@ def plan_ahead(
 
 
 def within(cases: CatchCase, limits: dict[str, Any] | None) -> CatchCase:
-    """Replace the cases' limits of least thrust and body rate by `limits`, unless it is None."""
+    """Replace limits of the cases by `limits`, numbers by name, unless it is None."""
     if limits is None:
         return cases
     leaves = {
