@@ -10,7 +10,7 @@ import pytest
 from derivatives import assert_gradient_matches_differences
 
 import planner_jax as pj
-from planner_jax.ball.flight import BallState, drag_free_flight, fly, racket_impact
+from planner_jax.ball.flight import BallState, drag_free_flight, fly
 from planner_jax.baselines.hit.bat import BatHit, serve_origin, transition_point
 from planner_jax.baselines.hit.decoupled import aim_at_angle, solve_decoupled_hit
 from planner_jax.baselines.hit.juggle import JuggleHit
@@ -18,6 +18,7 @@ from planner_jax.baselines.parts.minimum_jerk import minimum_jerk, minimum_jerk_
 from planner_jax.core.protocol import Status, is_solved
 from planner_jax.planning.plan import plan
 from planner_jax.referee.hit import referee_hits
+from planner_jax.sims.tasks.hit import racket_impact
 from planner_jax.task.hit import court
 from planner_jax.task.hit.spec import TASK
 from planner_jax.task.hit.suites import generate_serves, to_cases

@@ -50,13 +50,13 @@ def _aim(displacement: Array, flight_time: Array, drag: Array, gravity: Array) -
 
         vel, _ = near
         slope, end = jax.jacfwd(landing, has_aux=True)(vel)
-        return vel - _solve3(slope, end - displacement), slope
+        return vel - solve3(slope, end - displacement), slope
 
     start = aim_drag_free(jnp.zeros_like(displacement), displacement, flight_time, gravity)
     vel, slope = lax.fori_loop(0, 2, newton_step, (start, jnp.eye(3, dtype=start.dtype)))
 
     def chord_step(_: Array, vel: Array) -> Array:
-        return vel - _solve3(slope, _displacement(vel, flight_time, drag, gravity) - displacement)
+        return vel - solve3(slope, _displacement(vel, flight_time, drag, gravity) - displacement)
 
     return lax.fori_loop(0, 2, chord_step, vel)
 
@@ -70,7 +70,7 @@ def _aim_jvp(primals: Sequence[Array], tangents: Sequence[Tangent]) -> tuple[Arr
     changes = [-slope * others[k] for k, slope in zip(moving, slopes, strict=True)]
     if not isinstance(by_displacement, SymbolicZero):
         changes.append(by_displacement)
-    return vel, _solve3(by_vel, sum(changes[1:], changes[0]))
+    return vel, solve3(by_vel, sum(changes[1:], changes[0]))
 
 
 def _changing(tangents: Sequence[Tangent]) -> list[int]:
@@ -87,7 +87,7 @@ def _displacement(
     return fly(ball, flight_time, drag, gravity, num_steps=num_steps)[0].pos
 
 
-def _solve3(matrix: Array, rhs: Array) -> Array:
+def solve3(matrix: Array, rhs: Array) -> Array:
     """Solve a 3 x 3 linear system by Cramer's rule, so that a batch needs no LAPACK calls."""
     a, b, c = matrix[:, 0], matrix[:, 1], matrix[:, 2]
     bc, ca, ab = jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)

@@ -1,4 +1,4 @@
-"""Ball flight with quadratic drag [Yu2023bat, eq. 2] or linear drag, and impacts on a racket.
+"""Ball flight with quadratic drag [Yu2023bat, eq. 2] or linear drag, and solved impacts.
 
 World frame, z up, SI units. Functions take one ball; use `jax.vmap` for many. Positions and
 velocities are (3,) [m] and [m/s], durations () [s], `gravity` () is a magnitude [m/s^2], and `drag`
@@ -65,14 +65,16 @@ def ball_acceleration(vel: Vector, drag: Array, gravity: Array) -> Vector:
     return acc
 
 
-def rk4_step(ball: BallState, duration: Array, drag: Array, gravity: Array) -> BallState:
+def rk4_step(
+    ball: BallState, duration: Array, drag: Array, gravity: Array, acceleration=ball_acceleration
+) -> BallState:
     """Return the ball after a time `duration` [s], by one Runge-Kutta step of order 4.
 
     The drag is quadratic. A negative duration goes back in time.
     """
 
     def rate(state: BallState) -> BallState:
-        slopes: PyTree = ball_acceleration(state.vel, drag, gravity)
+        slopes: PyTree = acceleration(state.vel, drag, gravity)
         return BallState(pos=state.vel, vel=slopes)
 
     def ahead(slope: BallState, step: Array) -> BallState:
@@ -172,21 +174,6 @@ def drag_free_fall_time(ball: BallState, height: Array, gravity: Array) -> tuple
     time = (ball.vel[2] + jnp.sqrt(jnp.where(real, discriminant, 1.0))) / gravity
     reached = real & (time > 0.0)
     return jnp.where(reached, time, 0.0), reached
-
-
-def racket_impact(ball_vel: Array, racket_vel: Array, normal: Array, restitution: Array) -> Array:
-    """Return a ball's velocity v+ (3,) [m/s] after its bounce from a racket.
-
-    v+ = v- - (1 + beta) ((v- - u) . z) z, so that the tangential velocity is unchanged. [Yu2023bat,
-    eq. 3] prints (1 - beta), but its beta is the coefficient of restitution, which needs the plus.
-
-    Args:
-        ball_vel: v- (3,) [m/s], velocity of the ball before the bounce.
-        racket_vel: u (3,) [m/s], velocity of the racket.
-        normal: z (3,), unit normal of the racket.
-        restitution: beta (), coefficient of restitution, 0 to 1.
-    """
-    return ball_vel - (1.0 + restitution) * jnp.sum((ball_vel - racket_vel) * normal) * normal
 
 
 def solve_impact(ball_vel: Array, ball_vel_after: Array, restitution: Array) -> tuple[Array, Array]:

@@ -11,7 +11,9 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 from jax import Array, lax
+from jaxtyping import PyTree
 
+from planner_jax.ball.flight import BallState, ball_acceleration, rk4_step
 from planner_jax.core.arithmetic import at_least, components, reciprocal
 
 _LEAST_SPEED = 1e-3  # [m/s], smaller speeds count as this speed in divisions
@@ -47,35 +49,18 @@ def spin_acceleration(ball: SpinningBall, air: Surroundings) -> Array:
     return jnp.stack(_rate(components(ball.vel), ball, air))
 
 
-def _rate(vel: Sequence[Array], ball: SpinningBall, air: Surroundings) -> list[Array]:
-    u, lift = [v - w for v, w in zip(vel, air.wind, strict=True)], components(ball.lift)
-    squared = u[0] * u[0] + u[1] * u[1] + u[2] * u[2]
-    moving = squared > 0.0
-    # sqrt has no finite gradient at zero. The inner `where` replaces a zero argument by 1.
-    braking = jnp.where(moving, ball.drag * jnp.sqrt(jnp.where(moving, squared, 1.0)), 0.0)
-    fall = (0.0, 0.0, -air.gravity)
-    return [
-        fall[k] - braking * u[k] + lift[k - 2] * u[k - 1] - lift[k - 1] * u[k - 2] for k in range(3)
-    ]
+def _rate(vel: Sequence[Array], ball: SpinningBall, air: Surroundings) -> PyTree:
+    u: PyTree = tuple(v - w for v, w in zip(vel, air.wind, strict=True))
+    acc, lift = ball_acceleration(u, ball.drag, air.gravity), components(ball.lift)
+    return tuple(acc[k] + lift[k - 2] * u[k - 1] - lift[k - 1] * u[k - 2] for k in range(3))
 
 
 def spin_step(ball: SpinningBall, duration: Array, air: Surroundings) -> SpinningBall:
     """Return the ball after `duration` [s] without a bounce, by one Runge-Kutta step of order 4."""
-    start, half = components(ball.vel), 0.5 * duration
-    vels, rates = [start], [_rate(start, ball, air)]
-    for step in (half, half, duration):
-        vels.append([v + step * a for v, a in zip(start, rates[-1], strict=True)])
-        rates.append(_rate(vels[-1], ball, air))
-    pos, vel = (
-        jnp.stack(
-            [
-                x + duration / 6.0 * (a + 2.0 * b + 2.0 * c + d)
-                for x, a, b, c, d in zip(components(old), *slopes, strict=True)
-            ]
-        )
-        for old, slopes in ((ball.pos, vels), (ball.vel, rates))
-    )
-    return SpinningBall(pos, vel, ball.drag, ball.lift)
+    pos, vel = (tuple(components(each)) for each in (ball.pos, ball.vel))
+    rate = lambda vel, *_: _rate(vel, ball, air)  # noqa: E731
+    end: PyTree = rk4_step(BallState(pos, vel), duration, ball.drag, air.gravity, rate)  # pyright: ignore[reportArgumentType]
+    return SpinningBall(jnp.stack(end.pos), jnp.stack(end.vel), ball.drag, ball.lift)
 
 
 def spin_bounce(ball: SpinningBall, air: Surroundings) -> SpinningBall:

@@ -35,6 +35,8 @@ _CASE_SHAPES = {
     **{"restitution": (), "racket_height": (), "racket_radius": ()},
     **{"hit_limits.hitting_speed": (3,), "hit_limits.min_apex": (), "hit_limits.max_apex": ()},
 }
+_SPIN_SHAPES = {"lift": (3,), "around.wind": (3,)}
+_SPIN_SHAPES |= {"around.friction": (), "around.grip": (), "around.reach": ()}
 
 _INCOMING_STEPS = 60  # number of Runge-Kutta steps of the ball's flight up to the impact
 # [s] Step and greatest duration of the integrated flight of the ball after the impact.
@@ -102,6 +104,8 @@ def referee_hits(
     leaves = quadrotor.read_flight(cases, plans)
     leaves |= judging.read_leaves(cases, _CASE_SHAPES, len(leaves["lane"]))
     leaves |= judging.read_leaves(plans, {"stroke.time": ()}, len(leaves["lane"]))
+    if cases.lift is not None:
+        leaves |= judging.read_leaves(cases, _SPIN_SHAPES, len(leaves["lane"]))
     tolerances = {"relative": tolerance, "continuity": continuity_tolerance}
     tolerances |= {"landing": landing_tolerance, "contact": contact_tolerance}
     judge = functools.partial(
@@ -130,28 +134,29 @@ def _judge(
     return judging.first_failures(tests | impact_tests, LIMITS, finite) | measured | at_impact
 
 
-def _ball_acc(vel: np.ndarray, drag: np.ndarray, gravity: np.ndarray) -> np.ndarray:
-    """Return the accelerations g - K_D |v| v of balls with velocities v and drag K_D [1/m]."""
-    acc = -drag * np.sqrt((vel * vel).sum(axis=0)) * vel
-    acc[2] -= gravity
-    return acc
+def _ball_acc(vel: np.ndarray, air) -> np.ndarray:
+    """Return the accelerations g - K_D |u| u + l x u of balls with velocities v, and u = v - w.
+
+    `air` has the rows K_D and g; and, for spinning balls, three rows of l and of w.
+    """
+    u = vel - air[5:] if len(air) > 2 else vel
+    acc = -air[0] * np.sqrt((u * u).sum(axis=0)) * u
+    acc[2] -= air[1]
+    return acc + np.cross(air[2:5], u, axis=0) if len(air) > 2 else acc
 
 
-def _ball_step(state, step: np.ndarray, drag, gravity) -> np.ndarray:
-    half, sixth, vel = 0.5 * step, step / 6.0, state[3:]
-    acc_1 = _ball_acc(vel, drag, gravity)
-    acc_2 = _ball_acc(vel + half * acc_1, drag, gravity)
-    acc_3 = _ball_acc(vel + half * acc_2, drag, gravity)
-    acc_4 = _ball_acc(vel + step * acc_3, drag, gravity)
-    middle = acc_2 + acc_3
-    change = acc_1 + middle
-    ahead = state.copy()
-    ahead[:3] += step * (vel + sixth * change)
-    ahead[3:] += sixth * (change + middle + acc_4)
-    return ahead
+def ball_step(state: np.ndarray, step: np.ndarray, air) -> np.ndarray:
+    """Return the states (6, ...) of balls after one Runge-Kutta step of order 4."""
+    half, vel = 0.5 * step, state[3:]
+    acc_1 = _ball_acc(vel, air)
+    acc_2 = _ball_acc(vel + half * acc_1, air)
+    acc_3 = _ball_acc(vel + half * acc_2, air)
+    acc_4 = _ball_acc(vel + step * acc_3, air)
+    pos = state[:3] + step * vel + step**2 / 6.0 * (acc_1 + acc_2 + acc_3)
+    return np.concatenate([pos, vel + step / 6.0 * (acc_1 + 2.0 * (acc_2 + acc_3) + acc_4)])
 
 
-def _step_down_to(state, entry: int, level, drag, gravity) -> tuple[np.ndarray, np.ndarray]:
+def _step_down_to(state, entry: int, level, air) -> tuple[np.ndarray, np.ndarray]:
     """Find the time (B,) [s] within a step at which height or vertical speed falls to `level`.
 
     `entry` is 2 for the height and 5 for the vertical speed in the states (6, B) of B balls. Also
@@ -160,14 +165,14 @@ def _step_down_to(state, entry: int, level, drag, gravity) -> tuple[np.ndarray, 
     """
     step = np.full(state.shape[1], _OUTGOING_STEP)
     for _ in range(6):
-        ahead = _ball_step(state, step, drag, gravity)
-        slope = np.concatenate([ahead[3:], _ball_acc(ahead[3:], drag, gravity)])[entry]
+        ahead = ball_step(state, step, air)
+        slope = np.concatenate([ahead[3:], _ball_acc(ahead[3:], air)])[entry]
         step = np.clip(step - (ahead[entry] - level) / slope, 0.0, _OUTGOING_STEP)
-    return step, _ball_step(state, step, drag, gravity)
+    return step, ball_step(state, step, air)
 
 
-def _return_in_air(state, height, drag, gravity) -> tuple:
-    """Integrate the flights of B balls with quadratic drag until they fall to `height` (B,) [m].
+def _return_in_air(state, height, air) -> tuple:
+    """Integrate the flights of B balls in `air` until they fall to `height` (B,) [m].
 
     Returns the greatest heights (B,) [m] and their times, and the points (3, B) at which the balls
     fall to `height` and their times. Times [s] count from `state`, the start of the flights.
@@ -178,7 +183,7 @@ def _return_in_air(state, height, drag, gravity) -> tuple:
     for i in range(round(_LONGEST_FLIGHT / _OUTGOING_STEP)):
         now = state[:, flying]
         step = np.full(len(flying), _OUTGOING_STEP)
-        ahead = _ball_step(now, step, drag[flying], gravity[flying])
+        ahead = ball_step(now, step, air[:, flying])
         rising = now[5] > 0.0
         before_top[:, flying[rising]] = now[:, rising]
         top_time[flying[rising]] = i * _OUTGOING_STEP
@@ -188,11 +193,11 @@ def _return_in_air(state, height, drag, gravity) -> tuple:
         flying = flying[aloft & np.isfinite(ahead[2])]
         if not flying.size:
             break
-    step, top = _step_down_to(before_top, 5, 0.0, drag, gravity)
+    step, top = _step_down_to(before_top, 5, 0.0, air)
     rises = before_top[5] > 0.0
     apex = np.where(rises, top[2], before_top[2])
     apex_time = np.where(rises, top_time + step, 0.0)
-    step, end = _step_down_to(before_end, 2, height, drag, gravity)
+    step, end = _step_down_to(before_end, 2, height, air)
     down = apex >= height
     down[flying] = False
     landing = np.where(down, end[:3], np.nan)
@@ -212,28 +217,34 @@ def _return_in_vacuum(state, height, gravity) -> tuple:
 
 
 def _judge_impact(case: dict, drag_after_impact: bool, tolerances: dict) -> tuple[dict, dict]:
-    durations, drag, gravity = case["durations"], case["drag"], case["gravity"]
-    end = durations.sum(axis=1)
+    durations, end = case["durations"], case["durations"].sum(axis=1)
+    air, spins = np.stack([case["drag"], case["gravity"]]), "lift" in case
+    if spins:
+        air = np.concatenate([air, case["lift"].T, case["around.wind"].T])
     state = np.concatenate([case["ball.pos"].T, case["ball.vel"].T])
     for _ in range(_INCOMING_STEPS):
-        state = _ball_step(state, end / _INCOMING_STEPS, drag, gravity)
+        state = ball_step(state, end / _INCOMING_STEPS, air)
     tail = case["coeffs"][:, -1].transpose(1, 2, 0)
     pos, vel, normal = (judging.derivative(tail, durations[:, -1], order) for order in range(3))
     if "limits.air.drag" in case:  # the thrust is along a + g e_3 + d (v - w)
         normal += case["limits.air.drag"] * (vel - case["limits.air.wind"].T)
-    normal[2] += gravity
+    normal[2] += case["gravity"]
     # Without thrust the racket's normal is set to zero. The ball's speed along it is 0, and the
     # plan fails the test "wrong face", which requires a negative speed.
     normal /= np.maximum(np.linalg.norm(normal, axis=0), np.finfo(float).tiny)
     racket = pos + case["racket_height"] * normal
     approach = ((state[3:] - vel) * normal).sum(axis=0)
     after = state.copy()
-    after[3:] -= (1.0 + case["restitution"]) * approach * normal
+    push = -(1.0 + case["restitution"]) * approach
+    after[3:] += push * normal
+    if spins:
+        rub, air[2:5] = _rub(case, state[3:] - vel, normal, push)
+        after[3:] += rub
     target = case["target"].T
-    if drag_after_impact:
-        returned = _return_in_air(after, target[2], drag, gravity)
+    if drag_after_impact or spins:
+        returned = _return_in_air(after, target[2], air)
     else:
-        returned = _return_in_vacuum(after, target[2], gravity)
+        returned = _return_in_vacuum(after, target[2], case["gravity"])
     apex, apex_time, landing, flight_time = returned
     miss = np.linalg.norm(landing[:2] - target[:2], axis=0)
     measured = {
@@ -249,6 +260,18 @@ def _judge_impact(case: dict, drag_after_impact: bool, tolerances: dict) -> tupl
     tests["wrong face"] = (approach >= 0.0, approach, end)
     tests["contact time"] = _contact_time(case, end, state)
     return measured, tests
+
+
+def _rub(case: dict, vel: np.ndarray, normal: np.ndarray, push: np.ndarray) -> tuple:
+    """Return the velocity (3, B) [m/s] that friction adds, and the lift vector after the impact.
+
+    `vel` is relative to the racket. The impact adds the velocity `push` along the `normal`.
+    """
+    lift, reach, grip = case["lift"].T, case["around.reach"], case["around.grip"]
+    slip = vel - (vel * normal).sum(axis=0) * normal - reach * np.cross(lift, normal, axis=0)
+    size = np.maximum(np.linalg.norm(slip, axis=0), 1e-12)
+    rub = -np.minimum(case["around.friction"] * push / size, grip) * slip
+    return rub, lift + (1.0 / grip - 1.0) / reach * np.cross(rub, normal, axis=0)
 
 
 def _impact_tests(case, measured, tolerances, end, apex_at, landing_at) -> dict:

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from planner_jax.ball.flight import BallState, racket_impact
+from planner_jax.ball.flight import BallState
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.planner import Planner
 from planner_jax.optimise.settings import LbfgsConfig, Round
@@ -211,6 +211,21 @@ class HitFlights(Flights):
         return self.miss <= _NEAR
 
 
+def racket_impact(ball_vel: Array, racket_vel: Array, normal: Array, restitution: Array) -> Array:
+    """Return a ball's velocity v+ (3,) [m/s] after its bounce from a racket.
+
+    v+ = v- - (1 + beta) ((v- - u) . z) z, so that the tangential velocity is unchanged. [Yu2023bat,
+    eq. 3] prints (1 - beta), but its beta is the coefficient of restitution, which needs the plus.
+
+    Args:
+        ball_vel: v- (3,) [m/s], velocity of the ball before the bounce.
+        racket_vel: u (3,) [m/s], velocity of the racket.
+        normal: z (3,), unit normal of the racket.
+        restitution: beta (), coefficient of restitution, 0 to 1.
+    """
+    return ball_vel - (1.0 + restitution) * jnp.sum((ball_vel - racket_vel) * normal) * normal
+
+
 def reflect_ball(contact: Contact, restitution: Array) -> BallState:
     """Return one ball just after its impact on the racket [Yu2023bat, eq. 3]."""
     vel = racket_impact(contact.ball_vel, contact.tool_vel, contact.normal, restitution)
@@ -260,6 +275,8 @@ def fly_hits(
     sizes = {name: getattr(truth, name) for name in ("gravity", "racket_height", "racket_radius")}
     known = {name: size for name, size in sizes.items() if size is not None}
     require_world(loop, "racket", 1, **known)
+    if truth.lift is not None:
+        raise ArgumentError("spin", "left out, as simulated balls do not spin", shown="a spin")
     truth = jax.tree.map(jnp.asarray, truth)
     keys = flight_keys(seed, cases.index)
     drag = truth.drag[:, None]

@@ -4,6 +4,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from planner_jax.ball.flight import BallState, drag_free_apex, gravity_vector
+from planner_jax.core.errors import ArgumentError
 from planner_jax.cost.quadrotor import (
     acceleration_excess,
     body_rate_excess,
@@ -41,6 +42,8 @@ def make_impact(
     Returns:
         The impact, with the racket's centre at the ball and zero jerk of the quadrotor.
     """
+    if case.lift is not None:
+        raise ArgumentError("spin", "left out, except for the planner exact", shown="a spin")
     normal = thrust / jnp.sqrt(jnp.maximum(jnp.sum(thrust**2), 1e-6))
     tail_state = jnp.stack(
         [

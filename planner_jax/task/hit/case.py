@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jax import Array
+from jaxtyping import PyTree
 
 from planner_jax.ball.flight import BallState
 from planner_jax.core import GRAVITY, rules
@@ -32,6 +33,7 @@ RULES: Table = (
     Field("origin", (2,)),
     Field("target", (3,)),
     Field("drag", (), rules.NOT_NEGATIVE),
+    Field("lift", (3,)),
     Field("gravity", (), rules.POSITIVE),
     Field("restitution", (), rules.within(0.0, 1.0, "in [0, 1]")),
     Field("racket_height", ()),
@@ -82,6 +84,8 @@ class HitCase(Located):
     extras: tuple[Extra, ...] = ()  # the user's further constraints and costs
     racket_radius: Array | None = None  # () [m]; None: the contact's offset is not limited
     heading: "Heading | None" = None  # requested heading; None: 0
+    lift: Array | None = None  # (3,) [1/s], lift vector of the ball, None without spin
+    around: PyTree = None  # `Surroundings`: wind, and friction of ball and racket
 
     @property
     def batch_shape(self) -> tuple[int, ...]:
@@ -102,6 +106,9 @@ def case(
     heading=None,
     max_yaw_rate=None,
     drag=DRAG,
+    spin=None,
+    ball=None,
+    ball_radius=0.02,
     gravity=GRAVITY,
     restitution=None,
     racket_height=None,
@@ -140,6 +147,10 @@ def case(
         max_yaw_rate: [rad/s], greatest derivative of a requested heading, by default 2.
         drag: [1/m], coefficient K_D of quadratic drag. The drag and every following number is one
             value for all cases, or one value for each case.
+        spin: (3,) or (..., 3) [rad/s], spin of the ball at time 0, in world axes. With a spin the
+            racket has friction, and flights before and after the impact have drag and lift.
+        ball: a `pj.ball.Ball` with friction, grip, and reach; by default of table tennis.
+        ball_radius: [m], for a ball with spin.
         gravity: [m/s^2], magnitude.
         restitution: coefficient of restitution beta of the racket.
         racket_height: [m], height of the racket's centre above the propeller plane.
@@ -152,7 +163,8 @@ def case(
         min_height: [m], least height of the propeller plane.
         rotor_drag: [1/s], linear drag of the quadrotor per unit mass: one number, or two numbers
             (..., 2) across and along the thrust; by default the robot's, or none.
-        wind: (3,) or (..., 3) [m/s], velocity of the air; it acts by the drag.
+        wind: (3,) or (..., 3) [m/s], velocity of the air; it acts by the drag, and on balls that
+            have a `spin`.
         hitting_speed: (3,) [m/s], greatest speed of the quadrotor at the impact on each axis.
         min_apex: [m], least apex of the returned ball.
         max_apex: [m], greatest apex of the returned ball.
@@ -203,6 +215,10 @@ def case(
         origin=None if shift is None else leaf("origin", shift, 2),
     )
     cases = quadrotor.add_heading(cases, leaf, heading, max_yaw_rate, start_attitude)
+    if spin is not None:
+        from planner_jax.task.hit.spin import with_spin  # few balls have a known spin
+
+        cases = with_spin(cases, spin, ball_radius, ball, (0.0, 0.0, 0.0) if wind is None else wind)
     require_sound(cases, _ARGUMENTS)
     quadrotor.require_start(cases)
     height = np.asarray(cases.ball.pos)[..., 2]

@@ -32,7 +32,12 @@ def prepare_hit(case: HitCase, num_nodes: int) -> HitContext:
     """
     fall, _ = drag_free_fall_time(case.ball, jnp.zeros_like(case.drag), case.gravity)
     horizon = lax.stop_gradient(jnp.maximum(1.1 * fall, _SHORTEST))
-    path = predict_path(case.ball, horizon, case.drag, case.gravity, num_nodes=num_nodes)
+    if case.lift is None:
+        path = predict_path(case.ball, horizon, case.drag, case.gravity, num_nodes=num_nodes)
+    else:
+        from planner_jax.task.hit.spin import predict_spin
+
+        path = predict_spin(case, num_nodes)
     node = jnp.maximum(jnp.sum(path.pos[1:, 2] > 0.0), 1)
     # Landing time: after the last tabulated time at which the ball is above the ground, its rate
     # of descent is assumed to be constant.

@@ -12,9 +12,9 @@ Flights are computed by NumPy in float64.
 """
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from planner_jax.core.rules import require_rule, require_sound
+from planner_jax.referee.hit import ball_step
 from planner_jax.task.hit.case import HitCase
 
 HALF_LENGTH = 5.0  # [m], from the net to a back line
@@ -59,45 +59,22 @@ def target_of(scenario) -> np.ndarray:
     return np.array(TARGETS)[scenario_regions(scenario)[..., 2] - 1]
 
 
-# In the functions below vectors are (3, ...): NumPy is fastest if the long axes come last.
-
-
-def _acceleration(velocity: np.ndarray, drag: np.ndarray, gravity: np.ndarray) -> np.ndarray:
-    """Return a ball's acceleration (3, ...) [m/s^2] by gravity and drag [Yu2023bat, eq. 2]."""
-    x, y, z = velocity
-    acceleration = -drag * np.sqrt(x * x + y * y + z * z) * velocity
-    acceleration[2] -= gravity
-    return acceleration
-
-
-def _rk4_step(position, velocity, step, drag, gravity):
-    half = 0.5 * step
-    a1 = _acceleration(velocity, drag, gravity)
-    a2 = _acceleration(velocity + half * a1, drag, gravity)
-    a3 = _acceleration(velocity + half * a2, drag, gravity)
-    a4 = _acceleration(velocity + step * a3, drag, gravity)
-    return (
-        position + step * velocity + step**2 / 6.0 * (a1 + a2 + a3),
-        velocity + step / 6.0 * (a1 + 2.0 * (a2 + a3) + a4),
-    )
-
-
-def _components_first(vectors: ArrayLike) -> np.ndarray:
-    return np.ascontiguousarray(np.moveaxis(np.asarray(vectors, float), -1, 0))
+def _states(position, velocity, shape: tuple[int, ...] = ()) -> np.ndarray:
+    """Return states (6, ...): NumPy is fastest if the long axes come last."""
+    both = np.asarray(position, float), np.asarray(velocity, float)
+    lead = np.broadcast_shapes(*(each.shape[:-1] for each in both), shape)
+    both = [np.broadcast_to(each, (*lead, 3)) for each in both]
+    return np.ascontiguousarray(np.moveaxis(np.concatenate(both, axis=-1), -1, 0))
 
 
 def fly(position, velocity, duration, drag, gravity, *, num_steps: int = _FLIGHT_STEPS):
     """Return balls' positions [m] and velocities (..., 3) after `duration` [s], quadratic drag."""
     step = np.asarray(duration, float) / num_steps
-    drag, gravity = np.asarray(drag, float), np.asarray(gravity, float)
-    position, velocity = np.asarray(position, float), np.asarray(velocity, float)
-    lead = np.broadcast_shapes(position.shape[:-1], velocity.shape[:-1], step.shape)
-    position, velocity = (
-        _components_first(np.broadcast_to(vector, (*lead, 3))) for vector in (position, velocity)
-    )
+    air = np.asarray(drag, float), np.asarray(gravity, float)
+    state = _states(position, velocity, step.shape)
     for _ in range(num_steps):
-        position, velocity = _rk4_step(position, velocity, step, drag, gravity)
-    return np.moveaxis(position, 0, -1), np.moveaxis(velocity, 0, -1)
+        state = ball_step(state, step, air)
+    return np.moveaxis(state[:3], 0, -1), np.moveaxis(state[3:], 0, -1)
 
 
 def landing(position, velocity, drag, gravity):
@@ -115,30 +92,28 @@ def landing(position, velocity, drag, gravity):
         time: (...) [s], NaN if no landing is found, as for extreme speeds or drags.
         point: (..., 3) [m], NaN if no landing is found.
     """
-    vectors = np.broadcast_arrays(np.asarray(position, float), velocity)
-    point, velocity = (_components_first(vector) for vector in vectors)
+    state = _states(position, velocity)
     drag, gravity = np.asarray(drag, float), np.asarray(gravity, float)
-    rise = velocity[2]
+    rise = state[5]
     with np.errstate(all="ignore"):
-        drag_free_time = (rise + np.sqrt(rise**2 + 2.0 * gravity * point[2])) / gravity
+        drag_free_time = (rise + np.sqrt(rise**2 + 2.0 * gravity * state[2])) / gravity
         # Drag changes the velocity within the time 1 / (drag * speed), so a step must be shorter.
-        stiffness = drag * np.linalg.norm(velocity, axis=0) * drag_free_time
+        stiffness = drag * np.linalg.norm(state[3:], axis=0) * drag_free_time
         num_steps = int(np.clip(8.0 * np.nanmax(stiffness, initial=0.0), _FLIGHT_STEPS, 1024))
         step = drag_free_time / num_steps
         time = np.zeros_like(step)
         for _ in range(8 * num_steps):
-            above = point[2] > 0.0
+            above = state[2] > 0.0
             if not above.any():
                 break
-            ahead = _rk4_step(point, velocity, step, drag, gravity)
-            point, velocity = np.where(above, ahead, (point, velocity))
+            state = np.where(above, ball_step(state, step, (drag, gravity)), state)
             time = time + np.where(above, step, 0.0)
         for _ in range(_NEWTON_STEPS):
-            back = -point[2] / velocity[2]
-            point, velocity = _rk4_step(point, velocity, back, drag, gravity)
+            back = -state[2] / state[5]
+            state = ball_step(state, back, (drag, gravity))
             time = time + back
-    down = np.abs(point[2]) < 1e-6
-    return np.where(down, time, np.nan), np.moveaxis(np.where(down, point, np.nan), 0, -1)
+    down = np.abs(state[2]) < 1e-6
+    return np.where(down, time, np.nan), np.moveaxis(np.where(down, state[:3], np.nan), 0, -1)
 
 
 def check_cases(cases: HitCase) -> None:

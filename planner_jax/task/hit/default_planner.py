@@ -302,15 +302,21 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
         case = context.case
         time, flight_time, thrust = jnp.exp(natural[0]), jnp.exp(natural[1]), jnp.exp(natural[2])
         ball = target_at(context.path, time)
-        if self.drag_after_impact:
-            after = aim_with_drag(ball.pos, case.target, flight_time, case.drag, case.gravity)
-            apex = apex_with_drag(BallState(ball.pos, after), flight_time, case.drag, case.gravity)
+        if case.lift is not None:
+            from planner_jax.task.hit.spin import meet_spin
+
+            normal, vel, after, apex = meet_spin(case, ball, flight_time, natural[3:5])
         else:
-            after = aim_drag_free(ball.pos, case.target, flight_time, case.gravity)
-            apex = drag_free_apex(BallState(ball.pos, after), case.gravity)
-        normal, normal_speed = solve_impact(ball.vel, after, case.restitution)
-        across_x, across_y = tangent_basis(normal)
-        vel = normal_speed * normal + natural[3] * across_x + natural[4] * across_y
+            if self.drag_after_impact:
+                numbers = flight_time, case.drag, case.gravity
+                after = aim_with_drag(ball.pos, case.target, *numbers)
+                apex = apex_with_drag(BallState(ball.pos, after), *numbers)
+            else:
+                after = aim_drag_free(ball.pos, case.target, flight_time, case.gravity)
+                apex = drag_free_apex(BallState(ball.pos, after), case.gravity)
+            normal, normal_speed = solve_impact(ball.vel, after, case.restitution)
+            across_x, across_y = tangent_basis(normal)
+            vel = normal_speed * normal + natural[3] * across_x + natural[4] * across_y
         acc = thrust * normal + gravity_vector(case.gravity)
         if (air := case.limits.air) is not None:  # the thrust is along a + g e_3 + d (v - w)
             acc = acc - air.drag * velocity_in_air(air, vel)
@@ -320,7 +326,7 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
 
     def rules_out(self, context: HitContext) -> Array:
         """Return whether the ball is provably never within the quadrotor's reach, () bool."""
-        return is_too_far(context)
+        return is_too_far(context) if context.case.lift is None else jnp.zeros((), bool)
 
     def make_plan(
         self,
