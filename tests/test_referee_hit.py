@@ -69,7 +69,7 @@ def volley(
 
 
 def judge(leaves, **options) -> HitVerdict:
-    plans = flight(leaves, racket_radius=None)
+    plans = flight(leaves, racket_radius=None, lift=None)
     return referee_hits(plans, plans, **options)
 
 

@@ -91,7 +91,7 @@ def test_the_rows_alone_lead_the_referee_to_the_same_verdict(finished):
         ("hit_limits.", ("hitting_speed", "min_apex", "max_apex")),
     ):
         leaves |= {part + name: np.tile(setting[name], (NUM, 1)).squeeze() for name in names}
-    found = flight(leaves, racket_radius=None)
+    found = flight(leaves, racket_radius=None, lift=None)
     verdict = referee_hits(found, found)
     np.testing.assert_array_equal(verdict.success, rows["success"])
     np.testing.assert_array_equal(verdict.failed_limit, rows["failed_limit"])
