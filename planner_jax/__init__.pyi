@@ -64,5 +64,6 @@ from .task import group as group
 from .task import hit as hit
 from .task import intercept as intercept
 from .task import reach as reach
+from .task import team as team
 from .trajectory.polynomial import PiecewisePolynomial as PiecewisePolynomial
 from .trajectory.polynomial import evaluate as evaluate

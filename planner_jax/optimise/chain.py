@@ -72,6 +72,7 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
     # Number of intervals of each piece, at whose ends a finished plan is checked: for a plan of one
     # segment, and of several segments, between which the body rate can have narrow peaks.
     decode_nodes: ClassVar[tuple[int, int]] = (32, 48)
+    stands: ClassVar[bool] = False  # whether the quadrotor stands still after the last segment
     proportions: tuple[float, ...] = (1.0,) * 6  # relative durations of a segment's pieces
     nodes: int = 8  # number of intervals of each piece, at whose ends penalties are evaluated
     time_weight: float = 0.005
@@ -212,15 +213,16 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
 
         For most quantities q the excess is q^2 / limit^2 - 1.
         """
-        case = context.case
+        case, moving = _split_moving(context.case)
         offsets, natural = self.split(point)
         rows, durations, core, at_ends = self.evaluate_ends(natural, context)
-        penalties, worst = integrate_along(
-            self.along(self.nodes, case),
-            jnp.concatenate([rows, offsets], axis=1),
-            durations,
-            (case.gravity, case.limits, case.extras),
-        )
+        along, columns = self.along(self.nodes, case), jnp.concatenate([rows, offsets], axis=1)
+        parameters = (case.gravity, case.limits, case.extras)
+        penalties, worst = integrate_along(along, columns, durations, parameters)
+        if moving:
+            lasting = jnp.where(self.active(context), durations, 0.0)
+            more, deepest = moving(along, columns, lasting, self.stands)
+            penalties, worst = penalties + more, jnp.maximum(worst, deepest)
         energies = jax.vmap(functools.partial(offset_energy, self.maps))(offsets, durations)
         energy = self.energy_weight * self._count(energies, context)
         worst = jnp.max(jnp.where(self.active(context), worst, -1.0))
@@ -234,7 +236,9 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
         # Imported here because only Newton's method needs this module.
         from planner_jax.optimise.chain_curvature import chain_curvature
 
-        case = context.case
+        case, moving = _split_moving(context.case)
+        if moving:
+            return super().curvature_at(point, context)
         offsets, natural = self.split(point)
         return chain_curvature(
             self.maps,
@@ -257,9 +261,22 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
         rows = chain_rows(context.case.head_state, ends.tail_states, durations)
         chain = Chain(rows=rows, offsets=offsets, piece_durations=durations)
         nodes = self.decode_nodes[len(natural) > 1]
-        greatest = greatest_excess(self.maps, nodes, chain.columns, durations, context.case)
+        case, moving = _split_moving(context.case)
         active = self.active(context)
+        greatest = greatest_excess(self.maps, nodes, chain.columns, durations, case)
+        if moving:
+            lasting = jnp.where(active, durations, 0.0)
+            of_moving = self.along(nodes, case), chain.columns, lasting, self.stands
+            greatest.append(moving(*of_moving)[1])
         along = [jnp.max(jnp.where(active, each, -1.0)) for each in greatest]
         at_ends = jnp.max(self.relative_excess(ends.excess))
         violation = functools.reduce(jnp.maximum, [*along, at_ends])
         return self.make_plan(chain_trajectory(self.maps, chain, active), ends, violation, context)
+
+
+def _split_moving(case: QuadrotorCase) -> tuple[QuadrotorCase, PyTree]:
+    if not case.extras:
+        return case, None
+    from planner_jax.cost.moving import split_moving  # few cases have extras
+
+    return split_moving(case)

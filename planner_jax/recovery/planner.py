@@ -51,6 +51,7 @@ class RecoveryPlanner(ChainPlanner[RecoveryCase, QuadrotorPlan]):
     num_end_variables = 4
     guess_table = _GUESSES
     decode_nodes = (40, 40)
+    stands = True
     proportions: tuple[float, ...] = (0.4, 0.8, 1.0, 1.0, 1.0)  # relative durations of the pieces
     to: str = "brake"  # where to stand still: "brake" anywhere, "home" at the case's `home`
     # The recovery starts where the preceding plan ends, which may be closer to a limit than the

@@ -13,6 +13,7 @@ from jaxtyping import PyTree
 from planner_jax.core.choices import RECOVERIES, require_one_of
 from planner_jax.core.planner import CaseT, Drive, Planner, PlannerAround, PlanT
 from planner_jax.core.protocol import Status, is_solved
+from planner_jax.cost.moving import MovingKeepOut
 from planner_jax.recovery.case import RecoveryCase, end_state
 from planner_jax.recovery.planner import RecoveryPlanner
 
@@ -81,12 +82,15 @@ def recovery_cases(cases: PyTree, plans: PyTree) -> RecoveryCase:
     states: PyTree = _end_states(plans.trajectory)
     if isinstance(plans.status, np.ndarray):
         states = np.asarray(states)
+    ends = plans.trajectory.durations.sum(axis=-1)
+    later = lambda x: x.later(ends) if isinstance(x, MovingKeepOut) else x  # noqa: E731
+    extras: PyTree = tuple(map(later, cases.extras))
     return RecoveryCase(
         head_state=states,
         home=cases.head_state[:, 0],
         gravity=cases.gravity,
         limits=cases.limits.of_recovery(states, cases.gravity),
-        extras=cases.extras,
+        extras=extras,
     )
 
 

@@ -4,3 +4,4 @@ from . import group as group
 from . import hit as hit
 from . import intercept as intercept
 from . import reach as reach
+from . import team as team

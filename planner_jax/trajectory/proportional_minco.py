@@ -333,8 +333,9 @@ def chain_trajectory(
     """Join N segments of M pieces each; the pieces of inactive segments have a duration of 0 s."""
     build = functools.partial(proportional_trajectory, maps)
     pieces = jax.vmap(build)(chain.rows, chain.offsets, chain.piece_durations)
-    ends = chain.rows[:, maps.order, :]  # positions at the ends of the segments
-    last = ends[jnp.maximum(jnp.sum(active) - 1, 0)]
+    # Positions at the start of the chain, and at the ends of its segments.
+    ends = jnp.concatenate([chain.rows[:1, 0], chain.rows[:, maps.order]])
+    last = ends[jnp.sum(active)]
     still = jnp.zeros_like(pieces.coeffs).at[:, :, 0].set(last)
     coeffs = jnp.where(active[:, None, None, None], pieces.coeffs, still)
     durations = jnp.where(active[:, None], pieces.durations, 0.0)

@@ -73,10 +73,15 @@ def judge(cases: CatchCase, plans: CatchPlan, **settings: object) -> CatchVerdic
     quantities. The settings are keyword arguments of `referee_catches`. `TypeError` is raised for
     cases of other tasks, `ValueError` for different batch shapes or invalid settings.
     """
-    known = (BallPath, HarmonicPath, PathTable)  # classes of targets that the referee computes
-    if isinstance(cases, CatchCase) and type(cases.targets) not in known:
-        settings = {"target_states": _states_by_class, **settings}
+    if isinstance(cases, CatchCase):
+        settings = {**target_setting(cases.targets), **settings}
     return judge_by(referee_catches, cases, plans, (CatchCase, CatchPlan), settings)
+
+
+def target_setting(targets: TargetPath) -> dict[str, object]:
+    """Return the setting by which the referee evaluates targets of a user's own class, or {}."""
+    known = (BallPath, HarmonicPath, PathTable)  # classes of targets that the referee computes
+    return {} if type(targets) in known else {"target_states": _states_by_class}
 
 
 def _states_by_class(

@@ -76,7 +76,9 @@ def in_several_lengths(case: CatchCase, choices: CatchChoice) -> CatchChoice:
 
 
 @struct.dataclass
-class _Partial:
+class Sequences:
+    """W sequences of equally many catches of the N targets of one case, as a search finds them."""
+
     rank: Array  # (W,) [s], the least is best; infinite in rows that hold no sequence
     short: Array  # (W,) [m], sum of the distances by which targets are missed
     time: Array  # (W,) [s], of the last catch
@@ -85,14 +87,29 @@ class _Partial:
     times: Array  # (W, N) [s], of the catch of each target in the sequence
 
 
-def beam(case: CatchCase, table: Timetable, width: int) -> CatchChoice:
+def beam(
+    case: CatchCase, table: Timetable, width: int, margin: float = estimate.MARGIN
+) -> CatchChoice:
     """Search for W orders of one case that catch most targets, and catch them early.
+
+    These are the longest sequences that `sequences` finds. If fewer than W orders are found, the
+    first one is repeated. For N targets the leaves of the result have the shape (W, N).
+    """
+    depths = sequences(case, table, width, margin)
+    most = jnp.sum(jnp.any(jnp.isfinite(depths.rank[1:]), axis=1))
+    found = jax.tree.map(lambda leaf: leaf[most], depths)
+    chosen = jnp.where(jnp.isfinite(found.rank), np.arange(width), 0)
+    return jax.vmap(_choice)(found.position[chosen], found.times[chosen])
+
+
+def sequences(case: CatchCase, table: Timetable, width: int, margin: float) -> Sequences:
+    """Search for sequences of 0, 1, ..., N catches of one case, W of each length.
 
     It is a beam search of width W = `width` among the possible catches in `table`. After each catch
     the W sequences with the least ranks continue. The rank is the estimated time plus 10 s for each
-    metre that the quadrotor would lack to reach its targets in time. Among sequences with the same
-    targets and the same last target only the best continues. If fewer than W orders are found, the
-    first one is repeated. For N targets the leaves of the result have the shape (W, N).
+    metre that the quadrotor would lack to reach its targets in time, at most `margin` [m] for an
+    optional target. Among sequences with the same targets and the same last target only the best
+    continues. The leaves of the result have the shape (N + 1, W, ...).
 
     Raises:
         ValueError: there are more than `MOST_SEARCHED` targets.
@@ -107,11 +124,11 @@ def beam(case: CatchCase, table: Timetable, width: int) -> CatchChoice:
     inside = (place >= 0) & (place < _WORD)
     bits = jnp.asarray(np.where(inside, 1 << np.clip(place, 0, _WORD - 1), 0), jnp.int32)
 
-    def advance(now: _Partial, step: Array) -> tuple[_Partial, _Partial]:
+    def advance(now: Sequences, step: Array) -> tuple[Sequences, Sequences]:
         times, places, shortfalls = from_all(table, now.time, now.place, speed)
         times = jnp.maximum(times, now.time[:, None] + estimate.INSTANT)
         left = now.position == num
-        possible = left & jax.vmap(estimate.can_be_next, (None, 0))(case, shortfalls)
+        possible = left & jax.vmap(estimate.can_be_next, (None, 0, None))(case, shortfalls, margin)
         short = now.short[:, None] + shortfalls
         rank = estimate.later_by_shortfall(times, short)
         rank = jnp.where(possible & jnp.isfinite(now.rank)[:, None], rank, jnp.inf).ravel()
@@ -125,7 +142,7 @@ def beam(case: CatchCase, table: Timetable, width: int) -> CatchChoice:
         chosen = jnp.argsort(rank)[:width]
         row, target = chosen // num, chosen % num
         lanes = jnp.arange(width)
-        then = _Partial(
+        then = Sequences(
             rank=rank[chosen],
             short=short[row, target],
             time=times[row, target],
@@ -135,7 +152,7 @@ def beam(case: CatchCase, table: Timetable, width: int) -> CatchChoice:
         )
         return then, then
 
-    begin = _Partial(
+    begin = Sequences(
         rank=jnp.where(np.arange(width) == 0, 0.0, jnp.inf).astype(case.gravity.dtype),
         short=jnp.zeros(width, case.gravity.dtype),
         time=jnp.zeros(width, case.gravity.dtype),
@@ -144,11 +161,7 @@ def beam(case: CatchCase, table: Timetable, width: int) -> CatchChoice:
         times=jnp.zeros((width, num), case.gravity.dtype),
     )
     _, depths = lax.scan(advance, begin, jnp.arange(num))
-    depths = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), begin, depths)
-    most = jnp.sum(jnp.any(jnp.isfinite(depths.rank[1:]), axis=1))
-    found = jax.tree.map(lambda leaf: leaf[most], depths)
-    chosen = jnp.where(jnp.isfinite(found.rank), np.arange(width), 0)
-    return jax.vmap(_choice)(found.position[chosen], found.times[chosen])
+    return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), begin, depths)
 
 
 def _choice(position: Array, times: Array) -> CatchChoice:
@@ -206,17 +219,20 @@ class Best(CatchDecision):
 
     finalists: int = 6  # number of orders that are planned
     width: int = 64  # number of partial orders that the beam search continues
+    # [m], distances by which estimated flights may miss optional targets; a search for each one
+    margins: tuple[float, ...] = (estimate.MARGIN,)
 
     def __post_init__(self) -> None:
         require_settings(self)
         require(self.width >= self.finalists, "width", f">= {self.finalists} finalists", self.width)
 
     def propose(self, case: CatchCase) -> CatchChoice:
-        """Return F orders (F, N) of the N targets of a case, with the least ranks, best first."""
+        """Return the orders (F, N) of a case with the least ranks, best first for each margin."""
         table = timetable(case)
         if case.optional or case.num_targets > MOST_PERMUTED:
-            found = beam(case, table, self.width)
-            return in_several_lengths(case, jax.tree.map(lambda x: x[: self.finalists], found))
+            found = [beam(case, table, self.width, margin) for margin in self.margins]
+            first = lambda *leaves: jnp.concatenate([x[: self.finalists] for x in leaves])  # noqa: E731
+            return in_several_lengths(case, jax.tree.map(first, *found))
         orders = jnp.asarray(list(itertools.permutations(range(case.num_targets))), jnp.int32)
         choices, shortfall = jax.vmap(functools.partial(estimate.follow, case, table))(orders)
         rank = choices.times[:, -1] + 10.0 * shortfall

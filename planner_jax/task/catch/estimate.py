@@ -26,7 +26,7 @@ _TURNING = 0.2  # [s], time to tilt before the point starts to move
 _STEEPEST = 0.2  # greatest sine of a target's angle of ascent at a catch
 # [m], distance by which the estimated flight may miss an optional target that is still tried: plans
 # reach farther than the estimate.
-_MARGIN = 0.8
+MARGIN = 0.8
 
 
 @struct.dataclass
@@ -105,7 +105,7 @@ def shortfall(case: CatchCase, choice: CatchChoice) -> Array:
     before = jnp.concatenate([case.head_state[None, :1].mT, places[:-1]])
     span = jnp.diff(times, prepend=jnp.zeros_like(times[:1]))
     short = _out_of_reach(places - before, span[:, None], top_speed(case)) + penalty
-    short = (jnp.maximum(short - _MARGIN, 0.0) if case.optional else short)[:, 0]
+    short = (jnp.maximum(short - MARGIN, 0.0) if case.optional else short)[:, 0]
     return jnp.sum(jnp.where(case.present[order], short, 0.0))
 
 
@@ -157,13 +157,13 @@ def later_by_shortfall(times: Array, shortfalls: Array) -> Array:
     return times + 10.0 * shortfalls
 
 
-def can_be_next(case: CatchCase, shortfalls: Array) -> Array:
+def can_be_next(case: CatchCase, shortfalls: Array, margin: float = MARGIN) -> Array:
     """Return which of N targets may be caught next, (N,) bool.
 
     These are all targets that are present. Optional targets must also be within reach: estimates
-    of the distances `shortfalls` (N,) [m] by which they are missed must be at most 0.8 m.
+    of the distances `shortfalls` (N,) [m] by which they are missed must be at most `margin` [m].
     """
-    return case.present & (shortfalls <= _MARGIN) if case.optional else case.present
+    return case.present & (shortfalls <= margin) if case.optional else case.present
 
 
 def top_speed(case: CatchCase) -> Array:
