@@ -63,6 +63,7 @@ from .task import catch as catch
 from .task import group as group
 from .task import hit as hit
 from .task import intercept as intercept
+from .task import rally as rally
 from .task import reach as reach
 from .task import team as team
 from .trajectory.polynomial import PiecewisePolynomial as PiecewisePolynomial

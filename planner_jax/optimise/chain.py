@@ -49,6 +49,7 @@ class ChainEnds:
     total_time: Float[Array, ""]  # [s], sum of the durations of the segments that the case uses
     excess: Float[Array, "..."]  # relative excess over the limits at the ends; feasible if <= 0
     contact: PyTree = None  # data of the contacts (such as an impact) that the plan stores
+    cost: Array | float = 0.0  # (), further cost of the segments' ends, such as a preferred point
 
 
 @dataclasses.dataclass(frozen=True)
@@ -199,7 +200,7 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
         durations = ends.durations / self.num_pieces
         rows = chain_rows(context.case.head_state, ends.tail_states, durations)
         energies = jax.vmap(functools.partial(boundary_energy, self.maps))(rows, durations)
-        spent = self.energy_weight * self._count(energies, context)
+        spent = self.energy_weight * self._count(energies, context) + ends.cost
         if self.time_weight:
             spent = spent + self.time_weight * ends.total_time
         hinges = smooth_hinge(ends.excess + self.margin, self.hinge_width)

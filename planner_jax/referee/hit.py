@@ -171,7 +171,7 @@ def _step_down_to(state, entry: int, level, air) -> tuple[np.ndarray, np.ndarray
     return step, ball_step(state, step, air)
 
 
-def _return_in_air(state, height, air) -> tuple:
+def return_in_air(state, height, air) -> tuple:
     """Integrate the flights of B balls in `air` until they fall to `height` (B,) [m].
 
     Returns the greatest heights (B,) [m] and their times, and the points (3, B) at which the balls
@@ -242,7 +242,7 @@ def _judge_impact(case: dict, drag_after_impact: bool, tolerances: dict) -> tupl
         after[3:] += rub
     target = case["target"].T
     if drag_after_impact or spins:
-        returned = _return_in_air(after, target[2], air)
+        returned = return_in_air(after, target[2], air)
     else:
         returned = _return_in_vacuum(after, target[2], case["gravity"])
     apex, apex_time, landing, flight_time = returned

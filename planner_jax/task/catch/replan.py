@@ -15,8 +15,8 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from planner_jax.ball.target import TargetPath
-from planner_jax.core.arithmetic import Numbers
 from planner_jax.core.checks import require_path
+from planner_jax.optimise.chain_remainder import evaluate_pieces, fit_offsets
 from planner_jax.optimise.planner import OptimisedPlanner
 from planner_jax.optimise.settings import Evaluation, LbfgsConfig, Round
 from planner_jax.planning.replan import Replanning, check_elapsed, planned_state, resolve_argument
@@ -27,13 +27,11 @@ from planner_jax.task.catch.context import CatchContext, targets_at
 from planner_jax.task.catch.default_planner import ExactCatch
 from planner_jax.task.catch.plan import CatchPlan
 from planner_jax.trajectory import polynomial
-from planner_jax.trajectory.proportional_minco import boundary_rows
 
-_ORDERS = 4  # number of derivatives in a state, from position to jerk
 _LATEST = 0.05  # [s], greatest shift of a catch's time in the starting point
 _SHORTEST = 0.01  # [s], least duration of a segment in the starting point
 _CLOSING = 0.1  # [m/s], least speed towards the net's plane at which a catch's time is shifted
-_BINOMIALS, _SHIFTS = polynomial.shift_basis(2 * _ORDERS)
+_BINOMIALS, _SHIFTS = polynomial.shift_basis(8)
 # Step lengths that L-BFGS tries, relative to its proposed step. Small lengths are needed, because
 # the first step ignores the cost's curvature and is too long.
 _TRIALS = (1.0, 0.2, 0.04)
@@ -144,7 +142,7 @@ class ReplanCatch(OptimisedPlanner):
         segments, times = _segments(task)
         last = (segments + 1) * planner.num_pieces - 1
         coeffs, ends = trajectory.coeffs[last], trajectory.durations[last]
-        tails = _states(coeffs, ends)
+        tails = evaluate_pieces(coeffs, ends)
         load = add_drag(task.case.limits.air, tails[:, 1], tails[:, 2])
         axis = body_z(load, task.case.gravity)
         ball = targets_at(context.targets, times)
@@ -153,20 +151,12 @@ class ReplanCatch(OptimisedPlanner):
         meeting = context.active & (closing > _CLOSING)
         later = jnp.where(meeting, above / jnp.where(meeting, closing, 1.0), 0.0)
         later = jnp.clip(later, -_LATEST, _LATEST)
-        tails = _states(coeffs, ends + later)
+        tails = evaluate_pieces(coeffs, ends + later)
         times = times + later
         begins = jnp.concatenate([jnp.zeros_like(times[:1]), times[:-1]])
         durations = jnp.maximum(times - begins, _SHORTEST)
-        proportions = planner.maps.proportions
-        shares = np.cumsum(proportions) / np.sum(proportions) - proportions / np.sum(proportions)
-        knots = begins[:, None] + durations[:, None] * jnp.asarray(shares, times.dtype)[None]
-        states = _states_along(trajectory, task.elapsed + knots.ravel())
-        states = states.reshape(*knots.shape, _ORDERS, 3)
-        heads = jnp.concatenate([states[:1, 0], tails[:-1]])
-        rows = jax.vmap(boundary_rows)(heads, tails, durations / planner.num_pieces)
-        along = jnp.concatenate([rows, states[:, 1:, 0]], axis=1)
-        matrix = jnp.asarray(planner.maps.offsets, times.dtype)
-        offsets = jnp.sum(matrix[None, :, :, None] * along[:, None], axis=2)
+        begins = begins + task.elapsed
+        offsets = fit_offsets(planner, trajectory, begins, durations, tails)
         return planner.encode(context, durations, tails, offsets)
 
     def guesses(self, context: ReplanContext, num: int) -> Array:
@@ -186,19 +176,6 @@ class ReplanCatch(OptimisedPlanner):
         return jax.lax.cond(
             context.keep, lambda: _remainder(context.task, context.catch), lambda: plan
         )
-
-
-def _states(coeffs: Array, time: Numbers) -> Array:
-    factors, powers = polynomial.state_basis(coeffs.shape[1])
-    basis = time[:, None, None] ** jnp.asarray(powers, time.dtype)[None]
-    basis *= jnp.asarray(factors, time.dtype)[None]
-    return jnp.sum(basis[..., None] * coeffs[:, None], axis=2)
-
-
-def _states_along(trajectory: polynomial.PiecewisePolynomial, times: Numbers) -> Array:
-    ends = jnp.cumsum(trajectory.durations)
-    piece = jnp.sum(times[:, None] >= ends[None, :-1], axis=1)
-    return _states(trajectory.coeffs[piece], times - (ends - trajectory.durations)[piece])
 
 
 def _segments(task: Replanning) -> tuple[Array, Array]:
@@ -230,7 +207,7 @@ def _remainder(task: Replanning, context: CatchContext) -> CatchPlan:
     shift *= jnp.asarray(_BINOMIALS, local.dtype)[None, None]
     coeffs = jnp.take_along_axis(coeffs, source[:, :, None, None], axis=1)
     coeffs = jnp.sum(shift[..., None] * coeffs[:, :, None], axis=3)
-    last = _states(path.coeffs[-1:], path.durations[-1:])[0, 0]
+    last = evaluate_pieces(path.coeffs[-1:], path.durations[-1:])[0, 0]
     still = jnp.zeros_like(coeffs).at[:, :, 0].set(last)
     active = context.active[:, None]
     durations = jnp.where(active, jnp.diff(new, axis=1), 0.0)

@@ -48,13 +48,7 @@ _FEATURE_TIMES = (0.5, 0.75, 0.95)  # times of the ball that the network sees / 
 # (`nodes` a piece), so that the margin must cover higher values between samples.
 _ANY_FEASIBLE = (("energy_weight", 1e-11), ("margin", 0.01), ("nodes", 8))
 WITH_VELOCITIES = (*_ANY_FEASIBLE, ("velocities", True))
-_SMALL_MARGIN = (
-    ("energy_weight", 1e-11),
-    ("margin", 0.004),
-    ("hinge_width", 0.02),
-    ("nodes", 12),
-    ("velocities", True),
-)
+_SMALL_MARGIN = (*WITH_VELOCITIES, ("margin", 0.004), ("hinge_width", 0.02), ("nodes", 12))
 _VELOCITY_SCALE = 2.0  # entry of `scale` for the variables that change velocities at waypoints
 _PASSING = 0.9  # greatest speed of the racket in a starting point, divided by the speed limit
 # Starting points, the most successful first. Columns: time of the impact / time at which the ball
@@ -77,6 +71,16 @@ _GUESSES = np.array(
         (0.65, 1.7, 2.2),
     ]
 )
+
+
+def state_at_impact(
+    case: HitCase, ball_pos: Array, normal: Array, vel: Array, thrust: Array, jerk: Array
+) -> Array:
+    """Return position, velocity, acceleration and jerk (4, 3) of the quadrotor at an impact."""
+    acc = thrust * normal + gravity_vector(case.gravity)
+    if (air := case.limits.air) is not None:  # the thrust is along a + g e_3 + d (v - w)
+        acc = acc - air.drag * velocity_in_air(air, vel)
+    return jnp.stack([ball_pos - case.racket_height * normal, vel, acc, jerk])
 
 
 def _hard(steps: int) -> LbfgsConfig:
@@ -317,10 +321,7 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
             normal, normal_speed = solve_impact(ball.vel, after, case.restitution)
             across_x, across_y = tangent_basis(normal)
             vel = normal_speed * normal + natural[3] * across_x + natural[4] * across_y
-        acc = thrust * normal + gravity_vector(case.gravity)
-        if (air := case.limits.air) is not None:  # the thrust is along a + g e_3 + d (v - w)
-            acc = acc - air.drag * velocity_in_air(air, vel)
-        tail_state = jnp.stack([ball.pos - case.racket_height * normal, vel, acc, natural[5:]])
+        tail_state = state_at_impact(case, ball.pos, normal, vel, thrust, natural[5:])
         stroke = Stroke(time, ball.pos, ball.vel, after, normal, flight_time)
         return Impact(stroke=stroke, tail_state=tail_state, apex=apex)
 

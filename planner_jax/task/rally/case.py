@@ -1,0 +1,166 @@
+"""Cases of the task `rally`: the ball, the quadrotor, and the places to which it sends the ball."""
+
+import dataclasses
+import functools
+from typing import TYPE_CHECKING, ClassVar
+
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax import Array
+
+from planner_jax.ball.flight import BallState
+from planner_jax.core import rules
+from planner_jax.core.checks import floating, shape_of
+from planner_jax.core.errors import ArgumentError
+from planner_jax.core.origin import Located, find_origin, move
+from planner_jax.core.rules import Field, Table, require_sound
+from planner_jax.cost.extras import Extra
+from planner_jax.robot.quadrotor import QuadrotorLimits
+from planner_jax.task.arguments import array_of, batch_of
+from planner_jax.task.hit.case import RULES as HIT_RULES
+from planner_jax.task.hit.case import HitLimits
+from planner_jax.task.hit.case import case as hit_case
+from planner_jax.task.hit.spec import START
+
+if TYPE_CHECKING:
+    from planner_jax.robot.heading import Heading
+
+# Shapes and ranges that `pj.require_sound` checks for the arrays of a `RallyCase`.
+RULES: Table = (
+    *(field for field in HIT_RULES if field.name != "target"),
+    Field("places", ("K", 3)),
+    Field("place_range", ("K", 3), rules.NOT_NEGATIVE),
+    Field("hit_limits.min_contact", (), rules.POSITIVE),
+    Field("hit_limits.min_contact", (), rules.below("hit_limits.max_contact")),
+    Field("hit_limits.max_contact", (), rules.below("hit_limits.max_apex")),
+)
+
+
+@struct.dataclass
+class RallyLimits(HitLimits):
+    """Limits at every contact: speed, apex of the ball after it, and height of the contact."""
+
+    min_contact: Array  # () [m], least height of a contact
+    max_contact: Array  # () [m], greatest height of a contact
+
+
+@struct.dataclass
+class RallyCase(Located):
+    """K >= 1 hits to plan, or a batch: a quadrotor has to hit one ball again and again.
+
+    Hit k sends the ball to a place that the planner chooses in a box, and hit k + 1 happens there.
+    The other fields are as in `HitCase`.
+    """
+
+    rules: ClassVar[Table] = RULES
+    positions: ClassVar[dict] = {"ball": (), "head_state": (0,), "places": ()}
+    lift: ClassVar[None] = None  # rallies have balls without spin
+
+    ball: BallState  # position and velocity of the ball at time 0
+    head_state: Array  # (4, 3) position, velocity, acceleration, jerk of the quadrotor at time 0
+    places: Array  # (K, 3) [m], centre of the box in which the place after each hit is chosen
+    place_range: Array  # (K, 3) [m], half the box's width; zeros for a fixed place
+    drag: Array  # () [1/m], coefficient K_D of the ball's quadratic drag
+    gravity: Array  # () [m/s^2], magnitude
+    restitution: Array  # () coefficient of restitution beta of the racket
+    racket_height: Array  # () [m], height of the racket's centre above the propeller plane
+    limits: QuadrotorLimits
+    hit_limits: RallyLimits
+    extras: tuple[Extra, ...] = ()  # the user's further constraints and costs
+    racket_radius: Array | None = None  # () [m]; None: the contact's offset is not limited
+    heading: "Heading | None" = None  # requested heading; None: 0
+
+    @property
+    def batch_shape(self) -> tuple[int, ...]:
+        """Shape of the batch: () for one case, (B,) for a batch of B cases."""
+        return np.shape(self.drag)
+
+
+def case(
+    ball_pos,
+    ball_vel,
+    places,
+    *,
+    place_range=(0.5, 0.5, 0.2),
+    min_contact=1.0,
+    max_contact=2.0,
+    start=START,
+    origin=None,
+    dtype=jnp.float32,
+    **options,
+) -> RallyCase:
+    """Make one case of K hits in a row, or a batch.
+
+    Args:
+        ball_pos: (..., 3) [m], position of the ball at time 0, above the ground at z = 0.
+        ball_vel: (..., 3) [m/s], velocity of the ball at time 0.
+        places: (K, 3) or (..., K, 3) [m], centre of the box to which each hit sends the ball. The
+            next hit happens at the place in the box that the planner chooses.
+        place_range: (3,), (K, 3) or (..., K, 3) [m], half the width of the boxes; zeros fix the
+            places.
+        min_contact: [m], least height of the contacts.
+        max_contact: [m], greatest height of the contacts.
+        start: (3,) or (..., 3) [m], position of the quadrotor at time 0.
+        origin: (2,) x, y [m], world position that is subtracted from all positions, as in hits.
+        dtype: type of every floating leaf.
+        **options: further arguments of `pj.hit.case`, such as `robot`, `drag` or `max_apex`. The
+            `heading` may not follow the ball, and balls have no `spin`.
+
+    Returns:
+        A case whose leaves have the batch shape of `ball_pos`.
+
+    Raises:
+        CaseError: a number breaks a rule, such as a box that is not between the contact heights.
+        ValueError: an argument has a wrong shape.
+        TypeError: an argument does not hold numbers, or `dtype` is not a floating type.
+    """
+    dtype, batch = floating(dtype), batch_of("ball_pos", ball_pos, 3)
+    shape = shape_of("places", places)
+    if len(shape) < 2 or shape[-1] != 3 or shape[-2] < 1:
+        raise ArgumentError("places", "the shape (K, 3) with K >= 1", shape, verb="have")
+    shift = find_origin(start, origin, batch, dtype)
+    leaf = functools.partial(array_of, batch=batch, dtype=dtype)
+    near = move("places", places, None if shift is None else -shift, dtype)
+    if shape_of("place_range", place_range) == (3,):
+        place_range = np.broadcast_to(np.asarray(place_range), shape[-2:])
+    base = hit_case(
+        ball_pos,
+        ball_vel,
+        (0.0, 0.0, 0.0),  # hits of a rally have places instead of a target
+        start=start,
+        origin=origin,
+        dtype=dtype,
+        **options,
+    )
+    if base.lift is not None:
+        raise ArgumentError("spin", "left out for rallies", shown="a spin")
+    if options.get("heading") == "ball":
+        raise ArgumentError("heading", "an angle, or 'velocity'", "ball")
+    own = {field.name for field in dataclasses.fields(RallyCase)}
+    values = {name: value for name, value in vars(base).items() if name in own}
+    values["hit_limits"] = RallyLimits(
+        **vars(base.hit_limits),
+        min_contact=leaf("min_contact", min_contact),
+        max_contact=leaf("max_contact", max_contact),
+    )
+    cases = RallyCase(
+        **values,
+        places=leaf("places", near, *shape[-2:]),
+        place_range=leaf("place_range", place_range, *shape[-2:]),
+    )
+    names = {f"hit_limits.{field.name}": field.name for field in dataclasses.fields(RallyLimits)}
+    require_sound(cases, names)
+    low, high = (
+        np.asarray(cases.places)[..., 2] + side * np.asarray(cases.place_range)[..., 2]
+        for side in (-1.0, 1.0)
+    )
+    least, most = (
+        np.asarray(x)[..., None] - 1e-5 * s
+        for x, s in ((cases.hit_limits.min_contact, 1), (cases.hit_limits.max_contact, -1))
+    )
+    words = "boxes between the heights min_contact and max_contact"
+    rules.require_rule(
+        "places", np.asarray(cases.places)[..., 2], (low >= least) & (high <= most), words, batch
+    )
+    return cases

@@ -1,0 +1,167 @@
+"""Re-planning of rallies: before a contact for a new estimate of the ball, and after a contact.
+
+The search starts at the remainder of the previous plan. After a contact the second hit becomes the
+first one, and a new last hit is guessed. So every plan looks K hits ahead.
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax import Array
+from numpy.typing import ArrayLike
+
+from planner_jax.ball.flight import BallState
+from planner_jax.core.checks import require_beginning, require_kind
+from planner_jax.optimise.chain_remainder import evaluate_pieces, fit_offsets
+from planner_jax.optimise.planner import OptimisedPlanner
+from planner_jax.optimise.settings import Evaluation, Round, Settings
+from planner_jax.planning.replan import Replanning, check_elapsed, planned_state, resolve_argument
+from planner_jax.robot.heading import continue_heading
+from planner_jax.robot.quadrotor import add_drag, net_thrust, tangent_basis
+from planner_jax.task.rally.case import RallyCase
+from planner_jax.task.rally.default_planner import ROUNDS, ExactRally, RallyContext
+from planner_jax.task.rally.plan import RallyPlan
+
+_SHORTEST = 0.01  # [s], least duration of a segment in the starting point
+_MOST_SHARE = 0.98  # greatest distance of a place from its box's centre in a starting point
+_NEW_APEX, _NEW_THRUST = 0.5, 1.1  # of a new last hit, as in the first row of the planner's guesses
+
+
+@struct.dataclass
+class ReplanRallyContext:
+    """Data of a re-plan: the remaining hits, and the starting point from the previous plan."""
+
+    rally: RallyContext
+    start: Array  # (n,), values of the n decision variables
+
+
+@jax.tree_util.register_static
+@dataclasses.dataclass(frozen=True)
+class ReplanRally(OptimisedPlanner):
+    """A planner that re-plans rallies for `pj.replan`, from previous plans of `ExactRally`.
+
+    A hit counts as done from its planned time on. The plan then continues with the next hits, and
+    with as many new hits as are done. Then `ball` is the ball after the last contact.
+    """
+
+    case_type = Replanning
+    plan_type = RallyPlan
+    planner: ExactRally = ExactRally()
+    rounds: tuple[Round, ...] = ROUNDS
+
+    @property
+    def inner(self) -> ExactRally:
+        """The planner of rallies that plans what remains of each rally."""
+        return self.planner
+
+    def begin(
+        self,
+        cases: RallyCase,
+        previous: RallyPlan,
+        elapsed: ArrayLike,
+        *,
+        ball: BallState,
+        drag: ArrayLike | None = None,
+        restitution: ArrayLike | None = None,
+        places: ArrayLike | None = None,
+        place_range: ArrayLike | None = None,
+        head_state: ArrayLike | None = None,
+    ) -> Replanning:
+        """Return what follows in rallies `elapsed` [s] after the start of their plans `previous`.
+
+        `cases` are one case or a batch of B cases as they were planned. `ball` is the new estimate
+        of the ball's state, leaves (3,) or (B, 3). `drag` [1/m] and `restitution` are by default as
+        in `cases`. `places` and `place_range` (..., K, 3) [m] belong to the hits to plan; by
+        default places of finished hits are left out, and the last one is repeated. `head_state`
+        (..., 4, 3) is the quadrotor's state, by default as planned.
+        """
+        elapsed = check_elapsed(cases, elapsed)
+        require_kind("ball", ball, BallState)
+        require_beginning("ball", ball, cases.batch_shape, f"the batch shape {cases.batch_shape}")
+        index = count_done(previous, elapsed)[..., None] + np.arange(cases.places.shape[-2])
+        index = np.minimum(index, index.shape[-1] - 1)[..., None]
+        later = lambda boxes: np.take_along_axis(np.asarray(boxes), index, axis=-2)  # noqa: E731
+        own = {
+            "drag": (drag, cases.drag),
+            "restitution": (restitution, cases.restitution),
+            "places": (places, later(cases.places)),
+            "place_range": (place_range, later(cases.place_range)),
+            "head_state": (head_state, planned_state(previous.trajectory, elapsed)),
+        }
+        news = {
+            name: resolve_argument(name, given, usual, elapsed)
+            for name, (given, usual) in own.items()
+        }
+        now = dataclasses.replace(cases, ball=ball, **news)
+        return Replanning(case=now, previous=previous, elapsed=elapsed)
+
+    def with_settings(self, settings: Settings) -> "ReplanRally":
+        """Return a copy whose planner of rallies has the field values in `settings`."""
+        own = {name: value for name, value in settings if name == "rounds"}
+        planner = self.planner.with_settings(tuple(each for each in settings if each[0] not in own))
+        return dataclasses.replace(self, planner=planner, **own)
+
+    def prepare(self, task: Replanning) -> ReplanRallyContext:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """Return the data of the remaining hits, and the previous plan as a starting point."""
+        case = continue_heading(task.case, task.previous, task.elapsed)
+        return ReplanRallyContext(rally=self.planner.prepare(case), start=self._start(task))
+
+    def _start(self, task: Replanning) -> Array:
+        planner, case, previous = self.planner, task.case, task.previous
+        path, strokes, size = previous.trajectory, previous.strokes, case.places.shape[0]
+        index = count_done(previous, task.elapsed) + np.arange(size)
+        is_new = (index >= size)[:, None]
+        guessed = planner.guess_flights(case, case.places[0, 2], jnp.asarray(_NEW_APEX))
+        guessed = guessed.astype(strokes.time.dtype)
+        flights = jnp.concatenate([strokes.flight_time, guessed])
+        next_time = strokes.time[-1] + strokes.flight_time[-1]
+        times = jnp.append(strokes.time, next_time + jnp.cumsum(guessed) - guessed)
+        flights, times = flights[index], times[index] - task.elapsed
+        begins = jnp.concatenate([jnp.zeros_like(times[:1]), times[:-1]])
+        durations = jnp.maximum(times - begins, _SHORTEST)
+
+        index = jnp.minimum(index, size - 1)
+        last = (index + 1) * planner.num_pieces - 1
+        tails = evaluate_pieces(path.coeffs[last], path.durations[last])
+        vel, acc, jerk = tails[:, 1], tails[:, 2], tails[:, 3]
+        pull = net_thrust(add_drag(case.limits.air, vel, acc), case.gravity)
+        thrust = jnp.sqrt(jnp.sum(pull**2, axis=1))
+        across = jnp.stack(jax.vmap(tangent_basis)(strokes.normal[index]), axis=1)
+        speeds = jnp.sum(vel[:, None] * across, axis=2)
+        is_box = case.place_range > 0.0
+        share = (previous.places[index] - case.places) / jnp.where(is_box, case.place_range, 1.0)
+        share = jnp.clip(jnp.where(is_box, share, 0.0), -_MOST_SHARE, _MOST_SHARE)
+        share = share / jnp.sqrt(1.0 - share**2)
+        ends = jnp.concatenate([jnp.log(thrust)[:, None], speeds, jerk, share], axis=1)
+        new = jnp.zeros_like(ends).at[:, 0].set(jnp.log(_NEW_THRUST * case.gravity))
+        is_last = np.arange(size) == size - 1
+        flights = jnp.where(is_last, jnp.log(flights), 0.0)
+        natural = jnp.concatenate(
+            [jnp.log(durations)[:, None], flights[:, None], jnp.where(is_new, new, ends)], axis=1
+        )
+        offsets = fit_offsets(planner, path, begins + task.elapsed, durations, tails)
+        return planner.join(jnp.where(is_new[..., None], 0.0, offsets), natural)
+
+    def guesses(self, context: ReplanRallyContext, num: int) -> Array:
+        """Return `num` starting points: the previous plan, then guesses for new hits."""
+        first = context.start[None]
+        if num == 1:
+            return first
+        return jnp.concatenate([first, self.planner.guesses(context.rally, num - 1)])
+
+    def objective(self, point: Array, context: ReplanRallyContext) -> Evaluation:
+        """Return the cost, and the largest relative excess over a limit, at n variables `point`."""
+        return self.planner.objective(point, context.rally)
+
+    def decode(self, point: Array, context: ReplanRallyContext) -> RallyPlan:
+        """Return the plan of the next hits that the n decision variables `point` describe."""
+        return self.planner.decode(point, context.rally)
+
+
+def count_done(plan: RallyPlan, elapsed: Array | np.ndarray):
+    """Return how many hits of a plan are done `elapsed` [s] after its start, () or (B,)."""
+    xp = np if isinstance(elapsed, np.ndarray | np.generic) else jnp
+    return xp.sum(xp.asarray(plan.strokes.time) <= elapsed[..., None], axis=-1)

@@ -1,0 +1,124 @@
+"""Rallies: cases, suites, the planner's equations, plans and re-plans."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from rallies import bounces, fly_on
+
+import planner_jax as pj
+from planner_jax.ball.flight import BallState
+from planner_jax.planning.replan import Replanning
+from planner_jax.task.hit.court import fly
+from planner_jax.task.rally.replan import count_done
+from tests.trees import assert_same
+
+PLACES = np.tile([0.0, 0.0, 1.5], (2, 1))
+
+
+def test_a_hovering_racket_is_a_rally_of_the_equations():
+    case, plan = bounces(hits=3)
+    planner = pj.rally.planner()
+    one, strokes = pj.take(case, 0), pj.take(plan, 0).strokes
+    natural = np.zeros((3, 11))
+    natural[:, 0] = np.log(np.diff(strokes.time, prepend=0.0))
+    natural[-1, 1] = np.log(strokes.flight_time[-1])
+    natural[:, 2] = np.log(9.8)
+    ends = planner.meet(jnp.asarray(natural, jnp.float32), planner.prepare(one))
+    hover = np.zeros((3, 4, 3))
+    hover[:, 0] = one.head_state[0]
+    np.testing.assert_allclose(ends.tail_states, hover, atol=2e-3)
+    np.testing.assert_allclose(ends.contact[0].ball_pos, strokes.ball_pos, atol=1e-4)
+    np.testing.assert_allclose(ends.contact[0].ball_vel_after, strokes.ball_vel_after, atol=2e-3)
+    np.testing.assert_allclose(ends.contact[1], plan.places[0], atol=1e-6)
+    assert float(ends.excess.max()) < 0.0
+
+
+def test_drawn_balls_fall_into_the_volume():
+    cases = pj.rally.draw(50)
+    apex = np.asarray(cases.hit_limits.max_apex)
+    fall = np.linspace(0.5, 1.4, 200)[:, None]
+    pos, vel = fly(cases.ball.pos, cases.ball.vel, fall, cases.drag, cases.gravity)
+    is_near = (np.abs(pos[..., 2] - 1.5) < 0.05) & (vel[..., 2] < 0.0)
+    assert is_near.any(axis=0).all()
+    aside = np.where(is_near, np.abs(pos[..., :2]).max(axis=-1), 0.0)
+    assert aside.max() <= 0.55 and pos[..., 2].max() <= apex.max() + 0.01
+
+
+def test_draws_continue_and_depend_on_the_seed():
+    whole = pj.rally.draw(8, "juggle", 3)
+    assert_same(pj.rally.draw(3, seed=3, first=5), pj.take(whole, slice(5, 8)))
+    assert (np.asarray(whole.ball.pos) != np.asarray(pj.rally.draw(8, seed=4).ball.pos)).any()
+    assert pj.rally.draw(2, hits=4).places.shape == (2, 4, 3)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"places": (0.0, 0.0, 1.5)}, r"places must have the shape \(K, 3\) with K >= 1"),
+        ({"places": np.tile([0.0, 0.0, 1.9], (2, 1))}, "places must be .* min_contact"),
+        ({"max_contact": 0.9}, "min_contact must be .* got 1"),
+        ({"max_apex": 1.8, "min_apex": 1.0}, "max_contact must be .* got 2"),
+        ({"place_range": (-0.1, 0.0, 0.0)}, "place_range must be >= 0"),
+        ({"restitution": 1.5}, r"restitution must be in \[0, 1\]"),
+    ],
+)
+def test_a_volume_that_cannot_be_kept_is_one_line(changes, message):
+    arguments = {"ball_pos": (0.0, 0.0, 2.0), "ball_vel": np.zeros(3), "places": PLACES}
+    with pytest.raises(ValueError, match=message) as caught:
+        pj.rally.case(**(arguments | {"start": (0.0, 0.0, 1.2)} | changes))
+    assert "\n" not in str(caught.value)
+
+
+def test_a_hit_is_done_from_its_planned_time_on():
+    _, plan = bounces(hits=3)
+    plan = pj.take(plan, 0)
+    time = float(plan.strokes.time[1])
+    for elapsed, done in ((0.0, 0), (time - 1e-3, 1), (time, 2), (99.0, 3)):
+        assert int(count_done(plan, np.asarray(elapsed))) == done
+        assert int(count_done(plan, jnp.asarray(elapsed))) == done
+
+
+@pytest.mark.slow
+def test_plans_of_drawn_rallies_are_accepted_and_a_batch_is_a_loop():
+    cases, planner = pj.rally.draw(16, seed=5), pj.rally.planner()
+    plans = pj.plan(planner, cases)
+    verdict = pj.rally.judge(cases, plans)
+    assert verdict.success.all(), [verdict.sentence(k) for k in np.flatnonzero(~verdict.success)]
+    assert verdict.contact_error.max() < 5e-4 and verdict.place_error.max() < 5e-4
+    alone = pj.plan(planner, pj.take(cases, 3))
+    np.testing.assert_allclose(alone.strokes.time, plans.strokes.time[3], atol=2e-3)
+
+
+@pytest.mark.slow
+def test_a_ball_is_kept_up_for_thirty_hits_by_looking_one_hit_ahead():
+    cases, planner = pj.rally.draw(16, seed=1), pj.rally.planner()
+    plans = pj.plan(planner, cases)
+    for _ in range(30):
+        assert pj.are_solved(plans).all()
+        verdict = pj.rally.judge(cases, plans)
+        assert verdict.success.all()
+        time = np.asarray(plans.strokes.time)[:, 0]
+        ball = fly_on(cases, plans)
+        again = planner.replanner().begin(cases, plans, time, ball=ball)
+        plans = pj.replan(planner, cases, plans, time, ball=ball)
+        cases = again.case
+
+
+@pytest.mark.slow
+def test_the_start_of_a_replan_is_the_plan_itself_and_the_ball_may_change():
+    case, planner = pj.take(pj.rally.draw(1, seed=2), 0), pj.rally.planner()
+    plan = pj.plan(planner, case)
+    again = planner.replanner()
+    zero = jnp.zeros((), jnp.float32)
+    context = again.prepare(Replanning(case=case, previous=plan, elapsed=zero))
+    start = again.decode(context.start, context)
+    assert_close = lambda a, b: np.testing.assert_allclose(a, b, atol=2e-3)  # noqa: E731
+    jax.tree.map(assert_close, start.strokes, plan.strokes)
+    elapsed = 0.4
+    now = pj.fly(case.ball, elapsed, case.drag, case.gravity, num_steps=50)[0]
+    moved = BallState(now.pos + jnp.array([0.05, -0.03, 0.0]), now.vel)
+    new = pj.replan(planner, case, plan, elapsed, ball=moved)
+    left = again.begin(case, plan, elapsed, ball=moved).case
+    assert pj.rally.judge(left, new).success
+    assert abs(float(new.strokes.time[0]) - float(plan.strokes.time[0]) + elapsed) < 0.1
