@@ -134,9 +134,9 @@ def test_case_far_from_the_origin_is_moved():
 @pytest.mark.parametrize("suite", SUITES)
 def test_suites_share_the_targets_of_catches(suite):
     cases = pj.team.draw(3, suite, seed=5, first=2)
-    catches = pj.catch.draw(3, SUITES[suite].catches, seed=5, first=2)
+    catches = pj.catch.draw(3, SUITES[suite][0], seed=5, first=2)
     assert_same(cases.shared.replace(head_state=catches.head_state), catches)
-    assert cases.num_robots == SUITES[suite].num_robots
+    assert cases.num_robots == SUITES[suite][1]
     assert_same(pj.take(cases, 1), pj.take(pj.team.draw(1, suite, seed=5, first=3), 0))
 
 
@@ -211,7 +211,7 @@ def test_plan_and_recovery_stay_out_of_a_moving_keep_out():
         alone = case.of_robot(0, present=np.array([True, False]), extras=extras)
         found = pj.plan(planner, jax.tree.map(lambda leaf: np.asarray(leaf)[None], alone))
         assert pj.are_solved(found).all() and found.num_taken[0] == 1
-        whole = pj.take(found.whole, 0)
+        whole = jax.tree.map(jnp.asarray, pj.take(found.whole, 0))
         times = np.linspace(0.0, float(whole.durations.sum()), 2001)
         pos = np.asarray(jax.vmap(lambda time, path=whole: pj.evaluate(path, time))(times))
         nearest.append(np.linalg.norm(pos - middle - vel * times[:, None], axis=1).min())

@@ -27,6 +27,7 @@ from planner_jax.task.team.plan import TeamPlan
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
 
 _NODES = 256  # number of nodes of the table of a robot's path
+_HOVER = 1.0  # [s], duration of the recovery of a robot that catches nothing
 _SPARE = 1.01  # planned least distance between robots, relative to the least distance of the case
 # For teams: greatest distances [m] by which estimated flights may miss a target that is still
 # tried, and the numbers of orders and of partial orders for each distance.
@@ -80,25 +81,23 @@ class ExactTeam(Planner[TeamCase, TeamPlan]):
             cases = jax.tree.map(np.asarray, cases)
         present, robots = cases.shared.present, range(cases.num_robots)
         planner, apart = _with_reach(self.planner), _SPARE * cases.least_distance
-        starts, ones = jnp.asarray(cases.head_states[:, :, None, :1]), jnp.ones((len(present), 1))
-        paths = [_tabulate(PiecewisePolynomial(starts[:, k], ones)) for k in robots]
-        plans: list[PyTree] = [None for _ in robots]
+        pieces, heads = planner.recovery_planner.num_pieces, jnp.asarray(cases.head_states)
+        still = jnp.zeros((*heads.shape[:2], pieces, 8, 3)).at[..., 0, :].set(heads[:, :, None, 0])
+        rests = PiecewisePolynomial(still, jnp.full(still.shape[:3], _HOVER / pieces))
+        rests = [jax.tree.map(lambda leaf: xp.asarray(leaf)[:, k], rests) for k in robots]  # noqa: B023
+        paths: list[tuple[PathTable, Array]] = [_tabulate(rest) for rest in rests]
 
-        def plan_again(k: int, allowed: PyTree) -> None:
-            """Plan robot k with the targets (B, M) that it may catch; keep the better plans."""
+        def plan_with(k: int, allowed: PyTree, by: PyTree) -> PyTree:
+            """Plan robot k, with the targets (B, M) that it may catch, by a planner."""
             others = paths[:k] + paths[k + 1 :]
             near = [MovingKeepOut(path, apart, 0.0 * until, until) for path, until in others]
             own = cases.of_robot(k, present=allowed, extras=(*cases.shared.extras, *near))
-            new, _ = drive(planner, own if drive.is_pure else jax.tree.map(np.asarray, own))
-            if (old := plans[k]) is not None:
-                more = xp.asarray(new.num_taken > old.num_taken)
-                better = is_solved(new.status) & (more | ~is_solved(old.status))
-                pick = lambda a, b: xp.where(better.reshape(-1, *[1] * (a.ndim - 1)), a, b)  # noqa: B023, E731
-                new = jax.tree.map(pick, new, old)
-            plans[k], paths[k] = new, _tabulate(new.whole)
+            return drive(by, own if drive.is_pure else jax.tree.map(np.asarray, own))[0]
 
-        for k in robots:
-            plan_again(k, present & False)
+        plans: list[PyTree] = [
+            plan_with(k, present & False, planner.planner).replace(recovery=rests[k])
+            for k in robots
+        ]
         assigned = xp.asarray(assign(cases, _WIDTH, max(_MARGINS)))
         for turn in range(self.turns):
             for k in robots:
@@ -108,8 +107,13 @@ class ExactTeam(Planner[TeamCase, TeamPlan]):
                 free = present & ~gone
                 # A robot that may catch nothing more plans to hover, which takes little time.
                 free &= (free & ~taken[k]).any(axis=1, keepdims=True)
-                if not drive.is_over and (drive.is_pure or free.any()):
-                    plan_again(k, free)
+                if drive.is_over or not (drive.is_pure or free.any()):
+                    continue
+                new, old = plan_with(k, free, planner), plans[k]
+                more = is_solved(new.status) & xp.asarray(new.num_taken > old.num_taken)
+                pick = lambda a, b: xp.where(more.reshape(-1, *[1] * (a.ndim - 1)), a, b)  # noqa: B023, E731
+                plans[k] = jax.tree.map(pick, new, old)
+                paths[k] = _tabulate(plans[k].whole)
         return plans
 
 

@@ -32,9 +32,10 @@ def draw(
     suite = suite_named(suite, "team2-swarm12")
     if suite not in SUITES:
         return TASK.other_suite(suite)(num, seed, first)
-    shared = catches.draw(num, SUITES[suite].catches, seed, first=first, dtype=dtype)
-    angle = 2.0 * np.pi * np.arange(SUITES[suite].num_robots) / SUITES[suite].num_robots
-    states = np.zeros((num, angle.size, 4, 3))
+    name, robots = SUITES[suite]
+    shared = catches.draw(num, name, seed, first=first, dtype=dtype)
+    angle = 2.0 * np.pi * np.arange(robots) / robots
+    states = np.zeros((num, robots, 4, 3))
     states[:, :, 0] = START + _RADIUS * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
     heads = jnp.asarray(states, shared.gravity.dtype)
     shared = dataclasses.replace(shared, head_state=heads[:, 0])
