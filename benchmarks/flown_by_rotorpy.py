@@ -9,8 +9,8 @@ the plan's thrust, attitude and body rate. The table has the distance from the p
 its greatest value in the recovery, how many recoveries stay within 20 cm, and in how many flights a
 rotor saturates. Robots are RotorPy's Hummingbird and Crazyflie Brushless, and the Agilicious
 quadrotor of 0.752 kg [Foehn2022]; tools and limits are assumptions. RotorPy's aerodynamics are off,
-or on with a wind of 0 or 3 m/s along x. Then plans know the wind and the rotors' drag at the
-speed of hover. RotorPy is in the extra `peers`.
+or on with a wind of 0 or 3 m/s along x. Then plans know the wind, and the drag that `pj.fit_drag`
+finds in a log of another flight in RotorPy. RotorPy is in the extra `peers`.
 """
 
 import dataclasses
@@ -20,15 +20,19 @@ import itertools
 from types import SimpleNamespace
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 import planner_jax as pj
 from planner_jax.benchmarks.run import argument_parser, begin
 from planner_jax.core import GRAVITY
-from planner_jax.robot.quadrotor import Air
-from planner_jax.robot.quadrotor_model import FlightLimits, QuadrotorModel, Rotors, Tool
+from planner_jax.robot.quadrotor_model import (
+    FlightLimits,
+    QuadrotorModel,
+    RotorDrag,
+    Rotors,
+    Tool,
+)
 
 RATE = 500.0  # [Hz], of setpoints, controllers and simulation
 NEAR = 0.2  # [m], greatest distance from the plan of a recovery that counts as flown
@@ -70,16 +74,37 @@ def model_of(name: str, params: dict[str, Any], speed: float, tool: Tool) -> Qua
     return QuadrotorModel(name, params["mass"], inertia, rotors, tool, limits)
 
 
-def air_of(params: dict[str, Any], wind: float, num: int) -> Air:
-    """Return the drag of RotorPy's rotors at hover, for `num` cases with a wind [m/s] along x.
+def identify_drag(params: dict[str, Any]) -> RotorDrag:
+    """Return the drag that `pj.fit_drag` finds in a log of RotorPy's own controller in still air.
 
-    RotorPy's rotors have the drag  k_d Omega v  across and  k_z Omega v  along the thrust, for the
-    rotor speed Omega. The quadratic drag of the body is left out, and so is the translational lift.
+    The flight of 12 s is along a Lissajous curve of 1.5 m that rises and falls by 0.5 m.
     """
-    speeds = 4.0 * np.sqrt(0.25 * params["mass"] * GRAVITY / params["k_eta"])
-    drags = (params[name] * speeds / params["mass"] for name in ("k_d", "k_z"))
-    leaves = (*drags, np.array([wind, 0.0, 0.0]))
-    return Air(*(jnp.asarray(np.tile(x, (num, *np.ones_like(np.shape(x)))), "f4") for x in leaves))
+    control, vehicles, curves = (
+        importlib.import_module(f"rotorpy.{name}")
+        for name in (
+            *("controllers.quadrotor_control", "vehicles.multirotor"),
+            "trajectories.lissajous_traj",
+        )
+    )
+    peer, curve = control.SE3Control(params), curves.TwoDLissajous(1.5, 1.5, 1.6, 2.4, height=2.0)
+    state = {"x": curve.update(0.0)["x"], "v": np.zeros(3), "q": np.array([0.0, 0.0, 0.0, 1.0])}
+    state |= {"w": np.zeros(3), "wind": np.zeros(3), "rotor_speeds": hover_speeds(params)}
+    vehicle, log = vehicles.Multirotor(params, state, "cmd_motor_speeds", aero=True), []
+    for time in np.arange(0.0, 12.0, 1.0 / RATE):
+        flat, phase = curve.update(time), 2.9 * time
+        heights = (np.sin(phase), 2.9 * np.cos(phase), -(2.9**2) * np.sin(phase))
+        for name, height in zip(("x", "x_dot", "x_ddot"), heights, strict=True):
+            flat[name] = np.asarray(flat[name], float) + [0.0, 0.0, 0.5 * height]
+        log.append((time, state["q"], state["rotor_speeds"], state["v"]))
+        state = vehicle.step(state, peer.update(time, state, flat), 1.0 / RATE)
+    times, quats, speeds, velocities = (np.array(each) for each in zip(*log, strict=True))
+    thrusts = params["k_eta"] * np.sum(speeds**2, axis=1) / params["mass"]
+    return pj.fit_drag(times, quats[:, [3, 0, 1, 2]], thrusts, velocities=velocities)[0]
+
+
+def hover_speeds(params: dict[str, Any]) -> np.ndarray:
+    """Return the speeds (4,) [rad/s] of the rotors of a robot at hover."""
+    return np.full(4, np.sqrt(0.25 * params["mass"] * GRAVITY / params["k_eta"]))
 
 
 def track(own: Any, state: dict[str, np.ndarray], at: SimpleNamespace) -> np.ndarray:
@@ -120,7 +145,7 @@ def fly(plan: Any, params: dict[str, Any], controller: str, wind: float | None) 
     turning = np.gradient(points.body_rate, 1.0 / RATE, axis=0)[ahead]
     state = {"x": points.pos[0], "v": points.vel[0], "q": quats[0], "w": np.zeros(3)}
     state["wind"] = np.array([wind or 0.0, 0.0, 0.0])
-    state["rotor_speeds"] = np.full(4, np.sqrt(0.25 * params["mass"] * GRAVITY / params["k_eta"]))
+    state["rotor_speeds"] = hover_speeds(params)
     vehicle = multirotor(params, state, "cmd_motor_thrusts", aero=wind is not None)
     most = params["k_eta"] * params["rotor_speed_max"] ** 2
     apart, saturated = np.zeros(len(quats)), np.zeros(len(quats), bool)
@@ -155,14 +180,15 @@ def main() -> None:
             "| recovery, max cm | recoveries within 20 cm | flights that saturate |",
             "|---|---|---|---|---|---|---|",
         )
+        drags = {name: identify_drag(params) for name, (params, _) in robots().items()}
+        for name, drag in drags.items():
+            bench.row(robot=name, across=drag.across, along=drag.along)
         for name, task, wind in itertools.product(robots(), tasks, (None, 0.0, 3.0)):
             (params, speed), (module, tool) = robots()[name], tasks[task]
-            cases = module.draw(
-                options.num, seed=options.seed, robot=model_of(name, params, speed, tool)
-            )
+            robot, blown = model_of(name, params, speed, tool), None
             if wind is not None:
-                limits = cases.limits.replace(air=air_of(params, wind, options.num))
-                cases = dataclasses.replace(cases, limits=limits)
+                robot, blown = dataclasses.replace(robot, drag=drags[name]), (wind, 0.0, 0.0)
+            cases = module.draw(options.num, seed=options.seed, robot=robot, wind=blown)
             plans = pj.plan(module.planner(recovery="brake"), cases)
             good = np.asarray(module.judge(cases, plans).success)
             bench.count(good)
