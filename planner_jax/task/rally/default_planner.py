@@ -60,20 +60,22 @@ _GUESSES = np.array(
 _UNUSED_WEIGHT = 0.005
 _LEAST_RANGE = 0.01  # [m], by which a distance from the middle of a smaller range is divided
 _SHORTEST = 0.1  # [s], least duration of a flight in a starting point
-# Settings of searches for any plan that keeps the limits: energy and preferences hardly count.
-ANY_FEASIBLE = (
-    ("energy_weight", 1e-9),
-    ("place_weight", 1e-5),
-    ("apex_weight", 1e-5),
-    ("margin", 0.01),
+# Settings of searches for any plan that keeps the limits. All costs are a tenth, so that the
+# penalties weigh more. Their ratios stay: without `apex_weight` a plan may end in too short a
+# flight, after which no hit is possible.
+_ANY_FEASIBLE = (
+    ("energy_weight", 5e-9),
+    ("place_weight", 3e-4),
+    ("apex_weight", 3e-4),
+    ("margin", 0.02),
 )
 _HARD = LbfgsConfig(max_steps=200, memory=12, tolerance=1e-6, patience=5)
 # A round is an attempt to solve the cases that are unsolved so far.
 ROUNDS = (
-    Round(1, LbfgsConfig(max_steps=8)),
+    Round(1, LbfgsConfig(max_steps=12)),
     Round(1, LbfgsConfig(max_steps=60)),
-    Round(1, _HARD, ANY_FEASIBLE),
-    Round(5, _HARD, ANY_FEASIBLE, first=1),
+    Round(1, _HARD, _ANY_FEASIBLE),
+    Round(5, _HARD, _ANY_FEASIBLE, first=1),
 )
 
 
