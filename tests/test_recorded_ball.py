@@ -29,10 +29,11 @@ def ball(pos, vel, drag=0.0, lift=(0.0, 0.0, 0.0)):
     return SpinningBall(*map(as_floats, (pos, vel, drag, lift)))
 
 
-def flights(noise=0.001, seed=0, bounces=0, span=0.12):
+def flights(noise=0.001, seed=0, span=0.12, periodic=False):
     """Generate times, observed positions, and true drag, lift and position 0.2 s later."""
     rng = np.random.default_rng(seed)
     times = np.sort(rng.uniform(0.0, span, (LANES, NUM)), axis=1)
+    times = np.linspace(times[:, 0], span, NUM, axis=1) if periodic else times
     vel = rng.normal([7.0, 0.0, 1.0], 0.7, (LANES, 3))
     drag = BALL.drag * np.exp(0.1 * rng.normal(size=LANES))
     lift = 0.3 * drag[:, None] * 7.0 * rng.normal(size=(LANES, 3))
@@ -132,6 +133,24 @@ def test_a_batch_equals_its_flights_and_origin_and_clock_do_not_matter():
     np.testing.assert_allclose(then, many.predict([0.3]).pos[3, 0], atol=2e-3)
 
 
+def test_a_spin_across_the_flight_adds_the_speed_of_the_surface_to_the_drag(float64):
+    spinning = ball([0, 0, 0], [4, 0, 0], 0.1, [7, 0, 1 / 3])  # surface: 9 m / 3 s = 3 m/s
+    found = spin.spin_acceleration(spinning, air(gravity=0.0))
+    np.testing.assert_allclose(found, [-0.1 * 5 * 4, 4 / 3, 0], atol=1e-12)
+
+
+def test_stamps_that_a_periodic_camera_delays_are_corrected():
+    times, seen, _, _, truth = flights(seed=2, periodic=True)
+    delays = np.random.default_rng(2).normal(0.0, 0.001, times.shape)  # 7 mm of the path
+    off = []
+    for stamps in (times, times + delays):
+        found = pj.ball.fit(stamps, seen, ball=BALL)
+        then = found.predict(np.full((LANES, 1), 0.32))
+        off.append(np.median(np.linalg.norm(then.pos[:, 0] - truth, axis=1)))
+    assert off[1] < 1.3 * off[0]
+    assert np.median(found.stamp_noise) == pytest.approx(0.001, rel=0.3)
+
+
 def test_outliers_that_come_first_and_absent_observations_do_no_harm():
     times, seen, _, _, truth = flights(seed=1)
     seen[:, :5] = [0.3, 0.3, 0.3]  # a reflection, seen before the ball
@@ -179,7 +198,7 @@ def test_a_fit_through_an_observed_bounce_predicts_the_flight_after_it():
     low, high = then.interval(0.99)
     assert np.all((low[0] < truth[-1]) & (truth[-1] < high[0]))
     # The bounce determines the restitution, whose prior has a standard deviation of 0.1.
-    assert np.sqrt(found.covariance[10, 10]) < 0.02
+    assert np.sqrt(found.covariance[12, 12]) < 0.02
 
 
 def test_fit_refuses_what_is_no_recording_of_one_flight():

@@ -1,10 +1,12 @@
 """Estimate of a ball's flight from one's own recording, and its prediction with uncertainty.
 
 The unknowns are position and velocity at the first observation, logarithm of the drag K_D, lift
-vector l, and restitution and friction of the plane, 12 numbers. Gauss-Newton steps find their most
-probable values. The errors of positions have Student's t distribution, so that outliers have small
-weights. Errors along the path exceed errors across it by the error of a time stamp, multiplied by
-the speed. The residuals yield both standard deviations and the correlation of neighbouring errors.
+vector l, share a and drift of delays of the stamps, restitution and friction of the plane, and log
+`Ball.reach`. For a periodic camera, deviations of its stamps from the period are delays: a is 1. If
+times are irregular, a is 0. Gauss-Newton steps find the most probable values. Errors of positions
+have Student's t distribution: outliers have small weights. Errors along the path exceed errors
+across it by the error of a time stamp, multiplied by the speed. The residuals yield both standard
+deviations and the correlation of neighbouring errors.
 """
 
 import functools
@@ -28,9 +30,11 @@ from planner_jax.core.compiled import QUICK_OPTIONS
 from planner_jax.core.errors import CaseError
 from planner_jax.core.rules import POSITIVE
 
+_UNKNOWNS, _BEFORE = 15, 12  # numbers of unknowns, and of those with an effect before a bounce
+_DRIFT = 4.0  # standard deviation of the drift of stamps, divided by the spread of their delays
 _TAIL = 4.0  # degrees of freedom of Student's t distribution of the errors
 _WEIGHT = 4.0  # number of observations that the assumed noise counts for
-_ROUNDS = (2, 4)  # numbers of linearisations of a short and of a longer flight
+_ROUNDS = (2, 4)  # numbers of linearisations of a short flight without bounce, and of others
 _WEIGHINGS = 3  # number of weighted least-squares problems for each linearisation
 _LEAST = 4  # least number of observations
 _BOUNCES = 2  # number of bounces that are simulated
@@ -58,7 +62,7 @@ class Ball:
     # Standard deviations of the lift vector, in units of K_D |v|: along the flight, horizontal
     # and across the flight (topspin, backspin), and perpendicular to both (sidespin).
     lift_spread: tuple[float, float, float] = (0.4, 0.4, 0.4)
-    reach: float = 20.0  # [m], speed of the ball's surface, divided by the lift vector's length
+    reach: tuple[float, float] = (20.0, 0.3)  # [m], speed of the surface / |l|, and spread of log
     restitution: tuple[float, float] = (0.8, 0.1)  # e, mean and standard deviation
     friction: tuple[float, float] = (0.3, 0.1)  # mu, mean and standard deviation
     grip: float = 0.4  # 2/5 for a hollow ball, 2/7 for a solid ball
@@ -79,11 +83,11 @@ class Ball:
         for name, value in (("mass", mass), ("diameter", diameter), ("air", air)):
             require_number(name, value, POSITIVE)
         unit = air * math.pi * diameter**2 / (8.0 * mass)  # [1/m]
-        return cls(drag=0.47 * unit, drag_spread=0.2, reach=1.0 / (0.4 * unit))
+        return cls(drag=0.47 * unit, drag_spread=0.2, reach=(1.0 / (0.4 * unit), 0.3))
 
 
 # Drag, spin and bounces of "table tennis" were measured on recordings of two laboratories.
-_TABLE_TENNIS = Ball(0.152, 0.15, (0.6, 0.3, 0.18), 7.0, (0.93, 0.05), (0.22, 0.08))
+_TABLE_TENNIS = Ball(0.133, 0.1, (0.6, 0.35, 0.22), (8.0, 0.4), (0.94, 0.05), (0.24, 0.05))
 BALLS = {"unknown": Ball(), "table tennis": _TABLE_TENNIS}
 
 
@@ -123,8 +127,7 @@ class FlightFit:
     noise: np.ndarray  # () [m], standard deviation of an observed coordinate across the path
     stamp_noise: np.ndarray  # () [s], standard deviation of a time stamp
     outliers: np.ndarray  # () share of observations that are far from the flight
-    # (12, 12), of position, velocity, log K_D, lift vector, restitution and friction
-    covariance: np.ndarray
+    covariance: np.ndarray  # (15, 15), of the unknowns, in the order of the module's docstring
     _data: tuple[Any, ...]  # times of observations, origin, and inputs of the program of `predict`
 
     def predict(self, times: ArrayLike) -> Prediction:
@@ -233,17 +236,17 @@ def fit(
     distance = float(np.fmax.reduce(np.abs(padded[..., 1:]), axis=None))
     program = _program(_estimate, observed, _num_steps(ball.drag * distance))
     fitted = np.asarray(program(padded, floors, numbers))
-    state = fitted[: len(rows)].reshape((*batch, -1)).astype(np.float64)
-    verdict, rule = state[..., 161], "of one flight in one frame, except for less than half"
+    found = fitted[: len(rows)].reshape((*batch, -1)).astype(np.float64)
+    state, covariance, others = _unpack(found)
+    verdict, rule = others[..., 5], "of one flight in one frame, except for less than half"
     smooth = "of a flight with the lift and drag of `ball`; errors of neighbours are alike"
     _require(verdict >= 0.0, batch, "positions", smooth)
     _require(verdict > 0.0, batch, "positions", rule)
     start, origin = first[:, 0].reshape(batch), first[:, 1:].reshape((*batch, 3))
     freedom = (3.0 * counts - 9.0 + _WEIGHT).reshape(batch)
-    pos, drag, errors = state[..., :3] + origin, np.exp(state[..., 6]), np.sqrt(state[..., 156:158])
-    covariance = state[..., 12:156].reshape((*batch, 12, 12))
+    pos, drag, errors = state[..., :3] + origin, np.exp(state[..., 6]), np.sqrt(others[..., :2])
     data = clock.reshape(shape[:-1]), origin, freedom, fitted, numbers, bounces
-    beside = errors[..., 0], errors[..., 1], state[..., 160], covariance, data
+    beside = errors[..., 0], errors[..., 1], others[..., 4], covariance, data
     return FlightFit(start, pos, state[..., 3:6], drag, state[..., 7:10], *beside)
 
 
@@ -259,6 +262,12 @@ def _require(holds: np.ndarray | np.bool_, batch: tuple[int, ...], name: str, ru
         raise CaseError(
             name, rule, index=index, shown="", more=int(np.size(holds) - np.sum(holds)) - 1
         )
+
+
+def _unpack(fitted: Any) -> tuple[Any, Any, Any]:
+    """Return the state, its covariance, and the other numbers of results of `_estimate`."""
+    square = fitted[..., _UNKNOWNS:-6].reshape((*fitted.shape[:-1], _UNKNOWNS, _UNKNOWNS))
+    return fitted[..., :_UNKNOWNS], square, fitted[..., -6:]
 
 
 def _next_size(num: int, least: int = 16) -> int:
@@ -283,40 +292,46 @@ def _program(function: Callable, bounces: int, steps: int) -> Callable:
 
 def _air(numbers: Array, floor: Array, state: Array) -> Surroundings:
     return Surroundings(
-        numbers[12], numbers[13:16], floor, state[10], state[11], numbers[10], numbers[5]
+        numbers[13], numbers[14:17], floor, state[12], state[13], numbers[11], jnp.exp(state[14])
     )
 
 
 def _positions(
-    state: Array, times: Array, numbers: Array, floor: Array, counts: tuple[int, int]
+    state: Array, stamps: Array, numbers: Array, floor: Array, counts: tuple[int, int]
 ) -> tuple[Array, tuple[Array, Array]]:
     """Return positions (N, 3), and positions with velocities as further results of `jacfwd`."""
     ball = SpinningBall(state[:3], state[3:6], jnp.exp(state[6]), state[7:10])
     air = _air(numbers, floor, state)
-    found = spin_flight(ball, times, air, bounces=counts[0], steps=counts[1])
-    return found[0], found
+    pos, vel = spin_flight(ball, stamps[0], air, bounces=counts[0], steps=counts[1])
+    pos = pos - (state[10] * (stamps[1] + state[11] * stamps[2]))[:, None] * vel
+    return pos, (pos, vel)
+
+
+def _linearise(num: int, state: Array, *others: Any) -> tuple[Array, tuple[Array, Array]]:
+    """Return slopes (N, 3, num) by the first `num` unknowns, with positions and velocities."""
+    whole = functools.partial(jnp.append, values=state[num:])
+    return jax.jacfwd(lambda x: _positions(whole(x), *others), has_aux=True)(state[:num])
 
 
 def _estimate(rows: Array, floor: Array, numbers: Array, counts: tuple[int, int]) -> Array:
     """Estimate one flight from rows (N, 4) of time [s] and position [m]; absent rows are NaN.
 
-    The result (162,) has the unknowns, their covariance, squared errors of positions and of time
+    The result has the unknowns, their covariance, squared errors of positions and of time
     stamps, last time, floor, share of outliers, and 1 if the flight explains the rows. Otherwise
     the last number is -1 if errors of neighbours are alike, and 0 if not.
     """
     present = jnp.isfinite(rows[:, 0])
     num = jnp.sum(present, dtype=rows.dtype)
     last = jnp.max(jnp.where(present, rows[:, 0], 0.0))
-    times, seen = (
-        jnp.where(present, rows[:, 0], last),
-        jnp.where(present[:, None], rows[:, 1:], 0.0),
-    )
-    drag, spread, noise = numbers[0], numbers[1], numbers[16]
+    times = jnp.where(present, rows[:, 0], last)
+    seen = jnp.where(present[:, None], rows[:, 1:], 0.0)
+    stamps, delay = _stamps(times, seen, present, num)
+    others = stamps, numbers, floor, counts
+    drag, spread, noise = numbers[0], numbers[1], numbers[17]
     is_short = counts[1] == _STEPS[0][0]
-    means = jnp.stack([jnp.log(drag), *jnp.zeros(3), numbers[6], numbers[8]])
-
-    def positions(state: Array) -> tuple[Array, tuple[Array, Array]]:
-        return _positions(state, times, numbers, floor, counts)
+    free = _UNKNOWNS if counts[0] else _BEFORE
+    later = [0.5, 0.0, numbers[7], numbers[9], jnp.log(numbers[5])]  # means of the last unknowns
+    means = jnp.stack([jnp.log(drag), *jnp.zeros(3), *later])
 
     def guess(pair: Array) -> tuple[Array, ...]:
         i = jnp.floor(pair[0] * (num - 1.0))
@@ -324,7 +339,7 @@ def _estimate(rows: Array, floor: Array, numbers: Array, counts: tuple[int, int]
         i = i.astype(jnp.int32)
         span = times[j] - times[i]
         # The mean velocity between two observations is the velocity in the middle of their times.
-        air = _air(numbers, floor, jnp.zeros(12))
+        air = _air(numbers, floor, jnp.zeros(_UNKNOWNS))
         ball = SpinningBall(seen[i], (seen[j] - seen[i]) / span, drag, jnp.zeros(3))
         acc = spin_acceleration(ball, air)
         vel = ball.vel - (0.5 * span + times[i]) * acc
@@ -333,7 +348,7 @@ def _estimate(rows: Array, floor: Array, numbers: Array, counts: tuple[int, int]
         if is_short and not counts[0]:  # a parabola is near enough to a short flight
             path = pos[None] + jnp.outer(times, vel) + jnp.outer(0.5 * times**2, acc)
         else:
-            path = positions(state)[0]
+            path = _positions(state, *others)[0]
         away = jnp.sum((path - seen) ** 2, axis=1)
         # A sum of roots depends little on outliers.
         return state, away, jnp.sum(jnp.where(present, jnp.sqrt(jnp.sqrt(away)), 0.0))
@@ -355,20 +370,19 @@ def _estimate(rows: Array, floor: Array, numbers: Array, counts: tuple[int, int]
     # The lift along a short flight has no effect before a bounce: it is not estimated, and only its
     # uncertainty counts.
     scaled = frame / spreads.at[0].multiply(0.05 if is_short else 1.0)[:, None]
-    prior = jnp.diag(
-        jnp.stack([*jnp.zeros(6), 1 / spread**2, *jnp.zeros(3), *(1 / numbers[7:10:2] ** 2)])
-    )
-    prior = prior.at[7:10, 7:10].set(scaled.T @ scaled)
+    later = [0.5, _DRIFT, numbers[8], numbers[10], numbers[6]]
+    spread = jnp.stack([*jnp.full(6, jnp.inf), spread, *jnp.full(3, jnp.inf), *later])
+    prior = jnp.diag(spread[:free] ** -2).at[7:10, 7:10].set(scaled.T @ scaled)
 
     def linearise(carry: tuple[Array, ...], _: None) -> tuple[tuple[Array, ...], tuple]:
-        state, *others = carry
-        slopes, (pos, vel) = jax.jacfwd(positions, has_aux=True)(state)
+        state, *weights = carry
+        slopes, (pos, vel) = _linearise(free, state, *others)
         squared = at_least(jnp.sum(vel * vel, axis=1), 1e-6)
         direction = (vel * lax.rsqrt(squared)[:, None])[..., None]
-        # Errors and their slopes in one array (N, 3, 13); parts across and along the path.
+        # Errors and their slopes in one array (N, 3, free + 1); parts across and along the path.
         whole = jnp.concatenate([slopes, (seen - pos)[..., None]], axis=2)
         along = direction * jnp.sum(direction * whole, axis=1, keepdims=True)
-        known = (state - jnp.concatenate([jnp.zeros(6), means])).at[:6].set(0.0)
+        known = (state - jnp.concatenate([jnp.zeros(6), means])).at[:6].set(0.0)[:free]
         mean_squared = jnp.sum(jnp.where(present, squared, 0.0)) / num
 
         def weigh(carry: tuple[Array, ...], _: None) -> tuple[tuple[Array, ...], tuple]:
@@ -376,11 +390,11 @@ def _estimate(rows: Array, floor: Array, numbers: Array, counts: tuple[int, int]
             variance = scales[0] + scales[1] * squared  # along the path
             white = (whole - along) * lax.rsqrt(scales[0])
             white = white + along * lax.rsqrt(variance)[:, None, None]
-            left = white[..., 12] - white[..., :12] @ change
+            left = white[..., free] - white[..., :free] @ change
             distance = jnp.sum(left * left, axis=1)
             weight = jnp.where(present, (_TAIL + 3.0) / (_TAIL + distance), 0.0)
-            rows = (jnp.sqrt(weight * overlap)[:, None, None] * white).reshape(-1, 13)
-            matrix, errors = rows[:, :12], rows[:, 12]
+            rows = (jnp.sqrt(weight * overlap)[:, None, None] * white).reshape(-1, free + 1)
+            matrix, errors = rows[:, :free], rows[:, free]
             normal = matrix.T @ matrix + prior
             # Scaled unknowns, so that the matrix is well conditioned in single precision.
             unit = lax.rsqrt(jnp.diag(normal))
@@ -390,8 +404,8 @@ def _estimate(rows: Array, floor: Array, numbers: Array, counts: tuple[int, int]
             left = (errors - matrix @ change).reshape(-1, 3)
             ahead = jnp.sum(left * direction[..., 0], axis=1) ** 2
             # Numbers of unknowns that all errors, and errors along the path, determine.
-            spent = 12.0 - jnp.sum(prior * covariance)
-            inner = jnp.sum(direction * matrix.reshape(-1, 3, 12), axis=1)
+            spent = free - jnp.sum(prior * covariance)
+            inner = jnp.sum(direction * matrix.reshape(-1, 3, free), axis=1)
             spent_along = jnp.sum((inner @ covariance) * inner)
             # Errors of neighbours may be correlated; N observations count as (1 - r) / (1 + r) N.
             alike = jnp.sum(left[1:] * left[:-1]) / jnp.sum(left * left) + spent / (3.0 * num)
@@ -407,18 +421,19 @@ def _estimate(rows: Array, floor: Array, numbers: Array, counts: tuple[int, int]
             far = jnp.sum(present & (distance > _FAR), dtype=num.dtype) / num
             return (change, scales, (1.0 - alike) / (1.0 + alike)), (covariance, far)
 
-        begun = (jnp.zeros_like(state), *others)
-        (change, *others), found = lax.scan(weigh, begun, None, length=_WEIGHINGS)
-        return (state + change, *others), jax.tree.map(lambda leaf: leaf[-1], found)
+        begun = (jnp.zeros_like(state[:free]), *weights)
+        (change, *weights), found = lax.scan(weigh, begun, None, length=_WEIGHINGS)
+        return (state.at[:free].add(change), *weights), jax.tree.map(lambda leaf: leaf[-1], found)
 
     scales = jnp.stack([jnp.maximum(0.6 * error, noise**2), jnp.zeros_like(noise)])
     begun = state, scales, jnp.ones_like(noise)
     (state, scales, overlap), (covariance, far) = lax.scan(
-        linearise, begun, None, length=_ROUNDS[not is_short]
+        linearise, begun, None, length=_ROUNDS[counts[0] > 0 or not is_short]
     )
     size = jnp.linalg.norm(scaled @ state[7:10])
-    axial = jnp.concatenate([jnp.zeros(7), spreads[0] * forward, jnp.zeros(2)])
-    covariance = covariance[-1] + (jnp.outer(axial, axial) if is_short else 0.0)
+    axial = jnp.zeros(_UNKNOWNS).at[7:10].set(spreads[0] * forward)
+    whole = jnp.diag(spread.at[:free].set(0.0) ** 2).at[:free, :free].set(covariance[-1])
+    covariance = whole + (jnp.outer(axial, axial) if is_short else 0.0)
     # The error along the path must be small beside the extent of the recording.
     extent = jnp.max(seen, axis=0) - jnp.min(seen, axis=0)
     error = scales[0] + scales[1] * jnp.sum(state[3:6] ** 2)
@@ -426,8 +441,31 @@ def _estimate(rows: Array, floor: Array, numbers: Array, counts: tuple[int, int]
     sound &= jnp.isfinite(jnp.sum(covariance)) & (far[-1] <= _MOST_OUTLIERS)
     # Spin that the prior excludes leaves smooth errors; another frame leaves errors that alternate.
     verdict = jnp.where(sound, 1.0, jnp.where(overlap < 0.5, -1.0, 0.0)).astype(rows.dtype)
-    others = jnp.stack([*scales, last, floor, far[-1], verdict])
-    return jnp.concatenate([state, covariance.reshape(-1), others])
+    scales = scales.at[1].add(state[10] ** 2 * delay)
+    results = jnp.stack([*scales, last, floor, far[-1], verdict])
+    return jnp.concatenate([state, covariance.reshape(-1), results])
+
+
+def _stamps(times: Array, seen: Array, present: Array, num: Array) -> tuple[Array, Array]:
+    """Return times, delays by the clock of a periodic camera, and drift (3, N) [s], and variance.
+
+    A delay makes a step in time longer, but not the ball's step; an outlier does the opposite. The
+    smaller ratio of a step to the median step is the number of periods. The drift ends at zero.
+    """
+    steps = jnp.stack([jnp.diff(times), jnp.linalg.norm(jnp.diff(seen, axis=0), axis=1)])
+    middle = (0.5 * (num - 1.0)).astype(jnp.int32)
+    median = jnp.sort(jnp.where(present[1:], steps, jnp.inf), axis=1)[:, middle]
+    ratios = jnp.min(steps / at_least(median, 1e-9)[:, None], axis=0)
+    frames = jnp.cumsum(jnp.maximum(jnp.round(ratios), 1.0), dtype=times.dtype)
+    frames = jnp.concatenate([jnp.zeros(1), jnp.where(present[1:], frames, 0.0)])
+    weight, late, squared = jnp.where(present, 1.0, 0.0), times, num
+    for _ in range(_WEIGHINGS):  # a regression with Student's t distribution
+        far, away = (x - jnp.sum(weight * x) / jnp.sum(weight) for x in (frames, times))
+        period = jnp.sum(weight * far * away) / jnp.sum(weight * far**2)
+        late = jnp.where(present, away - period * far, 0.0)
+        squared = jnp.sum(weight * late**2) / (num - 2.0) + 1e-12
+        weight = jnp.where(present, (_TAIL + 1.0) / (_TAIL + late**2 / squared), 0.0)
+    return jnp.stack([times, late, jnp.sqrt(squared) * (times / jnp.max(times) - 1.0)]), squared
 
 
 def _forecast(fitted: Array, times: Array, numbers: Array, counts: tuple[int, int]) -> Array:
@@ -435,13 +473,14 @@ def _forecast(fitted: Array, times: Array, numbers: Array, counts: tuple[int, in
 
     The result (T, 24) has positions, velocities, and covariances of true and observed positions.
     """
-    state, covariance = fitted[:12], fitted[12:156].reshape(12, 12)
-    scales, span, floor = fitted[156:158], fitted[158], fitted[159]
-    slopes, (pos, vel) = jax.jacfwd(_positions, has_aux=True)(state, times, numbers, floor, counts)
-    sure = jnp.einsum("nik,kl,njl->nij", slopes, covariance, slopes)
+    state, covariance, (*scales, span, floor, _, _) = _unpack(fitted)
+    num = _UNKNOWNS if counts[0] else _BEFORE
+    stamps = jnp.zeros((3, *times.shape)).at[0].set(times)
+    slopes, (pos, vel) = _linearise(num, state, stamps, numbers, floor, counts)
+    sure = jnp.einsum("nik,kl,njl->nij", slopes, covariance[:num, :num], slopes)
     after = jnp.maximum(times - 0.5 * span, 0.0)
     eye = jnp.eye(3, dtype=pos.dtype)[None]
-    sure = sure + (numbers[11] * after**3 / 3.0)[:, None, None] * eye
+    sure = sure + (numbers[12] * after**3 / 3.0)[:, None, None] * eye
     stamps = scales[1] * jnp.einsum("ni,nj->nij", vel, vel)
     seen = sure + scales[0] * eye + stamps
     return jnp.concatenate([pos, vel, sure.reshape(-1, 9), seen.reshape(-1, 9)], axis=1)

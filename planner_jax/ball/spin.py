@@ -1,8 +1,9 @@
 """Flight of a spinning ball with quadratic drag, lift and wind, which bounces on a plane.
 
-With the velocity u = v - w relative to the wind w, the acceleration is g - K_D |u| u + l x u. The
+With the velocity u = v - w relative to the wind w, the acceleration is g - K_D s u + l x u. The
 lift vector l = K_M omega [1/s] is proportional to the spin omega [rad/s]; between two bounces it is
-constant. World frame, z up, SI units. Functions take one ball; use `jax.vmap` for many.
+constant. Spin increases the drag: s^2 = |u|^2 + |r omega x u|^2 / |u|^2, where r is the radius.
+World frame, z up, SI units. Functions take one ball; use `jax.vmap` for many.
 """
 
 from collections.abc import Sequence
@@ -13,7 +14,7 @@ from flax import struct
 from jax import Array, lax
 from jaxtyping import PyTree
 
-from planner_jax.ball.flight import BallState, ball_acceleration, rk4_step
+from planner_jax.ball.flight import BallState, rk4_step
 from planner_jax.core.arithmetic import at_least, components, reciprocal
 
 _LEAST_SPEED = 1e-3  # [m/s], smaller speeds count as this speed in divisions
@@ -45,14 +46,20 @@ class Surroundings:
 
 
 def spin_acceleration(ball: SpinningBall, air: Surroundings) -> Array:
-    """Return the acceleration g - K_D |u| u + l x u (3,) [m/s^2] of a spinning ball in flight."""
+    """Return the acceleration g - K_D s u + l x u (3,) [m/s^2] of a spinning ball in flight."""
     return jnp.stack(_rate(components(ball.vel), ball, air))
 
 
 def _rate(vel: Sequence[Array], ball: SpinningBall, air: Surroundings) -> PyTree:
-    u: PyTree = tuple(v - w for v, w in zip(vel, air.wind, strict=True))
-    acc, lift = ball_acceleration(u, ball.drag, air.gravity), components(ball.lift)
-    return tuple(acc[k] + lift[k - 2] * u[k - 1] - lift[k - 1] * u[k - 2] for k in range(3))
+    u, lift = tuple(v - w for v, w in zip(vel, air.wind, strict=True)), components(ball.lift)
+    push = tuple(lift[k - 2] * u[k - 1] - lift[k - 1] * u[k - 2] for k in range(3))
+    squared = u[0] * u[0] + u[1] * u[1] + u[2] * u[2]
+    moving = squared > 0.0
+    squared = jnp.where(moving, squared, 1.0)
+    turning = air.reach**2 * sum(a * a for a in push) / squared  # squared speed of the surface
+    braking = jnp.where(moving, ball.drag * jnp.sqrt(squared + turning), 0.0)
+    fall = (0.0, 0.0, -air.gravity)
+    return tuple(fall[k] - braking * u[k] + push[k] for k in range(3))
 
 
 def spin_step(ball: SpinningBall, duration: Array, air: Surroundings) -> SpinningBall:

@@ -135,14 +135,21 @@ def _judge(
 
 
 def _ball_acc(vel: np.ndarray, air) -> np.ndarray:
-    """Return the accelerations g - K_D |u| u + l x u of balls with velocities v, and u = v - w.
+    """Return the accelerations g - K_D s u + l x u of balls with velocities v, and u = v - w.
 
-    `air` has the rows K_D and g; and, for spinning balls, three rows of l and of w.
+    `air` has the rows K_D and g; and, for spinning balls, three rows of l and of w, and a row of
+    the radius r, in units of |l| / omega. Without spin s = |u|, and with the spin omega
+    s^2 = |u|^2 + |r omega x u|^2 / |u|^2 .
     """
-    u = vel - air[5:] if len(air) > 2 else vel
-    acc = -air[0] * np.sqrt((u * u).sum(axis=0)) * u
+    spins = len(air) > 2
+    u = vel - air[5:8] if spins else vel
+    square = (u * u).sum(axis=0)
+    push = np.cross(air[2:5], u, axis=0) if spins else 0.0
+    if spins:
+        square = square + air[8] ** 2 * (push * push).sum(axis=0) / np.maximum(square, 1e-12)
+    acc = -air[0] * np.sqrt(square) * u + push
     acc[2] -= air[1]
-    return acc + np.cross(air[2:5], u, axis=0) if len(air) > 2 else acc
+    return acc
 
 
 def ball_step(state: np.ndarray, step: np.ndarray, air) -> np.ndarray:
@@ -220,7 +227,9 @@ def _judge_impact(case: dict, drag_after_impact: bool, tolerances: dict) -> tupl
     durations, end = case["durations"], case["durations"].sum(axis=1)
     air, spins = np.stack([case["drag"], case["gravity"]]), "lift" in case
     if spins:
-        air = np.concatenate([air, case["lift"].T, case["around.wind"].T])
+        air = np.concatenate(
+            [air, case["lift"].T, case["around.wind"].T, case["around.reach"][None]]
+        )
     state = np.concatenate([case["ball.pos"].T, case["ball.vel"].T])
     for _ in range(_INCOMING_STEPS):
         state = ball_step(state, end / _INCOMING_STEPS, air)

@@ -33,9 +33,9 @@ def with_spin(
     def full(x: PyTree, *shape: int) -> Array:
         return jnp.asarray(np.broadcast_to(x, (*case.batch_shape, *shape)), case.drag.dtype)
 
-    numbers = 0.0, case.restitution, ball.friction[0], ball.grip, ball.reach
+    numbers = 0.0, case.restitution, ball.friction[0], ball.grip, ball.reach[0]
     around = spinning.Surroundings(case.gravity, full(wind, 3), *map(full, numbers))
-    return case.replace(lift=full(turn * radius / ball.reach, 3), around=around)
+    return case.replace(lift=full(turn * radius / ball.reach[0], 3), around=around)
 
 
 def predict_spin(case: PyTree, num_nodes: int) -> PathTable:
