@@ -51,7 +51,7 @@ def test_every_easy_serve_is_solved_and_confirmed_by_the_referee(cases, plans):
 def test_hits_at_utm_coordinates_have_the_same_plans(cases, plans):
     away = np.array([5e5, 4e6, 0.0])
     given = (cases.ball.pos + away, cases.ball.vel, cases.target + away)
-    far = pj.hit.case(*given, start=cases.head_state[:, 0] + away)
+    far = pj.hit.case(*given, start=cases.head_state[:, 0] + away, gravity=cases.gravity)
     found = plan(PLANNER, far)
     assert_same(found.replace(origin=None), plans)
     verdict, usual = pj.hit.judge(far, found), pj.hit.judge(cases, plans)
