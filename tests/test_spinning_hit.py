@@ -27,7 +27,7 @@ def case(spin=(30.0, 200.0, -100.0), **options):
 
 
 def air_of(of):
-    numbers = of.drag, of.gravity, *of.lift, *of.around.wind
+    numbers = of.drag, of.gravity, *of.lift, *of.around.wind, of.around.reach
     return np.array(numbers, float)[:, None]
 
 

@@ -141,15 +141,14 @@ def _ball_acc(vel: np.ndarray, air) -> np.ndarray:
     the radius r, in units of |l| / omega. Without spin s = |u|, and with the spin omega
     s^2 = |u|^2 + |r omega x u|^2 / |u|^2 .
     """
-    spins = len(air) > 2
-    u = vel - air[5:8] if spins else vel
+    u = vel - air[5:8] if len(air) > 2 else vel
     square = (u * u).sum(axis=0)
-    push = np.cross(air[2:5], u, axis=0) if spins else 0.0
-    if spins:
+    if len(air) > 2:
+        push = np.cross(air[2:5], u, axis=0)
         square = square + air[8] ** 2 * (push * push).sum(axis=0) / np.maximum(square, 1e-12)
-    acc = -air[0] * np.sqrt(square) * u + push
+    acc = -air[0] * np.sqrt(square) * u
     acc[2] -= air[1]
-    return acc
+    return acc + push if len(air) > 2 else acc
 
 
 def ball_step(state: np.ndarray, step: np.ndarray, air) -> np.ndarray:
