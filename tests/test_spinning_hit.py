@@ -59,7 +59,7 @@ def test_the_referee_returns_the_ball_to_the_target_with_and_without_slip_at_the
     slides = np.linalg.norm(rub) > 0.999 * of.around.friction * push[0]
     assert slides == bool(options)
     state = np.concatenate([BALL.pos, after])[:, None]
-    top, _, landing, time = referee._return_in_air(state, np.zeros(1), air)
+    top, _, landing, time = referee.return_in_air(state, np.zeros(1), air)
     np.testing.assert_allclose(landing[:, 0], of.target, atol=1e-3)
     assert time[0] == pytest.approx(TIME, abs=1e-3) and top[0] == pytest.approx(apex, abs=1e-3)
 

@@ -143,12 +143,12 @@ def _ball_acc(vel: np.ndarray, air) -> np.ndarray:
     """
     u = vel - air[5:8] if len(air) > 2 else vel
     square = (u * u).sum(axis=0)
+    push = np.cross(air[2:5], u, axis=0) if len(air) > 2 else np.zeros(())
     if len(air) > 2:
-        push = np.cross(air[2:5], u, axis=0)
         square = square + air[8] ** 2 * (push * push).sum(axis=0) / np.maximum(square, 1e-12)
     acc = -air[0] * np.sqrt(square) * u
     acc[2] -= air[1]
-    return acc + push if len(air) > 2 else acc
+    return acc + push
 
 
 def ball_step(state: np.ndarray, step: np.ndarray, air) -> np.ndarray:
