@@ -18,7 +18,7 @@ from planner_jax.task.catch.estimate import timetable
 from planner_jax.task.team.case import TeamCase
 
 _SWEEPS = 3  # number of sweeps over all pairs of more than two robots
-_AT_ONCE = 16  # number of cases whose pairs of sequences are compared at once; bounds the memory
+_AT_ONCE = 4  # number of cases whose pairs of sequences are compared at once; bounds the memory
 _PER_SECOND = 1e-3  # value of a second of a sequence's rank, in caught targets
 
 

@@ -3,7 +3,6 @@
 import dataclasses
 import functools
 import operator
-from types import ModuleType
 from typing import ClassVar
 
 import jax
@@ -56,6 +55,8 @@ class ExactTeam(Planner[TeamCase, TeamPlan]):
 
     def plan_by(self, drive: Drive, cases: TeamCase) -> TeamPlan:
         """Return plans of teams, by the loop over searches `drive`."""
+        if drive.is_pure:
+            raise TypeError("ExactTeam works on the host: call pj.plan outside compiled functions")
         if cases.batch_shape == ():
             one = self.plan_by(drive, jax.tree.map(lambda leaf: np.asarray(leaf)[None], cases))
             return jax.tree.map(lambda leaf: leaf[0], one)
@@ -65,8 +66,7 @@ class ExactTeam(Planner[TeamCase, TeamPlan]):
             robots = [drive(self.planner, cases.of_robot(0))[0]]
         else:
             robots = self._plan_in_turn(drive, cases)
-        xp: ModuleType = jnp if isinstance(robots[0].status, jax.Array) else np
-        plans: CatchPlan = jax.tree.map(lambda *leaves: xp.stack(leaves, axis=1), *robots)
+        plans: CatchPlan = jax.tree.map(lambda *leaves: np.stack(leaves, axis=1), *robots)
         return TeamPlan(
             cost=plans.cost.sum(axis=1),
             violation=plans.violation.max(axis=1),
@@ -76,15 +76,13 @@ class ExactTeam(Planner[TeamCase, TeamPlan]):
         )
 
     def _plan_in_turn(self, drive: Drive, cases: TeamCase) -> list[CatchPlan]:
-        xp: ModuleType = jnp if drive.is_pure else np
-        if not drive.is_pure:
-            cases = jax.tree.map(np.asarray, cases)
+        cases = jax.tree.map(np.asarray, cases)
         present, robots = cases.shared.present, range(cases.num_robots)
         planner, apart = _with_reach(self.planner), _SPARE * cases.least_distance
         pieces, heads = planner.recovery_planner.num_pieces, jnp.asarray(cases.head_states)
         still = jnp.zeros((*heads.shape[:2], pieces, 8, 3)).at[..., 0, :].set(heads[:, :, None, 0])
         rests = PiecewisePolynomial(still, jnp.full(still.shape[:3], _HOVER / pieces))
-        rests = [jax.tree.map(lambda leaf: xp.asarray(leaf)[:, k], rests) for k in robots]  # noqa: B023
+        rests = [jax.tree.map(lambda leaf: np.asarray(leaf)[:, k], rests) for k in robots]  # noqa: B023
         paths: list[tuple[PathTable, Array]] = [_tabulate(rest) for rest in rests]
 
         def plan_with(k: int, allowed: PyTree, by: PyTree) -> PyTree:
@@ -92,26 +90,26 @@ class ExactTeam(Planner[TeamCase, TeamPlan]):
             others = paths[:k] + paths[k + 1 :]
             near = [MovingKeepOut(path, apart, 0.0 * until, until) for path, until in others]
             own = cases.of_robot(k, present=allowed, extras=(*cases.shared.extras, *near))
-            return drive(by, own if drive.is_pure else jax.tree.map(np.asarray, own))[0]
+            return drive(by, jax.tree.map(np.asarray, own))[0]
 
         plans: list[PyTree] = [
             plan_with(k, present & False, planner.planner).replace(recovery=rests[k])
             for k in robots
         ]
-        assigned = xp.asarray(assign(cases, _WIDTH, max(_MARGINS)))
+        assigned = np.asarray(assign(cases, _WIDTH, max(_MARGINS)))
         for turn in range(self.turns):
             for k in robots:
-                taken = [xp.asarray(plan.choice.taken) for plan in plans]
+                taken = [np.asarray(plan.choice.taken) for plan in plans]
                 later = [assigned[:, j] for j in robots[k + 1 :] if turn == 0]
                 gone = functools.reduce(operator.or_, taken[:k] + taken[k + 1 :] + later)
                 free = present & ~gone
                 # A robot that may catch nothing more plans to hover, which takes little time.
                 free &= (free & ~taken[k]).any(axis=1, keepdims=True)
-                if drive.is_over or not (drive.is_pure or free.any()):
+                if drive.is_over or not free.any():
                     continue
                 new, old = plan_with(k, free, planner), plans[k]
-                more = is_solved(new.status) & xp.asarray(new.num_taken > old.num_taken)
-                pick = lambda a, b: xp.where(more.reshape(-1, *[1] * (a.ndim - 1)), a, b)  # noqa: B023, E731
+                more = is_solved(new.status) & np.asarray(new.num_taken > old.num_taken)
+                pick = lambda a, b: np.where(more.reshape(-1, *[1] * (a.ndim - 1)), a, b)  # noqa: B023, E731
                 plans[k] = jax.tree.map(pick, new, old)
                 paths[k] = _tabulate(plans[k].whole)
         return plans
