@@ -30,7 +30,7 @@ _HOVER = 1.0  # [s], duration of the recovery of a robot that catches nothing
 _SPARE = 1.01  # planned least distance between robots, relative to the least distance of the case
 # For teams: greatest distances [m] by which estimated flights may miss a target that is still
 # tried, and the numbers of orders and of partial orders for each distance.
-_MARGINS, _FINALISTS, _WIDTH = (0.8, 1.6), 3, 128
+_MARGINS, _FINALISTS, _WIDTH = (0.0, 0.8, 1.6), 3, 128
 
 
 @struct.dataclass
