@@ -129,3 +129,18 @@ def nearest(contact: Contact, passes: Array, later: Contact) -> Contact:
         return jnp.where(take.reshape(take.shape + (1,) * (old.ndim - 1)), new, old)
 
     return jax.tree.map(pick, contact, later)
+
+
+def racket_impact(ball_vel: Array, racket_vel: Array, normal: Array, restitution: Array) -> Array:
+    """Return a ball's velocity v+ (3,) [m/s] after its bounce from a racket.
+
+    v+ = v- - (1 + beta) ((v- - u) . z) z, so that the tangential velocity is unchanged. [Yu2023bat,
+    eq. 3] prints (1 - beta), but its beta is the coefficient of restitution, which needs the plus.
+
+    Args:
+        ball_vel: v- (3,) [m/s], velocity of the ball before the bounce.
+        racket_vel: u (3,) [m/s], velocity of the racket.
+        normal: z (3,), unit normal of the racket.
+        restitution: beta (), coefficient of restitution, 0 to 1.
+    """
+    return ball_vel - (1.0 + restitution) * jnp.sum((ball_vel - racket_vel) * normal) * normal

@@ -103,12 +103,29 @@ def first_estimate(pos: Array, drag: Array) -> Estimate:
     )
 
 
-def update_estimate(estimate: Estimate, seen: Array, sensing: Sensing, gravity: Array) -> Estimate:
-    """Update the estimate of one ball by the Kalman filter with one observed position (3,) [m]."""
+def advance_belief(
+    estimate: Estimate, duration: Array, sensing: Sensing, gravity: Array
+) -> EkfState:
+    """Return the belief about a ball `duration` [s] later, without an observation."""
     model = _model(sensing, estimate.drag, gravity)
-    period = jnp.full_like(estimate.drag, 1.0 / sensing.rate)
-    ahead = ekf_predict(estimate.belief, period, model, flight=rk4_step)
-    belief = ekf_update(ahead, seen, model)
+    return ekf_predict(estimate.belief, duration, model, flight=rk4_step)
+
+
+def update_estimate(
+    estimate: Estimate,
+    seen: Array,
+    sensing: Sensing,
+    gravity: Array,
+    period: Array | None = None,
+) -> Estimate:
+    """Update the estimate of one ball by the Kalman filter with one observed position (3,) [m].
+
+    The estimate belongs to a time `period` [s] earlier, by default one period of observation.
+    """
+    if period is None:
+        period = jnp.full_like(estimate.drag, 1.0 / sensing.rate)
+    ahead = advance_belief(estimate, period, sensing, gravity)
+    belief = ekf_update(ahead, seen, _model(sensing, estimate.drag, gravity))
     speed = jnp.sqrt(jnp.sum(belief.ball.vel**2))
     return dataclasses.replace(estimate, belief=belief, lever=estimate.lever + speed**3 * period)
 
@@ -154,10 +171,19 @@ def with_drag(estimate: Estimate, gravity: Array) -> Estimate:
     update combines the loss since `anchor_energy` with the prior estimate of K_D. The paper instead
     averages the losses between single observations, which would count the same noise repeatedly.
     """
+    return dataclasses.replace(estimate, drag=_find_drag(estimate, gravity).estimate)
+
+
+def settle_drag(estimate: Estimate, gravity: Array) -> Estimate:
+    """Make the drag estimated since `anchor_energy` the prior estimate of the next flight."""
+    found = _find_drag(estimate, gravity)
+    return dataclasses.replace(estimate, prior=found, drag=found.estimate)
+
+
+def _find_drag(estimate: Estimate, gravity: Array) -> RlsState:
     energy, variance = _energy(estimate.belief, gravity)
     std = jnp.sqrt(jnp.maximum(variance + estimate.energy_variance, 1e-12))
-    found = rls_update(estimate.prior, estimate.lever / std, (estimate.energy - energy) / std)
-    return dataclasses.replace(estimate, drag=found.estimate)
+    return rls_update(estimate.prior, estimate.lever / std, (estimate.energy - energy) / std)
 
 
 def predict(estimate: Estimate, ahead: Array, gravity: Array) -> BallState:

@@ -21,6 +21,7 @@ from planner_jax.task.catch.spec import DECISIONS, TRAINED
 from planner_jax.task.catch.spec import TASK as CATCH
 from planner_jax.task.hit.spec import TASK as HIT
 from planner_jax.task.intercept.spec import TASK as INTERCEPT
+from planner_jax.task.rally.spec import TASK as RALLY
 
 _REPLAN = "replanning rate, 0 for never (default: {} with {}, 0 with other planners)"
 # Cases of flights contain no order and times of catches, which the decision "given" would use.
@@ -246,6 +247,33 @@ class HitFly(BallFly):
     def __post_init__(self) -> None:
         super().__post_init__()
         require_one_of(HIT.suites, "suite", self.suite)
+
+
+@dataclasses.dataclass(frozen=True)
+class RallyFly(BallFly):
+    """Settings of trials in which a quadrotor hits one ball again and again."""
+
+    num: int = option(16, "N", "number of trials")
+    replan: float | None = option(None, "HZ", _REPLAN.format(25, "exact"))
+    planner: str = option("exact", "NAME", "planner of plans from scratch")
+    suite: str = option("juggle", "NAME", "suite of rallies")
+    hits: int = option(100, "N", "number of hits after which a trial ends")
+    restitution_error: float = option(
+        0.1, "F", "relative error of the initial estimate of the restitution, of random sign"
+    )
+
+    TASK: ClassVar[Task] = RALLY
+    FLIGHT: ClassVar[str] = "planner_jax.sims.tasks.rally:RallyFlight"
+    TOOL: ClassVar[str] = "racket"
+    RATE: ClassVar[float] = 25.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require_one_of(RALLY.suites, "suite", self.suite)
+        require_count("hits", self.hits, 1)
+        error = self.restitution_error
+        require(0.0 <= error < 1.0, "restitution_error", ">= 0 and < 1", error)
+        require(self.rate > 0.0, "replan", "> 0, as rallies must be planned again", self.rate)
 
 
 @dataclasses.dataclass(frozen=True)

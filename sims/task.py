@@ -165,18 +165,10 @@ _CONTACTS = leaves_of(
 
 
 @dataclasses.dataclass(frozen=True)
-class BallFlightTask(FlightTask):
-    """A task with flying balls, whose flights the closed loop `sims.loop` simulates."""
+class BallTask(FlightTask):
+    """A task with flying balls, which a motion capture observes."""
 
     settings: BallFly
-
-    @abc.abstractmethod
-    def launches(self, cases: Any, flown: Flown) -> Launches:
-        """Return each ball's state when its simulation starts, and just after the tool's impact."""
-
-    def every_column(self) -> Sequence[Column]:
-        """Return columns of the table of flights: ball contacts, then the task's own columns."""
-        return [*_CONTACTS, *self.COLUMNS]
 
     @property
     def conditions(self) -> str:
@@ -208,6 +200,19 @@ class BallFlightTask(FlightTask):
         settings = self.settings
         sensing = NOISES[settings.noise]
         return Loop(self.world(), sensing, replan=settings.rate, record=record)
+
+
+@dataclasses.dataclass(frozen=True)
+class BallFlightTask(BallTask):
+    """A task with flying balls, whose flights the closed loop `sims.loop` simulates."""
+
+    @abc.abstractmethod
+    def launches(self, cases: Any, flown: Flown) -> Launches:
+        """Return each ball's state when its simulation starts, and just after the tool's impact."""
+
+    def every_column(self) -> Sequence[Column]:
+        """Return columns of the table of flights: ball contacts, then the task's own columns."""
+        return [*_CONTACTS, *self.COLUMNS]
 
     def recording(self, cases: Any, flights: Any, lanes: Sequence[int] | np.ndarray) -> Recording:
         """Return a recording for pictures of the flights whose indices in the batch are `lanes`."""

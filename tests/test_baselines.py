@@ -18,7 +18,7 @@ from planner_jax.baselines.parts.minimum_jerk import minimum_jerk, minimum_jerk_
 from planner_jax.core.protocol import Status, is_solved
 from planner_jax.planning.plan import plan
 from planner_jax.referee.hit import referee_hits
-from planner_jax.sims.tasks.hit import racket_impact
+from planner_jax.sims.scoring import racket_impact
 from planner_jax.task.hit import court
 from planner_jax.task.hit.spec import TASK
 from planner_jax.task.hit.suites import generate_serves, to_cases

@@ -13,7 +13,7 @@ from planner_jax.core.protocol import Status, is_solved
 from planner_jax.optimise.shipped import load_scale
 from planner_jax.planning.plan import plan
 from planner_jax.referee.hit import referee_hits
-from planner_jax.sims.tasks.hit import racket_impact
+from planner_jax.sims.scoring import racket_impact
 from planner_jax.task.hit.default_planner import ExactHit
 from planner_jax.task.hit.suites import generate_serves, to_cases
 from planner_jax.trajectory.polynomial import evaluate, total_duration

@@ -5,7 +5,7 @@ import pytest
 from derivatives import assert_gradient_matches_differences
 
 from planner_jax.ball.flight import solve_impact
-from planner_jax.sims.tasks.hit import racket_impact
+from planner_jax.sims.scoring import racket_impact
 
 RESTITUTION = 0.7
 BALL_VEL = np.array([-5.0, -0.4, -5.5])

@@ -41,7 +41,7 @@ from planner_jax.sims.model import World
 from planner_jax.sims.recording import Launches
 from planner_jax.sims.robots.quadrotor.robot import Quadrotor
 from planner_jax.sims.scenery import Part
-from planner_jax.sims.scoring import Contact, passage
+from planner_jax.sims.scoring import Contact, passage, racket_impact
 from planner_jax.sims.settings import HitFly
 from planner_jax.sims.task import BallFlightTask, FlightCases, Flights
 from planner_jax.task.hit import court
@@ -209,21 +209,6 @@ class HitFlights(Flights):
     def success(self) -> np.ndarray:
         """Mask (B,) of the B balls that landed within 0.5 m of the target."""
         return self.miss <= _NEAR
-
-
-def racket_impact(ball_vel: Array, racket_vel: Array, normal: Array, restitution: Array) -> Array:
-    """Return a ball's velocity v+ (3,) [m/s] after its bounce from a racket.
-
-    v+ = v- - (1 + beta) ((v- - u) . z) z, so that the tangential velocity is unchanged. [Yu2023bat,
-    eq. 3] prints (1 - beta), but its beta is the coefficient of restitution, which needs the plus.
-
-    Args:
-        ball_vel: v- (3,) [m/s], velocity of the ball before the bounce.
-        racket_vel: u (3,) [m/s], velocity of the racket.
-        normal: z (3,), unit normal of the racket.
-        restitution: beta (), coefficient of restitution, 0 to 1.
-    """
-    return ball_vel - (1.0 + restitution) * jnp.sum((ball_vel - racket_vel) * normal) * normal
 
 
 def reflect_ball(contact: Contact, restitution: Array) -> BallState:

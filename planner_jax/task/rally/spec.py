@@ -13,4 +13,5 @@ TASK = Task(
     planners={"exact": "planner_jax.task.rally.default_planner:ExactRally"},
     suites=SUITES,
     contact="strokes.time",
+    flight="planner_jax.sims.settings:RallyFly",
 )

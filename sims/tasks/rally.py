@@ -1,0 +1,273 @@
+"""Rallies in closed loop: a quadrotor keeps one ball up with a racket, hit after hit."""
+
+import dataclasses
+import time
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from planner_jax.planning.plan import plan as plan_all
+from planner_jax.robot.quadrotor_model import PAPER_HITTER
+from planner_jax.runs.columns import COUNT, NUMBER, Column, leaves_of
+from planner_jax.runs.summary import percent
+from planner_jax.sims.launch import flight_keys
+from planner_jax.sims.loop_state import Loop
+from planner_jax.sims.model import World
+from planner_jax.sims.rally_loop import (
+    RallyPilot,
+    Trial,
+    Truth,
+    begin_trials,
+    believed_cases,
+    fly_on,
+)
+from planner_jax.sims.recording import Recording
+from planner_jax.sims.robots.quadrotor.robot import Quadrotor
+from planner_jax.sims.settings import RallyFly
+from planner_jax.sims.task import BallTask, FlightCases, Flights
+from planner_jax.task.rally.case import RallyCase
+from planner_jax.task.rally.suites import PERIODS, draw
+
+_SEEN = 0.25  # [s], time for which the first ball is observed before the first plan
+_CHUNK = 100  # number of planning periods that are simulated by one call of the program
+_SHOWN = 12.0  # [s], duration of the recording of a trial, for pictures and films
+_LONGEST = 3.0  # [s], longest mean time between two hits; a trial that is slower ends
+
+
+@dataclasses.dataclass(frozen=True)
+class Rallies(FlightCases):
+    """B first balls and robots, with the first estimates of the ball's and the racket's numbers."""
+
+    cases: RallyCase  # leaves (B, ...), with the true ball, drag and restitution
+    places: np.ndarray  # (B, P, 3) [m], places of the hits, which repeat after P hits
+    place_range: np.ndarray  # (B, P, 3) [m], half widths of their boxes
+    believed_drag: np.ndarray  # (B,) [1/m], initial estimate of K_D
+    believed_restitution: np.ndarray  # (B,), initial estimate of the coefficient of restitution
+
+
+@dataclasses.dataclass(frozen=True)
+class FlownRally:
+    """The trials at their ends, and the states at their start, on the host."""
+
+    trial: Trial  # leaves (B, ...)
+    tracking: np.ndarray  # (B, 2) [m], rms and worst tracking error
+    time: np.ndarray  # (K,) [s], times of the K recorded states
+    qpos: np.ndarray  # (B, K, R + 3), joint positions of robot and ball
+    wanted: np.ndarray  # (B, K, 3) [m], planned positions of the robot
+
+
+@dataclasses.dataclass(frozen=True)
+class RallyFlights(Flights):
+    """The result of a batch of B rallies; arrays have the leading axis B."""
+
+    flown: FlownRally
+    required: int  # number of hits after which a trial ends
+
+    @property
+    def success(self) -> np.ndarray:
+        """Mask (B,) of the trials with all required hits before the ball was lost."""
+        return np.asarray(self.flown.trial.hits) >= self.required
+
+
+def fly_rallies(
+    loop: Loop,
+    rallies: Rallies,
+    hits: int,
+    seed: int = 0,
+    *,
+    pilot: RallyPilot | None = None,
+    record: bool = True,
+) -> RallyFlights:
+    """Plan and simulate a batch of rallies until each ball is lost or was hit `hits` times.
+
+    Args:
+        loop: settings of the closed loop: world, sensing and rates.
+        rallies: the first balls and the robots.
+        hits: number of hits after which a trial ends.
+        seed: random seed of the noise, >= 0.
+        pilot: part of the loop that plans again; by default a `RallyPilot`.
+        record: whether the first seconds of the trials are kept for pictures.
+    """
+    pilot = pilot or RallyPilot()
+    cases = jax.tree.map(jnp.asarray, rallies.cases)
+    believed = jnp.asarray(rallies.believed_drag), jnp.asarray(rallies.believed_restitution)
+    keys = flight_keys(seed, rallies.index)
+    trials = begin_trials(loop, cases, *believed, keys, _SEEN)
+    known = believed_cases(loop, trials, cases)
+    clock = time.perf_counter()
+    first = jax.device_get(plan_all(pilot.planner.planner, known))
+    planning = time.perf_counter() - clock
+    trials = dataclasses.replace(trials, plan=jax.tree.map(jnp.asarray, first))
+    truth = Truth(
+        cases.drag,
+        cases.restitution,
+        jnp.asarray(rallies.places),
+        jnp.asarray(rallies.place_range),
+    )
+    qpos, wanted, elapsed = [], [], 0.0
+    while elapsed < _LONGEST * (hits + 1):
+        trials, frames = fly_on(loop, pilot, trials, truth, cases, _CHUNK)
+        if record and elapsed < _SHOWN:
+            qpos.append(_by_trial(frames.qpos))
+            wanted.append(_by_trial(frames.wanted))
+        elapsed += _CHUNK * loop.period
+        if np.all(np.asarray(trials.lost) | (np.asarray(trials.hits) >= hits)):
+            break
+    end = jax.device_get(dataclasses.replace(trials, key=None, plan=None))
+    mean = np.sqrt(end.squared_tracking / np.maximum(end.tracked, 1e-6))
+    steps = sum(part.shape[1] for part in qpos)
+    flown = FlownRally(
+        trial=end,
+        tracking=np.stack([mean, end.worst_tracking], axis=1),
+        time=(np.arange(steps) + 1) / loop.sensing.rate,
+        qpos=np.concatenate(qpos, axis=1) if qpos else np.zeros((len(rallies), 0, 0)),
+        wanted=np.concatenate(wanted, axis=1) if wanted else np.zeros((len(rallies), 0, 3)),
+    )
+    return RallyFlights(first, flown, planning, hits)
+
+
+def _by_trial(frames: Any) -> np.ndarray:
+    """Return states (B, P O, ...) of B trials from states (P, B, O, ...) of P periods."""
+    states = np.moveaxis(np.asarray(frames), 0, 1)
+    return states.reshape(states.shape[0], -1, states.shape[-1])
+
+
+_LAST = leaves_of(
+    "verdict.flown.trial.last",
+    (
+        "last_offset",
+        "m",
+        "of the ball from the racket's centre at the end",
+        NUMBER,
+        "offset",
+    ),
+    ("last_tracking", "m", "of the robot from its plan then", NUMBER, "tracking"),
+    ("last_late", "s", "of that passage after the planned time", NUMBER, "late"),
+    ("last_violation", "", "greatest relative excess of the last plan", NUMBER, "violation"),
+    ("last_restitution", "", "error of the estimated restitution", NUMBER, "restitution"),
+    ("last_drag", "", "relative error of the estimated drag", NUMBER, "drag"),
+)
+
+
+class RallyFlight(BallTask):
+    """The simulation of rallies, which `sims/run.py` calls to simulate, score and draw a run."""
+
+    settings: RallyFly
+
+    CONTACT = "hit"
+    PUBLISHED = (
+        "JuggleRL (arXiv 2509.24892), real: 311 hits in a row on average over 10 trials, 462 at "
+        "best; its model-based baseline 3.1"
+    )
+    COLUMNS = (
+        *leaves_of(
+            "verdict.flown.trial",
+            ("hits", "", "in a row", COUNT),
+            ("worst_offset", "m", "of a hit from the racket's centre", NUMBER),
+            ("at_fixed", "", "hits at places without a choice", COUNT),
+            ("in_circle", "", "of these hits within their circle of 0.25 m", COUNT),
+        ),
+        Column(
+            "mean_offset",
+            "m",
+            "of all hits from the racket's centre",
+            NUMBER,
+            lambda b: b.verdict.flown.trial.sum_offset / np.maximum(b.verdict.flown.trial.hits, 1),
+        ),
+        *_LAST,
+    )
+
+    @property
+    def SUCCESS(self) -> str:  # type: ignore[override]
+        """The predicate of a successful trial in sentences."""
+        return f"had {self.settings.hits:,} hits without a loss of the ball"
+
+    def world(self) -> World:
+        """Return the simulated world."""
+        robot = self.settings.robot or PAPER_HITTER
+        gravity = float(np.asarray(self._draw(1).gravity)[0])
+        return World(Quadrotor(robot, **self.settings.air()), gravity)
+
+    def _draw(self, num: int, hits: int = 2) -> RallyCase:
+        known = self.settings.known_robot() or PAPER_HITTER
+        settings = self.settings
+        return draw(num, settings.suite, settings.seed, hits=hits, robot=known, wind=settings.wind)
+
+    def cases(self) -> Rallies:
+        """Draw all trials of the run from its suite and seed, with wrong first estimates."""
+        settings = self.settings
+        cases = jax.tree.map(np.asarray, self._draw(settings.num))
+        pattern = self._draw(settings.num, hits=PERIODS[settings.suite])
+        signs = np.random.default_rng([settings.seed, 1]).choice([-1.0, 1.0], (2, settings.num))
+        drag = cases.drag * (1.0 + settings.drag_error * signs[0])
+        restitution = cases.restitution * (1.0 + settings.restitution_error * signs[1])
+        return Rallies(
+            np.arange(settings.num),
+            cases,
+            np.asarray(pattern.places),
+            np.asarray(pattern.place_range),
+            drag.astype(np.float32),
+            np.minimum(restitution, 1.0).astype(np.float32),
+        )
+
+    def fly(self, cases: Rallies, record: bool) -> RallyFlights:
+        """Plan and simulate the trials of `cases`; `record`: whether first states are kept."""
+        settings = self.settings
+        return fly_rallies(self.loop(False), cases, settings.hits, settings.seed, record=record)
+
+    def recording(
+        self, cases: Rallies, flights: RallyFlights, lanes: Sequence[int] | np.ndarray
+    ) -> Recording:
+        """Return a recording of the first seconds of the trials with the indices `lanes`."""
+        flown, number = flights.flown, len(lanes)
+        qpos, size = flown.qpos[lanes].astype(float), flown.qpos.shape[2] - 3
+        balls = qpos[:, :, None, size:]
+        balls[balls[..., 2] < 0.0] = np.nan
+        return Recording(
+            index=cases.index[lanes],
+            success=flights.success[lanes],
+            time=np.broadcast_to(flown.time, (number, flown.time.size)),
+            robot=qpos[:, :, :size],
+            wanted=flown.wanted[lanes].astype(float),
+            balls=balls,
+            met=np.full((number, 1), np.nan),
+            contact=np.full((number, 1, 3), np.nan),
+            target=np.full((number, 3), np.nan),
+            expected=np.zeros((number, flown.time.size, 0, 3)),
+        )
+
+    @property
+    def suite(self) -> str:
+        """The name of the suite for the report."""
+        return self.settings.suite
+
+    @property
+    def conditions(self) -> str:
+        """Sensing noise and errors of first estimates, as the beginning of a sentence."""
+        error = 100 * self.settings.restitution_error
+        return f"{super().conditions}, {error:g} % error of the estimated restitution"
+
+    def counts(self, rows: Any) -> dict[str, Any]:
+        """Return the numbers of all hits, of the fewest hits, and of hits within their circles."""
+        column = lambda name: np.asarray(rows[name])  # noqa: E731
+        return {
+            "hits": int(column("hits").sum()),
+            "fewest_hits": int(column("hits").min()),
+            "at_fixed": int(column("at_fixed").sum()),
+            "in_circle": int(column("in_circle").sum()),
+            "mean_offset": float(column("mean_offset").mean()),
+        }
+
+    def findings(self, summary: Mapping[str, Any]) -> list[str]:
+        """Return sentences about the numbers of hits and their places."""
+        lines = [
+            f"{summary['hits']:,} hits in all, at least {summary['fewest_hits']:,} in a trial, "
+            f"{100 * summary['mean_offset']:.1f} cm from the racket's centre on average."
+        ]
+        if fixed := summary["at_fixed"]:
+            share = percent(summary["in_circle"], fixed)
+            lines.append(f"{share} % of {fixed:,} hits at fixed places were within 0.25 m of them.")
+        return lines

@@ -1,0 +1,105 @@
+"""The closed loop of rallies: estimates across an impact, and trials."""
+
+import types
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from planner_jax.ball.estimation import EkfState
+from planner_jax.ball.flight import BallState, fly
+from planner_jax.core.errors import ArgumentError
+from planner_jax.sims import rally_loop
+from planner_jax.sims.scoring import racket_impact
+from planner_jax.sims.sensing import RlsState
+from planner_jax.sims.settings import RallyFly
+
+DRAG, GRAVITY = jnp.asarray(0.06), jnp.asarray(9.8)
+NORMAL = jnp.asarray([0.6, 0.0, 0.8])
+TOOL_VEL = jnp.asarray([0.2, -0.1, 1.0])
+BALL = BallState(jnp.asarray([0.1, 0.2, 1.6]), jnp.asarray([0.3, -0.2, -4.0]))
+
+
+def trial(time, bounce_time, is_due):
+    """Return the part of a trial that belongs to the estimate of its ball."""
+    belief = EkfState(jnp.concatenate([BALL.pos, BALL.vel]), jnp.diag(jnp.full(6, 1e-4)))
+    bounce = rally_loop.Bounce(
+        jnp.asarray(bounce_time), TOOL_VEL, NORMAL, jnp.zeros(3), jnp.asarray(is_due), jnp.ones(())
+    )
+    return types.SimpleNamespace(
+        time=jnp.asarray(time),
+        bounce=bounce,
+        restitution=RlsState(jnp.asarray(1.7), jnp.asarray(0.01)),
+        estimate=types.SimpleNamespace(belief=belief, drag=DRAG),
+    )
+
+
+LOOP = types.SimpleNamespace(
+    world=types.SimpleNamespace(gravity=9.8), sensing=types.SimpleNamespace(latency=0.02)
+)
+
+
+def test_a_ball_is_predicted_across_an_impact_that_is_felt_but_not_yet_seen():
+    ball = rally_loop._predict(trial(1.0, 0.99, True), LOOP, 0.1)
+    there = fly(BALL, jnp.asarray(0.01), DRAG, GRAVITY, num_steps=4)[0]
+    vel = racket_impact(there.vel, TOOL_VEL, NORMAL, jnp.asarray(0.7))
+    after = fly(BallState(there.pos, vel), jnp.asarray(0.11), DRAG, GRAVITY, num_steps=4)[0]
+    np.testing.assert_allclose(ball.pos, after.pos, atol=1e-5)
+    np.testing.assert_allclose(ball.vel, after.vel, atol=1e-4)
+
+
+def test_an_impact_that_was_seen_does_not_change_the_prediction():
+    ball = rally_loop._predict(trial(1.0, 0.5, False), LOOP, 0.1)
+    after = fly(BALL, jnp.asarray(0.12), DRAG, GRAVITY, num_steps=4)[0]
+    np.testing.assert_allclose(ball.pos, after.pos, atol=1e-5)
+
+
+def test_the_covariance_across_an_impact_has_the_jacobian_of_the_impact_map():
+    state = trial(1.0, 0.99, True)
+    belief = state.estimate.belief
+    after = rally_loop._reflect_belief(state, belief)
+    slope = np.eye(6)
+    of = lambda vel: racket_impact(vel, TOOL_VEL, NORMAL, jnp.asarray(0.7))  # noqa: E731
+    slope[3:, 3:] = jax.jacfwd(of)(BALL.vel)
+    approach = float(jnp.sum((BALL.vel - TOOL_VEL) * NORMAL))
+    expected = slope @ np.asarray(belief.covariance) @ slope.T
+    expected += np.diag(np.repeat([0.01, 0.1], 3) ** 2)
+    expected[3:, 3:] += 0.01 * approach**2 * np.outer(NORMAL, NORMAL)
+    np.testing.assert_allclose(after.covariance, expected, rtol=1e-4, atol=1e-7)
+    np.testing.assert_allclose(after.mean[3:], of(BALL.vel), atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"hits": 0}, "hits must be"),
+        ({"restitution_error": 1.0}, "restitution_error must be"),
+        ({"replan": 0.0}, "replan must be"),
+        ({"suite": "tennis"}, "suite must be"),
+    ],
+)
+def test_settings_out_of_their_range_are_errors_of_one_line(options, words):
+    with pytest.raises(ArgumentError, match=words) as raised:
+        RallyFly(**options)
+    assert "\n" not in str(raised.value)
+
+
+@pytest.mark.slow
+def test_rallies_with_noise_and_wrong_estimates_go_on_and_lost_balls_end_a_trial():
+    task = RallyFly(num=4, seed=7, hits=6).flight()
+    rallies = task.cases()
+    away = np.array(rallies.cases.ball.pos)
+    away[3, 0] += 30.0  # no robot reaches this ball
+    ball = BallState(away, rallies.cases.ball.vel)
+    cases = rallies.cases.replace(ball=ball)
+    flights = task.fly(type(rallies)(**{**vars(rallies), "cases": cases}), record=True)
+    assert flights.success.tolist() == [True, True, True, False]
+    end = flights.flown.trial
+    assert end.lost[3] and end.hits[3] == 0 and not end.lost[:3].any()
+    assert (end.worst_offset < 0.08).all()
+    error = np.asarray(end.restitution.estimate)[:3] - 1.0 - rallies.cases.restitution[:3]
+    assert (np.abs(error) < 0.03).all()  # 0.07 at the start
+    recording = task.recording(rallies, flights, np.arange(2))
+    assert recording.robot.shape[:2] == recording.wanted.shape[:2]
+    assert np.isfinite(recording.balls).all()
