@@ -3,14 +3,16 @@
     python -m benchmarks.flown_by_rotorpy [--num 10] [--seed 0] [--out DIR]
 
 For each robot, hits and catches with a recovery to standstill are planned, and flown from start to
-standstill by two controllers. "SE3" is RotorPy's `SE3Control` unchanged [Lee2010], with position,
-velocity and acceleration of the plan and with yaw 0. "feed-forward" has the same gains, and follows
-the plan's thrust, attitude and body rate. The table has the distance from the plan at the contact,
-its greatest value in the recovery, how many recoveries stay within 20 cm, and in how many flights a
-rotor saturates. Robots are RotorPy's Hummingbird and Crazyflie Brushless, and the Agilicious
-quadrotor of 0.752 kg [Foehn2022]; tools and limits are assumptions. RotorPy's aerodynamics are off,
-or on with a wind of 0 or 3 m/s along x. Then plans know the wind, and the drag that `pj.fit_drag`
-finds in a log of another flight in RotorPy. RotorPy is in the extra `peers`.
+standstill by controllers. "SE3" is RotorPy's `SE3Control` unchanged [Lee2010], with position,
+velocity and acceleration of the plan and with yaw 0. Its attitude lags, because it has no
+feed-forward of the body rate; "SE3, ahead" passes it the acceleration of the plan 0.1 s later.
+"feed-forward" has the same gains, and follows the plan's thrust, attitude and body rate. The table
+has the distance from the plan at the contact, its greatest value in the recovery, how many
+recoveries stay within 20 cm, and in how many flights a rotor saturates. Robots are RotorPy's
+Hummingbird and Crazyflie Brushless, and the Agilicious quadrotor of 0.752 kg [Foehn2022]; tools and
+limits are assumptions. RotorPy's aerodynamics are off, or on with a wind of 0 or 3 m/s along x.
+Then plans know the wind, and the drag that `pj.fit_drag` finds in a log of another flight in
+RotorPy. RotorPy is in the extra `peers`.
 """
 
 import dataclasses
@@ -36,6 +38,7 @@ from planner_jax.robot.quadrotor_model import (
 
 RATE = 500.0  # [Hz], of setpoints, controllers and simulation
 NEAR = 0.2  # [m], greatest distance from the plan of a recovery that counts as flown
+AHEAD = 0.1  # [s], from a setpoint's time to the time of its acceleration, of "SE3, ahead"
 # The Agilicious quadrotor in the names of RotorPy: differences from its Hummingbird.
 _AGILICIOUS = {
     **{"mass": 0.752, "Ixx": 2.5e-3, "Iyy": 2.1e-3, "Izz": 4.3e-3, "tau_m": 0.033},
@@ -130,7 +133,7 @@ def track(own: Any, state: dict[str, np.ndarray], at: SimpleNamespace) -> np.nda
 
 
 def fly(plan: Any, params: dict[str, Any], controller: str, wind: float | None) -> dict[str, float]:
-    """Fly one plan in RotorPy by a controller, "SE3" or "feed-forward"; wind None: no aerodynamics.
+    """Fly one plan in RotorPy by a controller of the table; wind None: no aerodynamics.
 
     Returns the distance from the plan at the contact, its greatest value in the recovery [m], and
     the share of control steps in which a rotor saturates.
@@ -148,10 +151,12 @@ def fly(plan: Any, params: dict[str, Any], controller: str, wind: float | None) 
     state["rotor_speeds"] = hover_speeds(params)
     vehicle = multirotor(params, state, "cmd_motor_thrusts", aero=wind is not None)
     most = params["k_eta"] * params["rotor_speed_max"] ** 2
+    later = np.arange(len(quats)) + (round(AHEAD * RATE) if controller == "SE3, ahead" else 0)
+    accs = points.acc[np.minimum(later, len(quats) - 1)]
     apart, saturated = np.zeros(len(quats)), np.zeros(len(quats), bool)
-    for k, (pos, vel, acc) in enumerate(zip(points.pos, points.vel, points.acc, strict=True)):
+    for k, (pos, vel, acc) in enumerate(zip(points.pos, points.vel, accs, strict=True)):
         apart[k] = np.linalg.norm(state["x"] - pos)
-        if controller == "SE3":
+        if controller != "feed-forward":
             flat = {"x": pos, "x_dot": vel, "x_ddot": acc, "yaw": 0.0, "yaw_dot": 0.0}
             forces = peer.update(points.time[k], state, flat)["cmd_motor_thrusts"]
         else:
@@ -192,7 +197,7 @@ def main() -> None:
             plans = pj.plan(module.planner(recovery="brake"), cases)
             good = np.asarray(module.judge(cases, plans).success)
             bench.count(good)
-            for controller in ("feed-forward", "SE3")[: 2 if wind is None else 1]:
+            for controller in ("feed-forward", "SE3", "SE3, ahead")[: 3 if wind is None else 1]:
                 some = [pj.take(plans, k) for k in np.flatnonzero(good)]
                 flights = [fly(each, params, controller, wind) for each in some]
                 contact, recovery, saturated = (
