@@ -161,7 +161,8 @@ def test_a_trajectory_comes_to_rest_smoothly_after_its_end():
 @pytest.fixture(scope="module")
 def tracked():
     world, robot = CATCH_WORLD, CATCH_WORLD.robot
-    plan, path = SimpleNamespace(trajectory=wiggle(), air=None, heading=None), jax.jit(with_rest)(wiggle())
+    plan = SimpleNamespace(trajectory=wiggle(), air=None, heading=None)
+    path = jax.jit(with_rest)(wiggle())
 
     def one(tilt):
         start = at_rest(world, jnp.array([0.0, 0.0, 1.0]))
