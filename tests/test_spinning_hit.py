@@ -11,6 +11,7 @@ from planner_jax.ball.aim import aim_with_drag, apex_with_drag
 from planner_jax.ball.flight import BallState, solve_impact
 from planner_jax.core.protocol import is_solved
 from planner_jax.referee import hit as referee
+from planner_jax.referee.spin import rub_ball
 from planner_jax.task.hit.spin import meet_spin, predict_spin
 
 float64 = pytest.mark.usefixtures("float64")
@@ -54,7 +55,7 @@ def test_the_referee_returns_the_ball_to_the_target_with_and_without_slip_at_the
     slip, up = (BALL.vel - racket)[:, None], normal[:, None]
     push = -(1.0 + float(of.restitution)) * (slip * up).sum(axis=0)
     air = air_of(of)
-    rub, air[2:5] = referee._rub(leaves, slip, up, push)
+    rub, air[2:5] = rub_ball(leaves, slip, up, push)
     np.testing.assert_allclose(BALL.vel[:, None] + push * up + rub, after[:, None], atol=1e-10)
     slides = np.linalg.norm(rub) > 0.999 * of.around.friction * push[0]
     assert slides == bool(options)
@@ -68,7 +69,7 @@ def test_a_spin_about_the_normal_leaves_a_ball_that_comes_along_the_normal():
     normal, lift = np.array([[0.6], [0.0], [0.8]]), np.array([[1.2, 0.0, 1.6]])
     numbers = {"around.friction": [0.3], "around.grip": [0.4], "around.reach": [7.0]}
     leaves = {name: np.array(value) for name, value in numbers.items()} | {"lift": lift}
-    rub, after = referee._rub(leaves, -5.0 * normal, normal, np.array([8.0]))
+    rub, after = rub_ball(leaves, -5.0 * normal, normal, np.array([8.0]))
     np.testing.assert_allclose(rub, 0.0, atol=1e-14)
     np.testing.assert_allclose(after, lift.T, atol=1e-14)
 

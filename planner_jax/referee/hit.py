@@ -246,7 +246,9 @@ def _judge_impact(case: dict, drag_after_impact: bool, tolerances: dict) -> tupl
     push = -(1.0 + case["restitution"]) * approach
     after[3:] += push * normal
     if spins:
-        rub, air[2:5] = _rub(case, state[3:] - vel, normal, push)
+        from planner_jax.referee.spin import rub_ball  # the spin of few balls is known
+
+        rub, air[2:5] = rub_ball(case, state[3:] - vel, normal, push)
         after[3:] += rub
     target = case["target"].T
     if drag_after_impact or spins:
@@ -268,18 +270,6 @@ def _judge_impact(case: dict, drag_after_impact: bool, tolerances: dict) -> tupl
     tests["wrong face"] = (approach >= 0.0, approach, end)
     tests["contact time"] = _contact_time(case, end, state)
     return measured, tests
-
-
-def _rub(case: dict, vel: np.ndarray, normal: np.ndarray, push: np.ndarray) -> tuple:
-    """Return the velocity (3, B) [m/s] that friction adds, and the lift vector after the impact.
-
-    `vel` is relative to the racket. The impact adds the velocity `push` along the `normal`.
-    """
-    lift, reach, grip = case["lift"].T, case["around.reach"], case["around.grip"]
-    slip = vel - (vel * normal).sum(axis=0) * normal - reach * np.cross(lift, normal, axis=0)
-    size = np.maximum(np.linalg.norm(slip, axis=0), 1e-12)
-    rub = -np.minimum(case["around.friction"] * push / size, grip) * slip
-    return rub, lift + (1.0 / grip - 1.0) / reach * np.cross(rub, normal, axis=0)
 
 
 def _impact_tests(case, measured, tolerances, end, apex_at, landing_at) -> dict:
