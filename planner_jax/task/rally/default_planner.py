@@ -96,7 +96,8 @@ class ExactRally(ChainPlanner[RallyCase, RallyPlan]):
     and of the thrust; two velocities of the racket across its normal; the jerk; and the place (3,)
     to which the ball is sent. A place variable x moves the place from the centre of its box by
     x / sqrt(1 + x^2) half widths. The ball flies from hit to hit as long as the segment lasts, so
-    that the flight time is a variable of the last hit only.
+    that the flight time is a variable of the last hit only. The units in `measured_scales.json` are
+    rough values that were set by hand.
 
     The cost is energy_weight * integral |snap|^2, plus the integral of smooth one-sided penalties
     on the limits and of the user's extra terms, plus contact_weight * penalties at the contacts.
