@@ -57,7 +57,7 @@ class SampledDrive:
     acceleration: np.ndarray  # (K,) [m/s^2], along the path
     curvature: np.ndarray  # (K,) [1/m]
     # Paths (101, 2) [m] of other targets, each up to its meeting with the car.
-    earlier: Sequence[np.ndarray] = ()
+    earlier: Sequence[np.ndarray] | np.ndarray = ()
 
     @property
     def middle(self) -> np.ndarray:
