@@ -1,4 +1,5 @@
 import dataclasses
+import functools
 import itertools
 from typing import Any
 
@@ -113,12 +114,15 @@ def planned():
     groups = draw(6, 4, 2)
     time = np.array([15.0] * 5 + [1.0], np.float32)
     groups = dataclasses.replace(groups, shared=dataclasses.replace(groups.shared, time=time))
-    return groups, {name: pj.plan(planner(name), groups) for name in ("best", "greedy")}
+    return groups, functools.cache(lambda name: pj.plan(planner(name), groups))
 
 
-@pytest.mark.parametrize("decide", ["best", "greedy"])
+DECISIONS = pytest.param("best", marks=pytest.mark.slow), "greedy"
+
+
+@pytest.mark.parametrize("decide", DECISIONS)
 def test_the_referee_confirms_solved_groups(planned, decide):
-    groups, plans = planned[0], planned[1][decide]
+    groups, plans = planned[0], planned[1](decide)
     verdict = pj.group.judge(groups, plans)
     assert all(isinstance(leaf, np.ndarray) for leaf in jax.tree.leaves(plans))
     np.testing.assert_array_equal(verdict.success, pj.are_solved(plans))
@@ -130,8 +134,9 @@ def test_the_referee_confirms_solved_groups(planned, decide):
     assert verdict.sentence(5).startswith(verdict.failed_limit[5] + ": leg ")
 
 
+@pytest.mark.slow
 def test_the_best_order_is_no_later_than_the_greedy_one(planned):
-    best, greedy = planned[1]["best"], planned[1]["greedy"]
+    best, greedy = planned[1]("best"), planned[1]("greedy")
     both = pj.are_solved(best) & pj.are_solved(greedy)
     assert pj.are_solved(best).sum() >= pj.are_solved(greedy).sum()
     assert np.all(best.cost[both] <= greedy.cost[both] + 1e-3)
@@ -140,17 +145,17 @@ def test_the_best_order_is_no_later_than_the_greedy_one(planned):
     np.testing.assert_allclose(best.cost[same], greedy.cost[same], atol=1e-3)
 
 
-@pytest.mark.parametrize("decide", ["best", "greedy"])
+@pytest.mark.parametrize("decide", DECISIONS)
 def test_one_group_is_planned_as_in_a_batch(planned, decide):
-    k = int(np.argmax(pj.are_solved(planned[1][decide])))
-    one, batch = pj.plan(planner(decide), pj.take(planned[0], k)), pj.take(planned[1][decide], k)
+    k = int(np.argmax(pj.are_solved(planned[1](decide))))
+    one, batch = pj.plan(planner(decide), pj.take(planned[0], k)), pj.take(planned[1](decide), k)
     assert one.status == batch.status and one.order.tolist() == batch.order.tolist()
     np.testing.assert_allclose(one.cost, batch.cost, atol=1e-3)
     assert pj.group.judge(pj.take(planned[0], k), one).success
 
 
 def test_each_leg_starts_where_the_previous_leg_ends(planned):
-    plans = planned[1]["best"]
+    plans = planned[1]("greedy")
     plan = pj.take(plans, int(np.argmax(pj.are_solved(plans))))
     first, second = (pj.take(plan.legs, k) for k in (0, 1))
     end = pose_at(first.start, first.time, first.speed, first.curvature, first.time)
@@ -161,7 +166,7 @@ def test_each_leg_starts_where_the_previous_leg_ends(planned):
 
 
 def test_a_picture_shows_every_meeting_and_the_verdict(planned):
-    groups, plans = planned[0], planned[1]["best"]
+    groups, plans = planned[0], planned[1]("greedy")
     for k in (int(np.argmax(pj.are_solved(plans))), 5):
         axes = pj.show(*pj.take((groups, plans), k)).axes[0]
         verdict = pj.group.judge(*pj.take((groups, plans), k))
@@ -193,7 +198,7 @@ def change_legs(plans, **changes):
 
 
 def test_the_referee_rejects_a_plan_with_a_wrong_leg(planned):
-    groups, plans = planned[0], planned[1]["best"]
+    groups, plans = planned[0], planned[1]("greedy")
     good = np.flatnonzero(pj.are_solved(plans))
     groups, plans = pj.take((groups, plans), good)
     legs = plans.legs
