@@ -136,7 +136,7 @@ class BallFly(FlySettings):
         0.0, "F", "relative error of the robot's drag in plans; -1: plans know no drag"
     )
 
-    TOOL: ClassVar[str]  # tool that the robot must carry, "net" or "racket"
+    TOOL: ClassVar[str] = "net"  # tool that the robot must carry, or "racket"
 
     def known_robot(self) -> Any:
         """Return the robot as plans know it, with an error of its drag; None for the default."""

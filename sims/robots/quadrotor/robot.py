@@ -167,9 +167,9 @@ class Quadrotor:
         path = with_rest(plan.trajectory)
         lag = self.model.rotors.lag
         times = jnp.minimum(times, total_duration(path) - 2.0 * lag)
-        return jax.vmap(lambda time: reference_at(path, time, lag, world, plan.air, plan.heading))(
-            times
-        )
+        # Plans of other packages may have a trajectory only.
+        air, heading = (getattr(plan, name, None) for name in ("air", "heading"))
+        return jax.vmap(lambda time: reference_at(path, time, lag, world, air, heading))(times)
 
     def command(self, state: RobotState, reference: Reference, world: World) -> Array:
         """Return the rotor thrusts (4,) [N] that track a reference (a planned state)."""
