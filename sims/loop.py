@@ -29,10 +29,33 @@ from planner_jax.host.machine import as_here
 from planner_jax.sims import sensing as sight
 from planner_jax.sims.loop_state import FlightState, Loop, Outlook, Pilot, Record
 from planner_jax.sims.model import ball_states, ball_velocity, step
+from planner_jax.sims.robot import Physics
 from planner_jax.sims.scoring import moment, nearest
 from planner_jax.sims.sensing import Estimate
 
 _FEW = 1024  # largest batch for which compiling takes longer than the flights themselves
+
+
+def track(
+    loop: Loop, physics: Physics, reference: Any, noise: Array, drag: Array
+) -> tuple[Any, Physics]:
+    """Simulate one physics step in which the robot tracks a reference (a planned state).
+
+    Args:
+        loop: settings of the closed loop.
+        physics: state before the step.
+        reference: the planned state.
+        noise: standard normal errors of the robot's estimated state.
+        drag: (N,), true drag coefficients K_D [1/m] of the balls.
+
+    Returns:
+        The robot's estimated state before the step, and the physics after the step.
+    """
+    world, robot = loop.world, loop.world.robot
+    state = robot.state(physics)
+    if any(loop.sensing.robot_stds):
+        state = robot.sense(state, noise, loop.sensing.robot_stds)
+    return state, step(world, physics, robot.command(state, reference, world), drag)
 
 
 def _fly_to_observation(loop: Loop, pilot: Pilot, flight: FlightState, drag: Array) -> FlightState:
@@ -47,11 +70,7 @@ def _fly_to_observation(loop: Loop, pilot: Pilot, flight: FlightState, drag: Arr
     def advance(carry: tuple, now: tuple) -> tuple[tuple, None]:
         physics, before, contact, worst, squared, tracked = carry
         reference, time = now
-        state = robot.state(physics)
-        if any(loop.sensing.robot_stds):
-            state = robot.sense(state, noise, loop.sensing.robot_stds)
-        command = robot.command(state, reference, world)
-        physics = step(world, physics, command, drag)
+        physics = track(loop, physics, reference, noise, drag)[1]
         after = moment(world, physics)
         passes, later = pilot.passage(world, before, after, time, planned, reference.pos)
         contact = nearest(contact, passes & flight.launched, later)

@@ -1,11 +1,11 @@
 """The closed loop of rallies: a robot hits one ball again and again, without an end.
 
-The periods are those of `sims.loop`: in every physics step the robot is controlled, at a lower rate
-the ball is observed, and at a still lower rate the next hits are planned anew. In addition the
-racket reflects the ball in the physics. The robot feels the impact at once, but sees the ball's new
-flight one latency later. The estimate of the ball therefore crosses an impact by the library's
-impact map. After every impact the robot estimates the coefficient of restitution from the ball's
-velocities before and after it, and during every flight the drag.
+As in `sims.loop`, the robot is controlled in every physics step, the ball is observed at a lower
+rate, and the next hits are planned anew at a still lower rate. In addition the racket reflects the
+ball in the physics. The robot feels the impact at once, but sees the ball's new flight one latency
+later. The estimate of the ball therefore crosses an impact by the library's impact map. After every
+impact the robot estimates the coefficient of restitution from the ball's velocities before and
+after the impact. During every flight the robot estimates the drag.
 
 The state of a trial has a fixed size, so that the number of hits does not change the memory.
 """
@@ -17,15 +17,17 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 from jax import Array, lax
+from jaxtyping import PyTree
 
-from planner_jax.ball.estimation import EkfState
+from planner_jax.ball.estimation import EkfState, congruence
 from planner_jax.ball.flight import BallState, fly
 from planner_jax.core.compiled import QUICK_OPTIONS
 from planner_jax.planning.replan import Replanning
 from planner_jax.sims import sensing as sight
 from planner_jax.sims.launch import watch_ball
+from planner_jax.sims.loop import track
 from planner_jax.sims.loop_state import Loop
-from planner_jax.sims.model import at_rest, ball_states, place_balls, step
+from planner_jax.sims.model import at_rest, ball_states, place_balls
 from planner_jax.sims.robot import Physics
 from planner_jax.sims.scoring import Contact, moment, passage, racket_impact
 from planner_jax.sims.sensing import Estimate, RlsState, rls_update
@@ -84,8 +86,6 @@ class Trial:
     last: Passage
     worst_offset: Array  # () [m], greatest offset of a hit so far
     sum_offset: Array  # () [m], sum of the offsets of all hits
-    in_circle: Array  # () int32, number of hits at fixed places that were within their circle
-    at_fixed: Array  # () int32, number of hits at fixed places
     worst_tracking: Array  # () [m], greatest distance from the plan so far
     squared_tracking: Array  # () [m^2 s], integral of the squared distance
     tracked: Array  # () [s], duration over which the squared distance is integrated
@@ -99,16 +99,6 @@ class Frames:
 
     qpos: Array  # (P, B, O, R + 3), joint positions of robot and ball
     wanted: Array  # (P, B, O, 3) [m], planned position of the robot
-
-
-@struct.dataclass
-class Truth:
-    """The true numbers of a trial, and the places that repeat with a period of P hits."""
-
-    drag: Array  # () [1/m]
-    restitution: Array  # ()
-    places: Array  # (P, 3) [m], centre of the box to which hit k, k + P, ... sends the ball
-    place_range: Array  # (P, 3) [m], half widths of the boxes; zeros for a fixed place
 
 
 @dataclasses.dataclass(frozen=True)
@@ -125,7 +115,10 @@ class RallyPilot:
     # violates limits by up to `desperate` is flown, too
     astray: float = 0.08
     desperate: float = 1.0
-    circle: float = 0.25  # [m], radius of the circles of fixed places
+
+
+def _pick(condition: Array, new: PyTree, old: PyTree) -> PyTree:
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), new, old)
 
 
 def _predict(trial: Trial, loop: Loop, ahead: float) -> BallState:
@@ -151,15 +144,13 @@ def _reflect_belief(trial: Trial, belief: EkfState) -> EkfState:
     bounce, restitution = trial.bounce, trial.restitution
     normal = bounce.normal
     turn = jnp.eye(3) - restitution.estimate * normal[:, None] * normal[None]
-    turn = jnp.eye(6).at[3:, 3:].set(turn)
-    P = jnp.matmul(turn, belief.covariance, precision=lax.Precision.HIGHEST)
-    P = jnp.matmul(P, turn.T, precision=lax.Precision.HIGHEST)
+    P = congruence(jnp.eye(6).at[3:, 3:].set(turn), belief.covariance)
     approach = jnp.sum((belief.mean[3:] - bounce.tool_vel) * normal)
     along = restitution.variance * approach**2 * normal[:, None] * normal[None]
     stds = jnp.repeat(jnp.asarray(_IMPACT_STD, P.dtype), 3)
     P = P + jnp.diag(stds**2) + jnp.zeros_like(P).at[3:, 3:].set(along)
     mean = jnp.concatenate([belief.mean[:3], _reflect(trial, belief.mean[3:])])
-    return EkfState(mean=mean, covariance=0.5 * (P + P.T))
+    return EkfState(mean=mean, covariance=P)
 
 
 def _observe(trial: Trial, loop: Loop, seen: Array) -> Trial:
@@ -176,11 +167,10 @@ def _observe(trial: Trial, loop: Loop, seen: Array) -> Trial:
     after = _reflect_belief(trial, before)
     settled = dataclasses.replace(sight.settle_drag(estimate, gravity), belief=after)
     started = dataclasses.replace(estimate, belief=before)
-    pick = lambda new, old: jnp.where(crosses, new, old)  # noqa: E731
-    estimate = jax.tree.map(pick, settled, started)
+    estimate = _pick(crosses, settled, started)
     bounce = dataclasses.replace(
         bounce,
-        ball_vel=pick(before.mean[3:], bounce.ball_vel),
+        ball_vel=jnp.where(crosses, before.mean[3:], bounce.ball_vel),
         is_due=bounce.is_due & ~crosses,
     )
     estimate = sight.update_estimate(estimate, seen, sensing, gravity, period - first)
@@ -194,48 +184,37 @@ def _observe(trial: Trial, loop: Loop, seen: Array) -> Trial:
     learned = rls_update(trial.restitution, approach / _JUMP_STD, jump / _JUMP_STD)
     known = bounce.is_learned | learns
     anchored, usual = sight.anchor_energy(estimate, gravity), sight.with_drag(estimate, gravity)
-    once = lambda new, old: jnp.where(learns, new, old)  # noqa: E731
-    estimate = jax.tree.map(
-        once, anchored, jax.tree.map(lambda new, old: jnp.where(known, new, old), usual, estimate)
-    )
     return dataclasses.replace(
         trial,
-        estimate=estimate,
-        restitution=jax.tree.map(once, learned, trial.restitution),
+        estimate=_pick(learns, anchored, _pick(known, usual, estimate)),
+        restitution=_pick(learns, learned, trial.restitution),
         bounce=dataclasses.replace(bounce, is_learned=known),
     )
 
 
-def _fly_to_observation(loop: Loop, pilot: RallyPilot, trial: Trial, truth: Truth) -> Trial:
+def _fly_to_observation(loop: Loop, trial: Trial, case: RallyCase) -> Trial:
     world, robot, dtype = loop.world, loop.world.robot, trial.time.dtype
     key, noise_key, look_key = jax.random.split(trial.key, 3)
     noise = jax.random.normal(noise_key, robot.noise_shape, dtype)
     times = trial.time + world.timestep * jnp.arange(loop.steps_per_observation, dtype=dtype)
     references = robot.references(trial.plan, times - trial.began, world)
-    drag = truth.drag[None]
+    drag = case.drag[None]
     stands = trial.began + trial.plan.strokes.time
 
     def advance(carry: tuple, now: tuple) -> tuple[tuple, None]:
         trial, before = carry
         reference, time = now
-        state = robot.state(trial.physics)
-        if any(loop.sensing.robot_stds):
-            state = robot.sense(state, noise, loop.sensing.robot_stds)
-        physics = step(world, trial.physics, robot.command(state, reference, world), drag)
+        state, physics = track(loop, trial.physics, reference, noise, drag)
         after = moment(world, physics)
         due = stands[jnp.argmin(jnp.abs(stands - time))]
         passes, contact = passage(world, before, after, time, due[None], reference.pos)
         contact = jax.tree.map(lambda leaf: leaf[0], contact)
-        trial = _score(pilot, trial, truth, passes[0], contact)
+        trial = _score(trial, case, passes[0], contact)
         hit = passes[0] & contact.met
-        vel = racket_impact(contact.ball_vel, contact.tool_vel, contact.normal, truth.restitution)
+        vel = racket_impact(contact.ball_vel, contact.tool_vel, contact.normal, case.restitution)
         left = time + world.timestep - contact.time
         ball = BallState((contact.ball_pos + left * vel)[None], vel[None])
-        physics = jax.tree.map(
-            lambda new, old: jnp.where(hit, new, old),
-            place_balls(world, physics, ball, drag, jnp.ones(1, bool)),
-            physics,
-        )
+        physics = place_balls(world, physics, ball, drag, hit[None])
         felt = world.carrier.tool_motion(state)
         feel = Bounce(
             time=time + world.timestep,
@@ -245,14 +224,13 @@ def _fly_to_observation(loop: Loop, pilot: RallyPilot, trial: Trial, truth: Trut
             is_due=jnp.ones((), bool),
             is_learned=jnp.zeros((), bool),
         )
-        bounce = jax.tree.map(lambda new, old: jnp.where(hit, new, old), feel, trial.bounce)
         squared = jnp.sum((before.robot_pos - reference.pos) ** 2)
         lasts = jnp.where(trial.lost, 0.0, world.timestep)
         away = jnp.where(trial.lost, 0.0, jnp.sqrt(squared))
         trial = dataclasses.replace(
             trial,
             physics=physics,
-            bounce=bounce,
+            bounce=_pick(hit, feel, trial.bounce),
             worst_tracking=jnp.maximum(trial.worst_tracking, away),
             squared_tracking=trial.squared_tracking + lasts * squared,
             tracked=trial.tracked + lasts,
@@ -275,7 +253,7 @@ def _fly_to_observation(loop: Loop, pilot: RallyPilot, trial: Trial, truth: Trut
     return _observe(trial, loop, sight.observe(look_key, shown[:1], loop.sensing)[0])
 
 
-def _score(pilot: RallyPilot, trial: Trial, truth: Truth, passes: Array, contact: Contact) -> Trial:
+def _score(trial: Trial, case: RallyCase, passes: Array, contact: Contact) -> Trial:
     """Return a trial after a step, in which the ball may pass the racket's plane."""
     counts = passes & ~trial.lost
     hit = counts & contact.met
@@ -284,42 +262,32 @@ def _score(pilot: RallyPilot, trial: Trial, truth: Truth, passes: Array, contact
         tracking=contact.tracking,
         late=contact.time - contact.planned_time,
         violation=trial.last.violation,
-        restitution=trial.restitution.estimate - 1.0 - truth.restitution,
-        drag=trial.estimate.drag / truth.drag - 1.0,
+        restitution=trial.restitution.estimate - 1.0 - case.restitution,
+        drag=trial.estimate.drag / case.drag - 1.0,
     )
-    # Hit number n was sent to the place number n - 1; the first ball is sent by nobody.
-    index = (trial.hits - 1) % truth.places.shape[0]
-    is_fixed = hit & (trial.hits > 0) & jnp.all(truth.place_range[index] == 0.0)
-    aside = contact.ball_pos[:2] - truth.places[index, :2]
-    is_inside = is_fixed & (jnp.sum(aside**2) <= pilot.circle**2)
     offset = jnp.where(hit, contact.offset, 0.0)
     return dataclasses.replace(
         trial,
         hits=trial.hits + hit,
-        last=jax.tree.map(lambda new, old: jnp.where(counts, new, old), last, trial.last),
+        last=_pick(counts, last, trial.last),
         worst_offset=jnp.maximum(trial.worst_offset, offset),
         sum_offset=trial.sum_offset + offset,
-        at_fixed=trial.at_fixed + is_fixed,
-        in_circle=trial.in_circle + is_inside,
     )
 
 
 def _plan(
-    loop: Loop, pilot: RallyPilot, trial: Trial, truth: Truth, case: RallyCase
+    loop: Loop, pilot: RallyPilot, trial: Trial, case: RallyCase
 ) -> tuple[RallyPlan, Array, Array]:
     """Return a plan that may start at the period's end, whether it does, and its number of hits."""
     elapsed = trial.time + loop.period - trial.began
     done = count_done(trial.plan, elapsed)
     planned = trial.planned + done
-    index = (planned + jnp.arange(case.places.shape[0])) % truth.places.shape[0]
     case = dataclasses.replace(
         case,
         ball=_predict(trial, loop, loop.period),
         drag=trial.estimate.drag,
         restitution=trial.restitution.estimate - 1.0,
         head_state=loop.world.carrier.head_state(trial.plan, elapsed),
-        places=truth.places[index],
-        place_range=truth.place_range[index],
     )
     task = Replanning(case=case, previous=trial.plan, elapsed=elapsed)
     plan = pilot.planner.solve(task, pilot.planner.rounds[0])
@@ -342,39 +310,31 @@ def fly_on(
     loop: Loop,
     pilot: RallyPilot,
     trials: Trial,
-    truth: Truth,
     cases: RallyCase,
     num_periods: int,
 ) -> tuple[Trial, Frames]:
     """Simulate `num_periods` planning periods of a batch of B trials, leaves (B, ...).
 
+    `cases` have the true numbers of ball and racket, and the boxes of the places of all hits.
     Times of the result count from its end, so that they stay exact in float32 for any duration.
     """
 
-    def fly(trial: Trial, truth: Truth) -> tuple[Trial, Frames]:
-        trial = _fly_to_observation(loop, pilot, trial, truth)
+    def observe_once(trial: Trial, case: RallyCase) -> tuple[Trial, Frames]:
+        trial = _fly_to_observation(loop, trial, case)
         wanted = loop.world.carrier.head_state(trial.plan, trial.time - trial.began)[0]
         return trial, Frames(trial.physics.qpos, wanted)
 
-    def one_period(trial: Trial, truth: Truth, case: RallyCase) -> tuple[Trial, Frames]:
-        plan, good, planned = _plan(loop, pilot, trial, truth, case)
-        body = lambda trial, _: fly(trial, truth)  # noqa: E731
+    def one_period(trial: Trial, case: RallyCase) -> tuple[Trial, Frames]:
+        plan, good, planned = _plan(loop, pilot, trial, case)
+        body = lambda trial, _: observe_once(trial, case)  # noqa: E731
         trial, frames = lax.scan(body, trial, None, length=loop.observations_per_plan)
-        pick = lambda new, old: jnp.where(good, new, old)  # noqa: E731
-        trial = dataclasses.replace(
-            trial,
-            plan=jax.tree.map(pick, plan, trial.plan),
-            began=pick(trial.time, trial.began),
-            planned=pick(planned, trial.planned),
-            last=dataclasses.replace(
-                trial.last, violation=pick(plan.violation, trial.last.violation)
-            ),
-        )
-        return trial, frames
+        last = dataclasses.replace(trial.last, violation=plan.violation)
+        taken = dataclasses.replace(trial, plan=plan, began=trial.time, planned=planned, last=last)
+        return _pick(good, taken, trial), frames
 
     every = jax.vmap(one_period)
-    step = lambda now, _: every(now, truth, cases)  # noqa: E731
-    trials, frames = lax.scan(step, trials, None, length=num_periods)
+    body = lambda now, _: every(now, cases)  # noqa: E731
+    trials, frames = lax.scan(body, trials, None, length=num_periods)
     trials = dataclasses.replace(
         trials,
         time=jnp.zeros_like(trials.time),
@@ -418,8 +378,6 @@ def begin_trials(
             last=Passage(zero, zero, zero, zero, zero, zero),
             worst_offset=zero,
             sum_offset=zero,
-            in_circle=none,
-            at_fixed=none,
             worst_tracking=zero,
             squared_tracking=zero,
             tracked=zero,

@@ -41,7 +41,7 @@ class EkfState:
         return BallState(pos=self.mean[..., :3], vel=self.mean[..., 3:])
 
 
-def _congruence(A: Array, P: Array) -> Array:
+def congruence(A: Array, P: Array) -> Array:
     """Return A P A^T in full precision (a GPU may use TF32 otherwise), exactly symmetric."""
     full = jnp.einsum("ij,jk,lk->il", A, P, A, precision=lax.Precision.HIGHEST)
     return 0.5 * (full + full.T)
@@ -95,7 +95,7 @@ def ekf_predict(
     t = jnp.asarray(duration, state.mean.dtype)
     per_axis = jnp.stack([jnp.stack([t**3 / 3.0, t**2 / 2.0]), jnp.stack([t**2 / 2.0, t])])
     Q = model.acceleration_density * jnp.kron(per_axis, jnp.eye(3, dtype=t.dtype))
-    return EkfState(mean=transition(state.mean), covariance=_congruence(F, state.covariance) + Q)
+    return EkfState(mean=transition(state.mean), covariance=congruence(F, state.covariance) + Q)
 
 
 def ekf_update(state: EkfState, observation: Float[Array, "3"], model: EkfModel) -> EkfState:
@@ -115,5 +115,5 @@ def ekf_update(state: EkfState, observation: Float[Array, "3"], model: EkfModel)
     factor = jnp.eye(6, dtype=dtype) - jnp.pad(K, ((0, 0), (0, 3)))  # I - K H
     return EkfState(
         mean=state.mean + jnp.matmul(K, residual, precision=lax.Precision.HIGHEST),
-        covariance=jnp.where(observed, _congruence(factor, P) + _congruence(K, R), P),
+        covariance=jnp.where(observed, congruence(factor, P) + congruence(K, R), P),
     )

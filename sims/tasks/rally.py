@@ -12,14 +12,12 @@ import numpy as np
 from planner_jax.planning.plan import plan as plan_all
 from planner_jax.robot.quadrotor_model import PAPER_HITTER
 from planner_jax.runs.columns import COUNT, NUMBER, Column, leaves_of
-from planner_jax.runs.summary import percent
 from planner_jax.sims.launch import flight_keys
 from planner_jax.sims.loop_state import Loop
 from planner_jax.sims.model import World
 from planner_jax.sims.rally_loop import (
     RallyPilot,
     Trial,
-    Truth,
     begin_trials,
     believed_cases,
     fly_on,
@@ -29,7 +27,7 @@ from planner_jax.sims.robots.quadrotor.robot import Quadrotor
 from planner_jax.sims.settings import RallyFly
 from planner_jax.sims.task import BallTask, FlightCases, Flights
 from planner_jax.task.rally.case import RallyCase
-from planner_jax.task.rally.suites import PERIODS, draw
+from planner_jax.task.rally.suites import draw
 
 _SEEN = 0.25  # [s], time for which the first ball is observed before the first plan
 _CHUNK = 100  # number of planning periods that are simulated by one call of the program
@@ -42,8 +40,6 @@ class Rallies(FlightCases):
     """B first balls and robots, with the first estimates of the ball's and the racket's numbers."""
 
     cases: RallyCase  # leaves (B, ...), with the true ball, drag and restitution
-    places: np.ndarray  # (B, P, 3) [m], places of the hits, which repeat after P hits
-    place_range: np.ndarray  # (B, P, 3) [m], half widths of their boxes
     believed_drag: np.ndarray  # (B,) [1/m], initial estimate of K_D
     believed_restitution: np.ndarray  # (B,), initial estimate of the coefficient of restitution
 
@@ -101,15 +97,9 @@ def fly_rallies(
     first = jax.device_get(plan_all(pilot.planner.planner, known))
     planning = time.perf_counter() - clock
     trials = dataclasses.replace(trials, plan=jax.tree.map(jnp.asarray, first))
-    truth = Truth(
-        cases.drag,
-        cases.restitution,
-        jnp.asarray(rallies.places),
-        jnp.asarray(rallies.place_range),
-    )
     qpos, wanted, elapsed = [], [], 0.0
     while elapsed < _LONGEST * (hits + 1):
-        trials, frames = fly_on(loop, pilot, trials, truth, cases, _CHUNK)
+        trials, frames = fly_on(loop, pilot, trials, cases, _CHUNK)
         if record and elapsed < _SHOWN:
             qpos.append(_by_trial(frames.qpos))
             wanted.append(_by_trial(frames.wanted))
@@ -167,8 +157,6 @@ class RallyFlight(BallTask):
             "verdict.flown.trial",
             ("hits", "", "in a row", COUNT),
             ("worst_offset", "m", "of a hit from the racket's centre", NUMBER),
-            ("at_fixed", "", "hits at places without a choice", COUNT),
-            ("in_circle", "", "of these hits within their circle of 0.25 m", COUNT),
         ),
         Column(
             "mean_offset",
@@ -191,24 +179,21 @@ class RallyFlight(BallTask):
         gravity = float(np.asarray(self._draw(1).gravity)[0])
         return World(Quadrotor(robot, **self.settings.air()), gravity)
 
-    def _draw(self, num: int, hits: int = 2) -> RallyCase:
+    def _draw(self, num: int) -> RallyCase:
         known = self.settings.known_robot() or PAPER_HITTER
         settings = self.settings
-        return draw(num, settings.suite, settings.seed, hits=hits, robot=known, wind=settings.wind)
+        return draw(num, settings.suite, settings.seed, robot=known, wind=settings.wind)
 
     def cases(self) -> Rallies:
         """Draw all trials of the run from its suite and seed, with wrong first estimates."""
         settings = self.settings
         cases = jax.tree.map(np.asarray, self._draw(settings.num))
-        pattern = self._draw(settings.num, hits=PERIODS[settings.suite])
         signs = np.random.default_rng([settings.seed, 1]).choice([-1.0, 1.0], (2, settings.num))
         drag = cases.drag * (1.0 + settings.drag_error * signs[0])
         restitution = cases.restitution * (1.0 + settings.restitution_error * signs[1])
         return Rallies(
             np.arange(settings.num),
             cases,
-            np.asarray(pattern.places),
-            np.asarray(pattern.place_range),
             drag.astype(np.float32),
             np.minimum(restitution, 1.0).astype(np.float32),
         )
@@ -251,23 +236,17 @@ class RallyFlight(BallTask):
         return f"{super().conditions}, {error:g} % error of the estimated restitution"
 
     def counts(self, rows: Any) -> dict[str, Any]:
-        """Return the numbers of all hits, of the fewest hits, and of hits within their circles."""
+        """Return the numbers of all hits and of the fewest hits, and the mean offset of hits."""
         column = lambda name: np.asarray(rows[name])  # noqa: E731
         return {
             "hits": int(column("hits").sum()),
             "fewest_hits": int(column("hits").min()),
-            "at_fixed": int(column("at_fixed").sum()),
-            "in_circle": int(column("in_circle").sum()),
             "mean_offset": float(column("mean_offset").mean()),
         }
 
     def findings(self, summary: Mapping[str, Any]) -> list[str]:
-        """Return sentences about the numbers of hits and their places."""
-        lines = [
+        """Return a sentence about the numbers of hits and their distance from the centre."""
+        return [
             f"{summary['hits']:,} hits in all, at least {summary['fewest_hits']:,} in a trial, "
             f"{100 * summary['mean_offset']:.1f} cm from the racket's centre on average."
         ]
-        if fixed := summary["at_fixed"]:
-            share = percent(summary["in_circle"], fixed)
-            lines.append(f"{share} % of {fixed:,} hits at fixed places were within 0.25 m of them.")
-        return lines

@@ -20,7 +20,6 @@ from planner_jax.task.quadrotor import require_own_robot
 from planner_jax.task.rally.case import RallyCase, case
 from planner_jax.task.rally.spec import SUITES, TASK
 
-PERIODS = {"juggle": 1}  # number of hits after which the places of a suite repeat
 _COLUMNS = 8  # random numbers of one case
 _HEIGHT = 1.5  # [m], of the middle of the volume
 _START = (0.0, 0.0, 1.2)  # [m], hover position of the robot
