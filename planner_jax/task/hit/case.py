@@ -62,19 +62,16 @@ class HitLimits:
 
 
 @struct.dataclass
-class HitCase(Located):
-    """One hit to plan, or a batch: a quadrotor has to hit a flying ball to a target with a racket.
+class RacketCase(Located):
+    """The fields that cases of hits and of rallies share. Every number is a leaf of the pytree.
 
-    Every number is a leaf of the pytree. Time 0 is when planning starts. Positions are relative to
-    `origin`.
+    Time 0 is when planning starts. Positions are relative to `origin`.
     """
 
-    rules: ClassVar[Table] = RULES
     positions: ClassVar[dict] = {"ball": (), "head_state": (0,)}
 
     ball: BallState  # position and velocity of the ball at time 0
     head_state: Array  # (4, 3) position, velocity, acceleration, jerk of the quadrotor at time 0
-    target: Array  # (3,) [m], required landing point of the returned ball
     drag: Array  # () [1/m], coefficient K_D of the ball's quadratic drag
     gravity: Array  # () [m/s^2], magnitude
     restitution: Array  # () coefficient of restitution beta of the racket
@@ -91,6 +88,14 @@ class HitCase(Located):
     def batch_shape(self) -> tuple[int, ...]:
         """Shape of the batch: () for one case, (B,) for a batch of B cases."""
         return np.shape(self.drag)
+
+
+@struct.dataclass
+class HitCase(RacketCase):
+    """One hit to plan, or a batch: a quadrotor has to hit a ball to a target with a racket."""
+
+    rules: ClassVar[Table] = RULES
+    target: Array = struct.field(kw_only=True)  # (3,) [m], landing point of the returned ball
 
 
 def case(

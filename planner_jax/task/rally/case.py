@@ -2,30 +2,25 @@
 
 import dataclasses
 import functools
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jax import Array
 
-from planner_jax.ball.flight import BallState
 from planner_jax.core import rules
 from planner_jax.core.checks import floating, shape_of
 from planner_jax.core.errors import ArgumentError
-from planner_jax.core.origin import Located, find_origin, move
+from planner_jax.core.origin import find_origin, move
 from planner_jax.core.rules import Field, Table, require_sound
-from planner_jax.cost.extras import Extra
-from planner_jax.robot.quadrotor import QuadrotorLimits
 from planner_jax.task.arguments import array_of, batch_of
 from planner_jax.task.hit.case import RULES as HIT_RULES
-from planner_jax.task.hit.case import HitLimits
+from planner_jax.task.hit.case import HitLimits, RacketCase
 from planner_jax.task.hit.case import case as hit_case
 from planner_jax.task.hit.spec import START
 
-if TYPE_CHECKING:
-    from planner_jax.robot.heading import Heading
-
+_ROUNDING = 1e-5  # [m], by which rounding may move a box beyond the heights of contacts
 # Shapes and ranges that `pj.require_sound` checks for the arrays of a `RallyCase`.
 RULES: Table = (
     *(field for field in HIT_RULES if field.name != "target"),
@@ -46,35 +41,20 @@ class RallyLimits(HitLimits):
 
 
 @struct.dataclass
-class RallyCase(Located):
+class RallyCase(RacketCase):
     """K >= 1 hits to plan, or a batch: a quadrotor has to hit one ball again and again.
 
     Hit k sends the ball to a place that the planner chooses in a box, and hit k + 1 happens there.
-    The other fields are as in `HitCase`.
     """
 
     rules: ClassVar[Table] = RULES
-    positions: ClassVar[dict] = {"ball": (), "head_state": (0,), "places": ()}
-    lift: ClassVar[None] = None  # rallies have balls without spin
+    positions: ClassVar[dict] = {**RacketCase.positions, "places": ()}
 
-    ball: BallState  # position and velocity of the ball at time 0
-    head_state: Array  # (4, 3) position, velocity, acceleration, jerk of the quadrotor at time 0
-    places: Array  # (K, 3) [m], centre of the box in which the place after each hit is chosen
-    place_range: Array  # (K, 3) [m], half the box's width; zeros for a fixed place
-    drag: Array  # () [1/m], coefficient K_D of the ball's quadratic drag
-    gravity: Array  # () [m/s^2], magnitude
-    restitution: Array  # () coefficient of restitution beta of the racket
-    racket_height: Array  # () [m], height of the racket's centre above the propeller plane
-    limits: QuadrotorLimits
-    hit_limits: RallyLimits
-    extras: tuple[Extra, ...] = ()  # the user's further constraints and costs
-    racket_radius: Array | None = None  # () [m]; None: the contact's offset is not limited
-    heading: "Heading | None" = None  # requested heading; None: 0
-
-    @property
-    def batch_shape(self) -> tuple[int, ...]:
-        """Shape of the batch: () for one case, (B,) for a batch of B cases."""
-        return np.shape(self.drag)
+    hit_limits: RallyLimits  # pyright: ignore[reportIncompatibleVariableOverride]
+    # (K, 3) [m], centre of the box in which the place after each hit is chosen
+    places: Array = struct.field(kw_only=True)
+    # (K, 3) [m], half the box's width; zeros for a fixed place
+    place_range: Array = struct.field(kw_only=True)
 
 
 def case(
@@ -137,8 +117,7 @@ def case(
         raise ArgumentError("spin", "left out for rallies", shown="a spin")
     if options.get("heading") == "ball":
         raise ArgumentError("heading", "an angle, or 'velocity'", "ball")
-    own = {field.name for field in dataclasses.fields(RallyCase)}
-    values = {name: value for name, value in vars(base).items() if name in own}
+    values = {name: value for name, value in vars(base).items() if name != "target"}
     values["hit_limits"] = RallyLimits(
         **vars(base.hit_limits),
         min_contact=leaf("min_contact", min_contact),
@@ -151,16 +130,12 @@ def case(
     )
     names = {f"hit_limits.{field.name}": field.name for field in dataclasses.fields(RallyLimits)}
     require_sound(cases, names)
-    low, high = (
-        np.asarray(cases.places)[..., 2] + side * np.asarray(cases.place_range)[..., 2]
-        for side in (-1.0, 1.0)
-    )
+    height, half = (np.asarray(each)[..., 2] for each in (cases.places, cases.place_range))
     least, most = (
-        np.asarray(x)[..., None] - 1e-5 * s
-        for x, s in ((cases.hit_limits.min_contact, 1), (cases.hit_limits.max_contact, -1))
+        np.asarray(each)[..., None]
+        for each in (cases.hit_limits.min_contact, cases.hit_limits.max_contact)
     )
+    is_within = (height - half >= least - _ROUNDING) & (height + half <= most + _ROUNDING)
     words = "boxes between the heights min_contact and max_contact"
-    rules.require_rule(
-        "places", np.asarray(cases.places)[..., 2], (low >= least) & (high <= most), words, batch
-    )
+    rules.require_rule("places", height, is_within, words, batch)
     return cases
