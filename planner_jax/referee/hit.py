@@ -135,20 +135,14 @@ def _judge(
 
 
 def _ball_acc(vel: np.ndarray, air) -> np.ndarray:
-    """Return the accelerations g - K_D s u + l x u of balls with velocities v, and u = v - w.
-
-    `air` has the rows K_D and g; and, for spinning balls, three rows of l and of w, and a row of
-    the radius r, in units of |l| / omega. Without spin s = |u|, and with the spin omega
-    s^2 = |u|^2 + |r omega x u|^2 / |u|^2 .
-    """
-    u = vel - air[5:8] if len(air) > 2 else vel
-    square = (u * u).sum(axis=0)
-    push = np.cross(air[2:5], u, axis=0) if len(air) > 2 else np.zeros(())
+    """Return the accelerations g - K_D |v| v of balls; `air` has rows K_D and g, or also spin."""
     if len(air) > 2:
-        square = square + air[8] ** 2 * (push * push).sum(axis=0) / np.maximum(square, 1e-12)
-    acc = -air[0] * np.sqrt(square) * u
+        from planner_jax.referee.spin import spin_acc  # the spin of few balls is known
+
+        return spin_acc(vel, air)
+    acc = -air[0] * np.sqrt((vel * vel).sum(axis=0)) * vel
     acc[2] -= air[1]
-    return acc + push
+    return acc
 
 
 def ball_step(state: np.ndarray, step: np.ndarray, air) -> np.ndarray:
@@ -226,9 +220,8 @@ def _judge_impact(case: dict, drag_after_impact: bool, tolerances: dict) -> tupl
     durations, end = case["durations"], case["durations"].sum(axis=1)
     air, spins = np.stack([case["drag"], case["gravity"]]), "lift" in case
     if spins:
-        air = np.concatenate(
-            [air, case["lift"].T, case["around.wind"].T, case["around.reach"][None]]
-        )
+        around = case["lift"].T, case["around.wind"].T, case["around.reach"][None]
+        air = np.concatenate([air, *around])
     state = np.concatenate([case["ball.pos"].T, case["ball.vel"].T])
     for _ in range(_INCOMING_STEPS):
         state = ball_step(state, end / _INCOMING_STEPS, air)

@@ -16,7 +16,7 @@ from planner_jax.referee import judging
 from planner_jax.referee.catch import CatchVerdict, referee_catches
 
 # Number of samples between two times at which one of two trajectories changes its polynomial, and
-# number of passes, of which all but the first sample around the nearest sample of the pass before.
+# number of passes. Every pass after the first one samples around the nearest sample so far.
 _SAMPLES, _REFINEMENTS = 256, 3
 _Path = tuple[np.ndarray, np.ndarray]  # coefficients (P, D + 1, 3) of pieces, and durations (P,)
 

@@ -1,6 +1,7 @@
 """Hits of spinning balls: flights with drag, lift and wind, and friction of ball and racket.
 
-The motion of the ball is that of `planner_jax.ball.spin`; the racket is the plane of its bounce.
+`planner_jax.ball.spin` has the model of the flight and of the impact. At the impact, the ball
+bounces on the plane of the racket.
 """
 
 import jax
@@ -38,14 +39,19 @@ def with_spin(
     return case.replace(lift=full(turn * radius / ball.reach[0], 3), around=around)
 
 
+def _around(case: PyTree) -> spinning.Surroundings:
+    """Return the surroundings of the ball, with the gravity and the restitution of the case."""
+    return case.around.replace(gravity=case.gravity, restitution=case.restitution)
+
+
 def predict_spin(case: PyTree, num_nodes: int) -> PathTable:
     """Return the path of the incoming ball until some time after it lands."""
-    ball = SpinningBall(case.ball.pos, case.ball.vel, case.drag, case.lift)
+    ball, air = SpinningBall(case.ball.pos, case.ball.vel, case.drag, case.lift), _around(case)
     numbers = jnp.arange(num_nodes, dtype=case.drag.dtype)
 
     def table(step: Array) -> PathTable:
-        start, times = spinning.spin_step(ball, -step, case.around), step * numbers
-        path = spinning.spin_flight(start, times, case.around, bounces=0, steps=num_nodes - 1)
+        start, times = spinning.spin_step(ball, -step, air), step * numbers
+        path = spinning.spin_flight(start, times, air, bounces=0, steps=num_nodes - 1)
         return PathTable(*path, step)
 
     fall, _ = drag_free_fall_time(case.ball, jnp.zeros_like(case.drag), case.gravity)
@@ -62,7 +68,7 @@ def meet_spin(
     The ball is at the target after `flight_time` [s]; `speeds` (2,) are the racket's speeds across
     its normal. Newton's method finds the change of the ball's velocity along the normal.
     """
-    air = case.around
+    air = _around(case)
 
     def strike(push: Array) -> tuple[Array, Array, SpinningBall]:
         size = jnp.sqrt(at_least(jnp.sum(push * push), 1e-6))
