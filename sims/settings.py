@@ -156,9 +156,6 @@ class BallFly(FlySettings):
         super().__post_init__()
         require(0.0 <= self.drag_error < 1.0, "drag_error", ">= 0 and < 1", self.drag_error)
         object.__setattr__(self, "robot", resolve_robot(self.robot, self.TOOL, self.wind))
-        if self.wind is not None:
-            is_wind = len(self.wind) == 3 and all(map(math.isfinite, self.wind))
-            require(is_wind, "wind", "three finite numbers", self.wind)
         error, has_drag = self.rotor_drag_error, bool(self.robot and self.robot.drag)
         require(-1.0 <= error < math.inf, "rotor_drag_error", "finite and >= -1", error)
         rule = "0 unless the file of the robot states its drag"

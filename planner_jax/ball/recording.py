@@ -23,6 +23,7 @@ from numpy.typing import ArrayLike
 from scipy.special import stdtrit
 
 from planner_jax.ball.spin import SpinningBall, Surroundings, spin_acceleration, spin_flight
+from planner_jax.core import GRAVITY
 from planner_jax.core.arithmetic import at_least
 from planner_jax.core.checks import require_number, shape_of
 from planner_jax.core.choices import require, require_one_of
@@ -169,7 +170,7 @@ def fit(
     *,
     ball: Ball | str = "unknown",
     floor: float | None = None,
-    gravity: float = 9.81,
+    gravity: float = GRAVITY,
     wind: ArrayLike = (0.0, 0.0, 0.0),
     noise: float = 0.002,
 ) -> FlightFit:

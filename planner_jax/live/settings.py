@@ -1,13 +1,18 @@
 """Options of the command `planner-jax serve`, checked before the slow import of JAX."""
 
-import contextlib
 import dataclasses
 import pkgutil
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from planner_jax.core.choices import require
 from planner_jax.runs.settings import option, require_count
-from planner_jax.sweep.quadrotor_settings import resolve_robot, robot_option
+from planner_jax.sweep.quadrotor_settings import (
+    HEADING,
+    MAX_YAW_RATE,
+    read_heading,
+    resolve_robot,
+    robot_option,
+)
 from planner_jax.task.hit.spec import DRAG
 
 if TYPE_CHECKING:
@@ -25,10 +30,8 @@ class ServeSettings:
     horizon: int = option(10, "K", "number of setpoints in an answer")
     deadline: float = option(0.01, "S", "longest time from a packet to its answer [s]")
     noise: float = option(0.005, "M", "standard deviation of an observed coordinate [m]")
-    heading: str | float | None = option(
-        None, "ANGLE", "of the robot: an angle [rad], velocity or ball (default: 0)"
-    )
-    max_yaw_rate: float | None = option(None, "W", "of the heading [rad/s] (default: 2)")
+    heading: str | float | None = HEADING
+    max_yaw_rate: float | None = MAX_YAW_RATE
     seconds: float | None = option(None, "S", "end after this time (default: never)")
     report: bool = option(False, "", "print counts, times and memory at the end")
 
@@ -47,8 +50,7 @@ class ServeSettings:
         if self.seconds is not None:
             require(0.0 < self.seconds <= 1e7, "seconds", "> 0 and at most 1e7", self.seconds)
         object.__setattr__(self, "robot", resolve_robot(vars(self)["robot"], self.TOOL))
-        with contextlib.suppress(ValueError, TypeError):  # a word, or no heading
-            object.__setattr__(self, "heading", float(self.heading))  # type: ignore[arg-type]
+        object.__setattr__(self, "heading", read_heading(self.heading))
         drag = vars(self)["drag"]
         require(0.0 <= drag <= self.MOST_DRAG, "drag", f"from 0 to {self.MOST_DRAG:g}", drag)
 

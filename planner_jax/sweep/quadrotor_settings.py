@@ -1,7 +1,8 @@
 """Settings of runs over many cases in which quadrotors hit or catch."""
 
 import dataclasses
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from planner_jax.core.choices import CHOICES, EFFORTS, require, require_one_of, require_scale
@@ -16,6 +17,10 @@ _DRAG = "left out unless the file of the robot states its drag"
 WIND: Any = option(
     None, "X Y Z", "velocity of the air [m/s], for a robot with drag (default: none)"
 )
+HEADING: Any = option(
+    None, "ANGLE", "of the quadrotor: an angle [rad], velocity or ball (default: 0)"
+)
+MAX_YAW_RATE: Any = option(None, "W", "of the heading [rad/s] (default: 2)")
 
 
 def robot_option(usual: str) -> Any:
@@ -24,11 +29,19 @@ def robot_option(usual: str) -> Any:
     return option(None, "NAME", words)
 
 
+def read_heading(given: str | float | None) -> str | float | None:
+    """Return an option `heading` as a number if it is one, else unchanged: a word, or None."""
+    try:
+        return float(given)  # type: ignore[arg-type]
+    except (TypeError, ValueError):
+        return given
+
+
 def resolve_robot(given: object, tool: str, wind: object = None) -> "QuadrotorModel | None":
     """Return the quadrotor that a name, file, model or dict of fields defines; None if not given.
 
     An `ArgumentError` is raised unless the quadrotor carries `tool`, "net" or "racket", and unless
-    it has drag if `wind` is not None.
+    it has drag and `wind` has three finite numbers if `wind` is not None.
     """
     if given is None:
         require(wind is None, "wind", _DRAG, wind)
@@ -48,6 +61,9 @@ def resolve_robot(given: object, tool: str, wind: object = None) -> "QuadrotorMo
         shown = f"{found.name!r} with a {found.tool.kind}"
         raise ArgumentError("robot", f"a {tool}", verb="carry", shown=shown)
     require(wind is None or found.drag is not None, "wind", _DRAG, wind)
+    if isinstance(wind, Sequence):
+        is_wind = len(wind) == 3 and all(map(math.isfinite, wind))
+        require(is_wind, "wind", "three finite numbers", wind)
     return found
 
 

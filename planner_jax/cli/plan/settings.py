@@ -1,6 +1,5 @@
 """Options of the command `planner-jax plan` for each task, checked before JAX is imported."""
 
-import contextlib
 import dataclasses
 import math
 from dataclasses import MISSING
@@ -11,7 +10,14 @@ from planner_jax.core.registry import Task, split_name
 from planner_jax.runs.manifest import Entries
 from planner_jax.runs.settings import option, recovery_option, recovery_options
 from planner_jax.sweep.block.settings import REGIMES, ArmSettings
-from planner_jax.sweep.quadrotor_settings import WIND, resolve_robot, robot_option
+from planner_jax.sweep.quadrotor_settings import (
+    HEADING,
+    MAX_YAW_RATE,
+    WIND,
+    read_heading,
+    resolve_robot,
+    robot_option,
+)
 from planner_jax.task.catch.spec import DECISIONS, TRAINED
 from planner_jax.task.hit.spec import DRAG
 
@@ -95,10 +101,8 @@ class SingleSettings(PlanSettings):
     start_attitude: tuple[float, ...] | None = option(
         None, "W X Y Z", "at the start, instead of the acceleration, with a thrust of the weight"
     )
-    heading: str | float | None = option(
-        None, "ANGLE", "of the quadrotor: an angle [rad], velocity or ball (default: 0)"
-    )
-    max_yaw_rate: float | None = option(None, "W", "of the heading [rad/s] (default: 2)")
+    heading: str | float | None = HEADING
+    max_yaw_rate: float | None = MAX_YAW_RATE
     speed: float | None = option(None, "V", f"greatest speed [m/s] {_OWN}")
     body_rate: float | None = option(None, "W", f"greatest body rate [rad/s] {_OWN}")
     min_thrust: float | None = option(None, "A", f"least thrust over mass [m/s^2] {_OWN}")
@@ -116,8 +120,7 @@ class SingleSettings(PlanSettings):
     def __post_init__(self) -> None:
         object.__setattr__(self, "robot", resolve_robot(self.robot, self.TOOL, self.wind))
         require_one_of(CHOICES, "recovery", self.recovery)
-        with contextlib.suppress(ValueError, TypeError):  # a word, or no heading
-            object.__setattr__(self, "heading", float(self.heading))  # type: ignore[arg-type]
+        object.__setattr__(self, "heading", read_heading(self.heading))
         for field in dataclasses.fields(self):
             value = vars(self)[field.name]
             if isinstance(value, list):  # argparse returns several numbers as a list

@@ -20,10 +20,10 @@ from planner_jax.task.hit.case import HitCase, case
 from planner_jax.task.hit.court import fly, landing
 from planner_jax.task.hit.spec import DRAG, START
 
+# [m/s^2]; `DRAG` was fitted to landing points with this gravity. [Yu2023bat] states neither number.
+GRAVITY = 9.8
 # The distribution of serves, fitted to the serves of [Yu2023bat]: position and velocity are uniform
 # under the conditions below, and the ball must land in the landing region of its scenario.
-# [m/s^2]; `DRAG` was fitted to the landing points with it. [Yu2023bat] states neither number.
-GRAVITY = 9.8
 SERVE_HEIGHT = 2.0  # [m], height of the ball at the serve
 DEPTH = 4.5  # [m] from the net, end of the far and side regions for serves and landing points
 RISE_SPEED = (6.5, 8.73)  # [m/s], range of the vertical speed of a serve
