@@ -10,7 +10,7 @@ from planner_jax.robot.quadrotor_model import GRAVITY, RotorDrag
 
 _WINDOW, _FEWEST = 0.5, 10  # duration [s] and least number of samples of one average
 _BUMP = np.poly1d([-1.0, 0.0, 1.0]) ** 5  # weight (1 - s^2)^5 in a window from s = -1 to 1
-_BLOCKS = 10  # number of parts of a log, each of which is left out once for standard deviations
+_BLOCKS = 10  # number of parts of a log; each is left out once, for the standard deviations
 
 
 def fit_drag(

@@ -66,8 +66,8 @@ def add_request(
 ) -> PyTree:
     """Return cases with a requested heading and a greatest yaw rate `most`, arguments of `case`.
 
-    The heading at time 0 is that of the start's `attitude`; without one it is the requested angle
-    at time 0, or 0 for a direction that the heading follows.
+    At time 0 the heading equals the heading of the start's `attitude`. Without an attitude it
+    equals the requested angle at time 0, or 0 if the heading follows a direction.
     """
     require(heading is not None, "max_yaw_rate", "left out without heading", most)
     follows, times, angles = "angles", np.arange(2.0), heading

@@ -89,7 +89,7 @@ class RallyContext(HitContext):
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class ExactRally(ChainPlanner[RallyCase, RallyPlan]):
-    """A planner of K minimum-snap segments, each of which ends at a hit.
+    """A planner of K minimum-snap segments; each segment ends at a hit.
 
     A segment of M polynomial pieces has 3 (M - 1) + 11 decision variables in units of `scale`:
     offsets of its waypoints; logarithms of its duration, of the ball's flight time after the hit,

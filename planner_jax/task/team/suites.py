@@ -1,4 +1,4 @@
-"""Named, seeded suites of team cases, whose targets are those of suites of the task `catch`."""
+"""Named, seeded suites of team cases, with the targets of suites of the task `catch`."""
 
 import dataclasses
 
