@@ -258,6 +258,9 @@ class RallyFly(BallFly):
     restitution_error: float = option(
         0.1, "F", "relative error of the initial estimate of the restitution, of random sign"
     )
+    state: str | None = option(
+        None, "FILE", "file for the state of the trials, from which the same command continues"
+    )
 
     TASK: ClassVar[Task] = RALLY
     FLIGHT: ClassVar[str] = "planner_jax.sims.tasks.rally:RallyFlight"
@@ -271,6 +274,8 @@ class RallyFly(BallFly):
         error = self.restitution_error
         require(0.0 <= error < 1.0, "restitution_error", ">= 0 and < 1", error)
         require(self.rate > 0.0, "replan", "> 0, as rallies must be planned again", self.rate)
+        is_one = self.batch is None or self.batch >= self.num
+        require(self.state is None or is_one, "batch", "left out with a file of states", self.batch)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,5 +1,6 @@
 """The closed loop of rallies: estimates across an impact, and trials."""
 
+import dataclasses
 import types
 
 import jax
@@ -14,6 +15,8 @@ from planner_jax.sims import rally_loop
 from planner_jax.sims.scoring import racket_impact
 from planner_jax.sims.sensing import RlsState
 from planner_jax.sims.settings import RallyFly
+from planner_jax.sims.tasks.rally import StateFile
+from tests.trees import assert_same
 
 DRAG, GRAVITY = jnp.asarray(0.06), jnp.asarray(9.8)
 NORMAL = jnp.asarray([0.6, 0.0, 0.8])
@@ -77,12 +80,37 @@ def test_the_covariance_across_an_impact_has_the_jacobian_of_the_impact_map():
         ({"restitution_error": 1.0}, "restitution_error must be"),
         ({"replan": 0.0}, "replan must be"),
         ({"suite": "tennis"}, "suite must be"),
+        ({"state": "trials.npz", "batch": 4}, "batch must be left out"),
     ],
 )
 def test_settings_out_of_their_range_are_errors_of_one_line(options, words):
     with pytest.raises(ArgumentError, match=words) as raised:
         RallyFly(**options)
     assert "\n" not in str(raised.value)
+
+
+def test_a_state_file_continues_its_own_run_only(tmp_path):
+    file = StateFile(tmp_path / "trials.npz", "run 1")
+    like = {"time": np.zeros(2), "calls": np.zeros((), int)}
+    assert file.load(like) is like
+    file.save({"time": np.array([0.5, 1.0]), "calls": np.array(3)})
+    assert_same(file.load(like), {"time": np.array([0.5, 1.0]), "calls": np.array(3)})
+    with pytest.raises(ArgumentError, match="state must be the file of a run with these settings"):
+        dataclasses.replace(file, identity="run 2").load(like)
+    file.path.write_bytes(file.path.read_bytes()[:100])
+    with pytest.raises(ArgumentError, match="state must be a whole file"):
+        file.load(like)
+
+
+@pytest.mark.slow
+def test_a_run_that_continues_from_its_state_equals_a_run_in_one_piece(tmp_path):
+    def trials(hits, **options):
+        task = RallyFly(num=2, seed=7, hits=hits, **options).flight()
+        return task.fly(task.cases(), record=True).flown
+
+    state = {"state": str(tmp_path / "trials.npz")}
+    trials(2, **state)
+    assert_same(vars(trials(8, **state)), vars(trials(8)))
 
 
 @pytest.mark.slow

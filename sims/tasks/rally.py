@@ -1,14 +1,19 @@
 """Rallies in closed loop: a quadrotor keeps one ball up with a racket, hit after hit."""
 
 import dataclasses
+import json
 import time
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from planner_jax.core.errors import ArgumentError
+from planner_jax.host.files import open_plain, replacing
 from planner_jax.planning.plan import plan as plan_all
 from planner_jax.robot.quadrotor_model import PAPER_HITTER
 from planner_jax.runs.columns import COUNT, NUMBER, Column, leaves_of
@@ -33,6 +38,7 @@ _SEEN = 0.25  # [s], time for which the first ball is observed before the first 
 _CHUNK = 100  # number of planning periods that are simulated by one call of the program
 _SHOWN = 12.0  # [s], duration of the recording of a trial, for pictures and films
 _LONGEST = 3.0  # [s], longest mean time between two hits; a trial that is slower ends
+_STORED = 30.0  # [s], time between two times at which the state of the trials is stored
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,6 +62,41 @@ class FlownRally:
 
 
 @dataclasses.dataclass(frozen=True)
+class StateFile:
+    """A file with the state of trials, from which an interrupted run continues."""
+
+    path: Path
+    identity: str  # text that identifies the run
+
+    def load(self, like: Any) -> Any:
+        """Return a stored pytree with the structure of `like`; `like` itself without a file.
+
+        Raises:
+            ArgumentError: the file belongs to another run, or cannot be read.
+        """
+        if not self.path.exists():
+            return like
+        leaves, structure = jax.tree.flatten(like)
+        try:
+            with open_plain(self.path) as file, np.load(file) as stored:
+                identity = str(stored["identity"])
+                found = [stored[f"leaf{k}"] for k in range(len(leaves))]
+        except (OSError, ValueError, KeyError, TypeError, EOFError, BadZipFile) as error:
+            why = " ".join(str(error).split())
+            raise ArgumentError("state", f"a whole file: {why}", self.path.name) from None
+        if identity != self.identity:
+            rule = "the file of a run with these settings, or a new file"
+            raise ArgumentError("state", rule, self.path.name)
+        return jax.tree.unflatten(structure, found)
+
+    def save(self, tree: Any) -> None:
+        """Store a pytree of arrays; a file that exists is replaced at the end."""
+        leaves = {f"leaf{k}": leaf for k, leaf in enumerate(jax.tree.leaves(jax.device_get(tree)))}
+        with replacing(self.path) as scratch, open(scratch, "wb") as file:
+            np.savez(file, identity=self.identity, **leaves)
+
+
+@dataclasses.dataclass(frozen=True)
 class RallyFlights(Flights):
     """The result of a batch of B rallies; arrays have the leading axis B."""
 
@@ -76,6 +117,7 @@ def fly_rallies(
     *,
     pilot: RallyPilot | None = None,
     record: bool = True,
+    state: StateFile | None = None,
 ) -> RallyFlights:
     """Plan and simulate a batch of rallies until each ball is lost or was hit `hits` times.
 
@@ -86,6 +128,10 @@ def fly_rallies(
         seed: random seed of the noise, >= 0.
         pilot: part of the loop that plans again; by default a `RallyPilot`.
         record: whether the first seconds of the trials are kept for pictures.
+        state: file from which the trials continue, and in which their state is stored.
+
+    Raises:
+        ArgumentError: the file `state` belongs to another run, or cannot be read.
     """
     pilot = pilot or RallyPilot()
     cases = jax.tree.map(jnp.asarray, rallies.cases)
@@ -97,24 +143,42 @@ def fly_rallies(
     first = jax.device_get(plan_all(pilot.planner.planner, known))
     planning = time.perf_counter() - clock
     trials = dataclasses.replace(trials, plan=jax.tree.map(jnp.asarray, first))
-    qpos, wanted, elapsed = [], [], 0.0
-    while elapsed < _LONGEST * (hits + 1):
-        trials, frames = fly_on(loop, pilot, trials, cases, _CHUNK)
-        if record and elapsed < _SHOWN:
-            qpos.append(_by_trial(frames.qpos))
-            wanted.append(_by_trial(frames.wanted))
-        elapsed += _CHUNK * loop.period
+    steps = loop.observations_per_plan * _CHUNK
+    size = steps * (int(np.ceil(_SHOWN / (_CHUNK * loop.period))) if record else 0)
+    now = {
+        "trials": dataclasses.replace(trials, key=jax.random.key_data(trials.key)),
+        "calls": np.zeros((), int),  # number of calls of `fly_on` so far
+        "qpos": np.zeros((len(rallies), size, trials.physics.qpos.shape[-1]), np.float32),
+        "wanted": np.zeros((len(rallies), size, 3), np.float32),
+    }
+    now = now if state is None else state.load(now)
+    trials = jax.tree.map(jnp.asarray, now["trials"])
+    trials = dataclasses.replace(trials, key=jax.random.wrap_key_data(trials.key))
+    stored, limit = time.monotonic(), _LONGEST * (hits + 1) / (_CHUNK * loop.period)
+    while now["calls"] < limit:
         if np.all(np.asarray(trials.lost) | (np.asarray(trials.hits) >= hits)):
             break
+        trials, frames = fly_on(loop, pilot, trials, cases, _CHUNK)
+        part = slice(int(now["calls"]) * steps, (int(now["calls"]) + 1) * steps)
+        if part.stop <= size:
+            now["qpos"][:, part] = _by_trial(frames.qpos)
+            now["wanted"][:, part] = _by_trial(frames.wanted)
+        now["calls"] = now["calls"] + 1
+        now["trials"] = dataclasses.replace(trials, key=jax.random.key_data(trials.key))
+        if state is not None and time.monotonic() - stored > _STORED:
+            state.save(now)
+            stored = time.monotonic()
+    if state is not None:
+        state.save(now)
     end = jax.device_get(dataclasses.replace(trials, key=None, plan=None))
     mean = np.sqrt(end.squared_tracking / np.maximum(end.tracked, 1e-6))
-    steps = sum(part.shape[1] for part in qpos)
+    shown = min(size, int(now["calls"]) * steps)
     flown = FlownRally(
         trial=end,
         tracking=np.stack([mean, end.worst_tracking], axis=1),
-        time=(np.arange(steps) + 1) / loop.sensing.rate,
-        qpos=np.concatenate(qpos, axis=1) if qpos else np.zeros((len(rallies), 0, 0)),
-        wanted=np.concatenate(wanted, axis=1) if wanted else np.zeros((len(rallies), 0, 3)),
+        time=(np.arange(shown) + 1) / loop.sensing.rate,
+        qpos=now["qpos"][:, :shown],
+        wanted=now["wanted"][:, :shown],
     )
     return RallyFlights(first, flown, planning, hits)
 
@@ -200,8 +264,13 @@ class RallyFlight(BallTask):
 
     def fly(self, cases: Rallies, record: bool) -> RallyFlights:
         """Plan and simulate the trials of `cases`; `record`: whether first states are kept."""
-        settings = self.settings
-        return fly_rallies(self.loop(False), cases, settings.hits, settings.seed, record=record)
+        settings, state = self.settings, None
+        if settings.state is not None:
+            others = {**dataclasses.asdict(settings), "state": None, "hits": None}
+            identity = json.dumps([others, [int(cases.index[0]), len(cases)]], default=str)
+            state = StateFile(Path(settings.state), identity)
+        given = {"record": record, "state": state}
+        return fly_rallies(self.loop(False), cases, settings.hits, settings.seed, **given)
 
     def recording(
         self, cases: Rallies, flights: RallyFlights, lanes: Sequence[int] | np.ndarray
