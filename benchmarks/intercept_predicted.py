@@ -74,7 +74,7 @@ def predict(times: jax.Array, seen: jax.Array, weights: jax.Array) -> TurningPat
 
     The fit weights the L observations of each target by `weights` (B, L).
     """
-    return select(times, seen, NOISE, weights).path
+    return select(times, seen, NOISE, weights)
 
 
 @jax.jit

@@ -10,7 +10,7 @@ from jax import Array
 from jax.typing import ArrayLike
 
 from planner_jax.plane.target import TurningPath, arc
-from planner_jax.sims.prediction.observed import centre, safe_sqrt
+from planner_jax.sims.prediction.observed import centre
 from planner_jax.sims.prediction.turn_fit import fit_rate, tangent
 
 
@@ -51,7 +51,7 @@ def cramer_rao(
 
 def mean_distance(bound: Array) -> Array:
     """Return the mean length () [m] of a Gaussian error with covariance `bound` (2, 2) [m^2]."""
-    return np.sqrt(0.5 * np.pi) * jnp.mean(safe_sqrt(_square_radii(bound)))
+    return np.sqrt(0.5 * np.pi) * jnp.mean(_safe_sqrt(_square_radii(bound)))
 
 
 def share_within(bound: Array, radius: ArrayLike) -> Array:
@@ -70,5 +70,11 @@ def _square_radii(bound: Array) -> Array:
     function over the points, which is its mean over all directions of the error.
     """
     mean = 0.5 * (bound[0, 0] + bound[1, 1])
-    apart = safe_sqrt((0.5 * (bound[0, 0] - bound[1, 1])) ** 2 + bound[0, 1] ** 2)
+    apart = _safe_sqrt((0.5 * (bound[0, 0] - bound[1, 1])) ** 2 + bound[0, 1] ** 2)
     return mean + apart * jnp.asarray(np.cos(np.arange(64) * (np.pi / 32.0)), bound.dtype)
+
+
+def _safe_sqrt(value: Array) -> Array:
+    """Return the square roots of numbers (...) >= 0, with a derivative of zero at zero."""
+    positive = value > 0.0
+    return jnp.where(positive, jnp.sqrt(jnp.where(positive, value, 1.0)), 0.0)

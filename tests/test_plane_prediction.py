@@ -1,6 +1,4 @@
-"""Predicted target positions: fits, selection of a model, covariance, and Cramer-Rao bound."""
-
-import functools
+"""Predicted target positions: fits, selection of a model, and Cramer-Rao bound."""
 
 import jax
 import jax.numpy as jnp
@@ -10,27 +8,18 @@ from closed_forms import positions_on
 from derivatives import assert_gradient_matches_differences
 from scipy.optimize import least_squares
 from scipy.special import ellipe
-from scipy.stats import ncx2
 
 from planner_jax.benchmarks.prediction_bounds import cramer_rao, mean_distance, share_within
 from planner_jax.plane.target import PolynomialPath, TurningPath
+from planner_jax.sims.prediction.observed import centre
 from planner_jax.sims.prediction.polynomial_fit import fit_polynomial
-from planner_jax.sims.prediction.select_path import (
-    Alternatives,
-    Prediction,
-    TurnPrior,
-    chance_within,
-    covariance,
-    mean_position,
-    select,
-)
-from planner_jax.sims.prediction.turn_fit import fit_turn
+from planner_jax.sims.prediction.select_path import log_density, select
+from planner_jax.sims.prediction.turn_fit import best_turn, path_of
 
 TIMES = np.arange(-14.0, 1.0)
 NOISE, AHEAD = 0.1, 10.0
 NUM = 300  # targets of a batch; the first half moves straight
 ONES = np.ones(15)
-PRIOR = TurnPrior()
 
 float64 = pytest.mark.usefixtures("float64")
 
@@ -63,27 +52,13 @@ def fits(times, seen, weights):
 
 
 @jax.jit
-def predict(times, seen, weights, noise, prior, truth):
-    chosen = select(times, seen, noise, weights, prior=prior)
-    error = jnp.linalg.norm(chosen.path.at(AHEAD).pos - truth)
-    radii = jnp.stack([jnp.full_like(error, 0.3), error])
-    chances = jax.vmap(lambda radius: chance_within(chosen, AHEAD, radius))(radii)
-    return chosen, covariance(chosen, AHEAD), chances, mean_position(chosen, AHEAD), error
+def turn(times, seen):
+    centred = centre(times, seen, None, 3)
+    return path_of(centred, best_turn(centred))
 
 
-def predict_one(times, seen, weights=ONES, noise=NOISE, prior=PRIOR, truth=(0.0, 0.0)):
-    return predict(times, seen, weights, noise, prior, np.asarray(truth))
-
-
-predict_by_gain = jax.jit(functools.partial(select, threshold=6.6))
-turn = jax.jit(fit_turn)
+predict = jax.jit(select, static_argnums=2)
 bound_of = jax.jit(cramer_rao, static_argnames="turning")
-
-
-@jax.jit
-def moments(prediction, radius):
-    chance, square = chance_within(prediction, 3.0, radius), covariance(prediction, 3.0)
-    return chance, square, mean_position(prediction, 3.0)
 
 
 def at(polynomial, times):
@@ -129,8 +104,8 @@ def test_absent_observations_have_no_effect():
     other = np.isin(TIMES, TIMES[present]).astype(float)
     wild, order = noisy(TURN), np.random.default_rng(3).permutation(15)
     wild[other == 0.0] = 9.0
-    again = predict_one(TIMES[order], wild[order], other[order])
-    assert_same(predict_one(times, seen, weights), again, rtol=1e-7, atol=1e-9)
+    again = predict(TIMES[order], wild[order], NOISE, other[order])
+    assert_same(predict(times, seen, NOISE, weights), again, rtol=1e-7, atol=1e-9)
 
 
 @pytest.mark.parametrize("precision", ["single", "double"])
@@ -156,53 +131,39 @@ def test_a_turn_with_noise_minimises_the_squares():
     assert_same(turn(TIMES, seen), path(best[:2], best[2:4], best[4]), rtol=1e-5)
 
 
-@float64
-def test_half_and_nine_tenths_of_the_targets_are_within_the_predicted_radii():
-    targets = zip(*draw_targets(), strict=True)
-    found = [predict_one(TIMES, seen, truth=truth) for truth, seen in targets]
-    nearer = np.array([chances[1] for _, _, chances, _, _ in found])
-    for half in np.split(nearer, 2):
-        assert np.mean(half <= 0.5) == pytest.approx(0.5, abs=0.12)
-        assert np.mean(half <= 0.9) == pytest.approx(0.9, abs=0.075)
-    straight, turning = np.split(np.array([chosen.is_turning for chosen, *_ in found]), 2)
+def test_few_straight_targets_count_as_turning_and_few_predictions_are_far_off():
+    truth, seen = draw_targets()
+    found = jax.jit(jax.vmap(lambda seen: select(TIMES, seen, NOISE)))(seen.astype(np.float32))
+    straight, turning = np.split(np.asarray(found.turn_rate) != 0.0, 2)
     assert straight.mean() < 0.05 and turning.mean() > 0.9
-    # The mean of the predicted positions over all turn rates has a smaller mean squared error than
-    # the position at the median turn rate.
-    off = np.linalg.norm(np.array([mean for *_, mean, _ in found]) - draw_targets()[0], axis=1)
-    assert np.mean(off**2) < np.mean(np.square([error for *_, error in found]))
+    ahead = np.asarray(jax.vmap(lambda path: path.at(AHEAD).pos)(found))
+    off = np.linalg.norm(ahead - truth, axis=1)
+    shares = [(half <= 0.3).mean() for half in np.split(off, 2)]
+    assert shares[0] > 0.9 and shares[1] > 0.4
+    bounds = [bound_of(LINE, TIMES, NOISE, AHEAD, turning=False)]
+    bounds += [bound_of(TURN, TIMES, NOISE, AHEAD)]
+    least = np.array([mean_distance(bound) for bound in bounds])
+    assert np.all(np.mean(np.split(off, 2), axis=1) < 1.3 * least)
 
 
 @pytest.mark.slow
 def test_a_batch_in_single_precision_equals_its_targets_one_by_one_in_double():
-    truth, seen = (each[:: NUM // 4] for each in draw_targets())
-    many = jax.jit(jax.vmap(predict, in_axes=(None, 0, None, None, None, 0)))
-    found = many(TIMES, seen, ONES, NOISE, PRIOR, truth)
-    assert found[1].dtype == jnp.float32
+    seen = draw_targets()[1][:: NUM // 4]
+    many = jax.jit(jax.vmap(lambda seen: select(TIMES, seen, NOISE)))
+    found = many(seen)
+    assert found.pos.dtype == jnp.float32
     with jax.enable_x64(True):
-        for k in range(len(truth)):
-            one = predict_one(TIMES, seen[k], truth=truth[k])
-            for a, b in zip(found[1:], one[1:], strict=True):
-                assert_same(jax.tree.map(lambda leaf, k=k: leaf[k], a), b, rtol=2e-3, atol=1e-3)
+        for k in range(len(seen)):
+            one = predict(TIMES, seen[k], NOISE)
+            assert_same(jax.tree.map(lambda leaf, k=k: leaf[k], found), one, rtol=2e-3, atol=1e-3)
 
 
 @float64
-def test_a_prior_of_straight_targets_reaches_the_bound():
-    found, square, (share, _), _, _ = predict_one(TIMES, noisy(LINE), prior=TurnPrior(chance=0.0))
-    bound = bound_of(LINE, TIMES, NOISE, AHEAD, turning=False)
-    assert (found.chance_turning, found.path.turn_rate) == (0.0, 0.0)
-    np.testing.assert_allclose(square, bound, rtol=1e-9, atol=1e-15)
-    np.testing.assert_allclose(share, share_within(bound, 0.3), rtol=1e-9)
+def test_the_bound_for_a_straight_target_is_the_variance_of_a_fitted_line():
     middle = TIMES.mean()
     variance = NOISE**2 * (1 / 15 + (AHEAD - middle) ** 2 / np.sum((TIMES - middle) ** 2))
+    bound = bound_of(LINE, TIMES, NOISE, AHEAD, turning=False)
     np.testing.assert_allclose(bound, variance * np.eye(2), rtol=1e-12, atol=1e-15)
-
-
-@float64
-def test_a_prior_of_turning_targets_reaches_the_bound():
-    sharp, always = 0.01, TurnPrior(chance=1.0, spread=3.0)
-    found, square, *_ = predict_one(TIMES, positions_on(TURN, TIMES), noise=sharp, prior=always)
-    np.testing.assert_allclose(found.chance_turning, 1.0)
-    np.testing.assert_allclose(square, bound_of(TURN, TIMES, sharp, AHEAD), rtol=0.02)
 
 
 @float64
@@ -232,60 +193,20 @@ def test_mean_and_share_of_a_gaussian_error_have_closed_forms():
 
 
 @float64
-def test_the_chance_within_a_radius_follows_from_shifted_gaussians():
-    offsets, chances = np.array([[0.0, 0.0], [0.3, 0.4], [0.0, -0.05]]), np.array([0.5, 0.3, 0.2])
-    distance, none = np.linalg.norm(offsets, axis=1), np.zeros(())
-    for std in (1e-3, 0.2, 30.0):
-        among = Alternatives(
-            **{"chance": chances, "turn_rate": np.zeros(3), "velocity": offsets},
-            **{"lever": np.tile([2.0, 0.0], (3, 1)), "centre": np.zeros(2), "middle": none},
-            centre_variance=np.array(0.75 * std**2),
-            velocity_variance=np.full(3, 0.25 * std**2),
-        )
-        rest = path([0.0, 0.0], [0.0, 0.0], 0.0)
-        prediction = Prediction(rest, none > 0.0, none, none, none, none, among)
-        for radius in (0.0, 0.1, 0.499, 0.7):
-            share, square, mean = moments(prediction, radius)
-            each = ncx2.cdf((radius / std) ** 2, 2, np.maximum((distance / std) ** 2, 1e-12))
-            np.testing.assert_allclose(share, chances @ each, rtol=1e-6, atol=1e-12)
-        expected = np.einsum("k,ki,kj->ij", chances, offsets, offsets) + std**2 * np.eye(2)
-        np.testing.assert_allclose(square, expected, rtol=1e-12)
-        np.testing.assert_allclose(mean, chances @ offsets, atol=1e-15)
-
-
-@float64
 @pytest.mark.parametrize("num", [0, 1, 2])
-def test_too_few_observations_have_an_infinite_covariance(num):
+def test_too_few_observations_are_predicted_to_move_straight(num):
     seen, weights = noisy(TURN), np.where(np.arange(15) < num, 1.0, 0.0)
-    found, square, chances, *_ = predict_one(TIMES, seen, weights)
-    assert np.all(np.isinf(np.diag(square))) and not np.any(chances)
-    assert not any(np.any(np.isnan(leaf)) for leaf in jax.tree.leaves((found, square)))
-    assert (found.is_turning, found.path.turn_rate) == (False, 0.0)
-    last = positions_on(jax.tree.map(np.asarray, found.path), TIMES[[num - 1]])[0]
+    found = jax.tree.map(np.asarray, predict(TIMES, seen, NOISE, weights))
+    assert found.turn_rate == 0.0
+    last = positions_on(found, TIMES[[num - 1]])[0]
     np.testing.assert_allclose(last, seen[num - 1] if num else [0.0, 0.0], atol=1e-9)
 
 
 @float64
-def test_unknown_noise_is_estimated_and_a_threshold_on_the_gain_selects_the_turn():
-    found, best = predict_by_gain(TIMES, noisy(TURN)), turn(TIMES, noisy(TURN))
-    assert found.noise == pytest.approx(NOISE, rel=0.3)
-    assert found.is_turning and found.gain > 6.6
-    np.testing.assert_allclose(found.path.turn_rate, best.turn_rate, rtol=1e-9)
-    residual = positions_on(jax.tree.map(np.asarray, best), TIMES) - noisy(TURN)
-    np.testing.assert_allclose(found.residual, np.sqrt(np.mean(residual**2)), rtol=1e-9)
-    straight = predict_by_gain(TIMES, noisy(LINE))
-    assert not straight.is_turning and straight.gain < 6.6 and straight.path.turn_rate == 0.0
-    exact = predict_by_gain(TIMES, positions_on(LINE, TIMES))
-    assert 0.0 < exact.noise < 1e-12 and not exact.is_turning
-    assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(exact))
-
-
-@float64
-def test_the_density_of_turn_rates_integrates_to_one_and_has_its_variance():
-    prior, rates = TurnPrior(spread=0.6), np.linspace(-3.0, 3.0, 60001)
-    density = np.exp(jax.jit(lambda rates: prior.log_density(rates))(rates))
+def test_the_density_of_turn_rates_integrates_to_one_and_is_symmetric():
+    rates = np.linspace(-3.0, 3.0, 60001)
+    density = np.exp(jax.jit(log_density)(rates))
     np.testing.assert_allclose(np.trapezoid(density, rates), 1.0, rtol=1e-6)
-    np.testing.assert_allclose(np.trapezoid(rates**2 * density, rates), prior.variance, rtol=1e-4)
     np.testing.assert_allclose(density, density[::-1])
     assert density[30000] == 0.0
 
@@ -296,10 +217,8 @@ def test_turns_and_predictions_can_be_differentiated_by_the_observations(fits_tu
     times = TIMES.copy()  # JAX may cache the constant itself in double precision
 
     def total(seen):
-        if fits_turn:
-            return jnp.sum(fit_turn(times, seen).at(AHEAD).pos)
-        found = select(times, seen, NOISE)
-        return jnp.sum(found.path.at(AHEAD).pos) + chance_within(found, AHEAD, 0.3)
+        found = turn(times, seen) if fits_turn else select(times, seen, NOISE)
+        return jnp.sum(found.at(AHEAD).pos)
 
     assert_gradient_matches_differences(total, noisy(TURN), step=1e-6, rtol=1e-5)
 
@@ -310,8 +229,7 @@ FEW, MANY = (TIMES[:2], np.zeros((2, 2))), (TIMES, np.zeros((15, 2)))
 @pytest.mark.parametrize(
     ("function", "arguments", "message"),
     [
-        (fit_turn, FEW, "times must be of at least 3 observations, got 2"),
-        (select, (TIMES[:3], np.zeros((3, 2))), "times must be of at least 4 observations, got 3"),
+        (select, (*FEW, NOISE), "times must be of at least 3 observations, got 2"),
         (fit_polynomial, (*FEW, 2), "times must be of at least 3 observations, got 2"),
         (fit_polynomial, (*MANY, 4), "degree must be 1, 2 or 3, got 4"),
         (fit_polynomial, (*MANY, 0), "degree must be 1, 2 or 3, got 0"),

@@ -62,9 +62,3 @@ def centre(
         total=total,
         num=jnp.sum(present).astype(dtype),
     )
-
-
-def safe_sqrt(value: Array) -> Array:
-    """Return the square roots of numbers (...) >= 0, with a derivative of zero at zero."""
-    positive = value > 0.0
-    return jnp.where(positive, jnp.sqrt(jnp.where(positive, value, 1.0)), 0.0)

@@ -12,12 +12,14 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import Array, lax
-from jax.typing import ArrayLike
 
 from planner_jax.plane.target import TurningPath, arc
-from planner_jax.sims.prediction.observed import Centred, Pair, centre
+from planner_jax.sims.prediction.observed import Centred, Pair
 
 _RATES = 33  # number of equally spaced turn rates among which the search selects its start
+# [rad/s], greatest turn rate at which the search starts. At that rate a target should turn by at
+# most 24 rad within the observations, and by less than pi between two.
+_FASTEST = 1.0
 _STEPS = 8  # number of Gauss-Newton iterations, over the turn rate alone
 
 
@@ -30,33 +32,6 @@ class TurnFit(NamedTuple):
     power: Array  # () [s^2], weighted sum of |arc - lever|^2
     residual: Pair  # each (L,) [m], observations minus the path
     squares: Array  # () [m^2], weighted sum of |residual|^2
-
-
-def fit_turn(
-    times: ArrayLike,
-    positions: ArrayLike,
-    weights: ArrayLike | None = None,
-    *,
-    fastest: ArrayLike = 1.0,
-) -> TurningPath:
-    """Fit a path of constant speed and turn rate to observations by least squares.
-
-    Gauss-Newton refines the best of 33 equally spaced rates. The path is straight if fewer than
-    three observations are present.
-
-    Args:
-        times: (L,) [s], times of L observations. Time 0 of the path should not be far from them.
-        positions: (L, 2) [m], observed positions of the target.
-        weights: (L,) >= 0, proportional to the inverse variance of each observation; 1 by default.
-            An observation of weight zero, or not finite, is absent.
-        fastest: () [rad/s], greatest turn rate at which the search starts. At that rate the target
-            should turn by at most 24 rad within the observations, and by less than pi between two.
-
-    Raises:
-        ValueError: the arrays hold fewer than three observations, or the shapes do not match.
-    """
-    seen = centre(times, positions, weights, 3)
-    return path_of(seen, best_turn(seen, fastest))
 
 
 def fit_rate(seen: Centred, rate: Array) -> TurnFit:
@@ -97,11 +72,12 @@ def tangent(seen: Centred, fit: TurnFit) -> tuple[Callable[[Array], Pair], Array
     return lambda after: subtract_fit(*differentiate_arcs(after)), _sum(seen, of_seen, of_seen)
 
 
-def best_turn(seen: Centred, fastest: ArrayLike) -> TurnFit:
-    """Fit position, velocity and turn rate to observations.
+def best_turn(seen: Centred) -> TurnFit:
+    """Fit position, velocity and turn rate to observations by least squares.
 
-    JAX can differentiate the result by the observations. The derivatives are exact at the optimum,
-    since the search for the turn rate is not differentiated.
+    Gauss-Newton refines the best of 33 equally spaced rates. The path is straight if fewer than
+    three observations are present. JAX can differentiate the result by the observations. The
+    derivatives are exact at the optimum, since the search for the turn rate is not differentiated.
     """
 
     def downhill(rate: Array) -> Array:
@@ -109,7 +85,7 @@ def best_turn(seen: Centred, fastest: ArrayLike) -> TurnFit:
         _, slopes = jax.jvp(lambda rate: arc(rate, seen.after), (rate,), (jnp.ones_like(rate),))
         return _sum(seen, _times(fit.velocity, slopes), fit.residual)
 
-    spacing = jnp.asarray(fastest, seen.after.dtype) * (2.0 / (_RATES - 1))
+    spacing = jnp.asarray(_FASTEST, seen.after.dtype) * (2.0 / (_RATES - 1))
     rate = lax.stop_gradient(_search_rate(lax.stop_gradient(seen), spacing))
     # The search itself is not differentiated. A Newton step from a point of zero slope has the
     # derivatives of the optimum (implicit function theorem); its curvature is treated as constant.

@@ -138,7 +138,7 @@ def predict_scene(
             rate = getattr(case.target, "turn_rate", jnp.zeros_like(now))
             target = TurningPath(pos=there.pos, vel=there.vel, turn_rate=rate)
         else:
-            target = select(times, meeting.target, noise, weights).path
+            target = select(times, meeting.target, noise, weights)
         movers = case.movers
         if not predict_movers:
             centre = movers.centre + movers.velocity * now
