@@ -15,8 +15,8 @@ from flax import struct
 from jax import Array
 from jaxtyping import PyTree
 
-from planner_jax.ball.aim import aim_with_drag, apex_with_drag
-from planner_jax.ball.flight import BallState, drag_free_fall_time, fly, solve_impact
+from planner_jax.ball.arc import fly_between
+from planner_jax.ball.flight import BallState, drag_free_fall_time, solve_impact
 from planner_jax.ball.prediction import LEAST_NODES, target_at
 from planner_jax.core.arithmetic import reciprocal
 from planner_jax.core.choices import require_size
@@ -43,7 +43,6 @@ if TYPE_CHECKING:
     from planner_jax.task.rally.replan import ReplanRally
 
 _PROPORTIONS = (0.3,) + (1.0,) * 5
-_FLIGHT_STEPS = 10  # number of Runge-Kutta steps between two contacts
 # Starting points, the best first. Columns: height of the first contact between the least and the
 # greatest, apex between the least and the greatest, thrust per unit mass / gravity at the contacts.
 _GUESSES = np.array(
@@ -183,14 +182,9 @@ class ExactRally(ChainPlanner[RallyCase, RallyPlan]):
         share = natural[:, 8:]
         places = case.places + case.place_range * share * jax.lax.rsqrt(1.0 + share * share)
         pos = jnp.concatenate([first.pos[None], places[:-1]])
-        air = (case.drag, case.gravity)
-        aim = lambda pos, place, time: aim_with_drag(pos, place, time, *air)  # noqa: E731
-        after = jax.vmap(aim)(pos, places, flights)
-        top = lambda ball, time: apex_with_drag(ball, time, *air)  # noqa: E731
-        apex = jax.vmap(top)(BallState(pos, after), flights)
-        come = lambda ball, time: fly(ball, time, *air, num_steps=_FLIGHT_STEPS)[0].vel  # noqa: E731
-        later = jax.vmap(come)(BallState(pos[:-1], after[:-1]), durations[1:])
-        ball = BallState(pos, jnp.concatenate([first.vel[None], later]))
+        arc = jax.vmap(fly_between, (0, 0, 0, None, None))
+        after, later, apex = arc(pos, places, flights, case.drag, case.gravity)
+        ball = BallState(pos, jnp.concatenate([first.vel[None], later[:-1]]))
 
         def reach(ball: BallState, after: Array, thrust: Array, free: Array) -> tuple:
             normal, speed = solve_impact(ball.vel, after, case.restitution)
