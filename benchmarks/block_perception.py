@@ -48,6 +48,7 @@ from jax import Array
 
 import planner_jax as pj
 from planner_jax.ball.flight import BallState, drag_free_flight
+from planner_jax.benchmarks.rendered_balls.segment import ball_thresholds, noisy_depth, sighting
 from planner_jax.benchmarks.run import Bench, argument_parser, begin, parse_names
 from planner_jax.core import GRAVITY
 from planner_jax.robot.arm_file import irb1600
@@ -68,7 +69,6 @@ from planner_jax.sims.perception.observation import (
     watch,
 )
 from planner_jax.sims.perception.receding import AIMS, decide
-from planner_jax.sims.segment import ball_thresholds, noisy_depth, sighting
 from planner_jax.task.block.case import ANYWHERE
 from planner_jax.task.block.end_poses import flight_of
 from planner_jax.task.block.replan import ReplanBlock
@@ -190,8 +190,8 @@ def report_models(bench: Bench, num: int, seed: int) -> None:
 
 
 def report_images(bench: Bench, num: int, seed: int) -> None:
-    from planner_jax.sims.board import calibrate_camera
-    from planner_jax.sims.camera import RenderError, SceneCamera
+    from planner_jax.benchmarks.rendered_balls.board import calibrate_camera
+    from planner_jax.benchmarks.rendered_balls.camera import RenderError, SceneCamera
 
     sensor, thresholds = eye(rate=RENDERED_RATE), ball_thresholds()
     assert isinstance(sensor.noise, StereoNoise)

@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from planner_jax.ball.estimation import EkfModel, ekf_init, ekf_predict, ekf_update
 from planner_jax.ball.flight import BallState, drag_free_flight
-from planner_jax.sims import segment
-from planner_jax.sims.calibrate import calibrate, hand_eye, pose, rigid_motion
+from planner_jax.benchmarks.rendered_balls import segment
+from planner_jax.benchmarks.rendered_balls.calibrate import calibrate, hand_eye, pose, rigid_motion
 from planner_jax.sims.perception import flight_fit
 from planner_jax.sims.perception.camera import back_project, in_view, looking_at, project
 from planner_jax.sims.perception.noise import IsotropicNoise, information, sightings, stereo_noise

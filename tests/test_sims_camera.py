@@ -7,15 +7,15 @@ import pytest
 
 import planner_jax as pj
 from planner_jax.ball.flight import drag_free_flight
+from planner_jax.benchmarks.rendered_balls import camera as scene_camera
+from planner_jax.benchmarks.rendered_balls.board import calibrate_camera, show_board
+from planner_jax.benchmarks.rendered_balls.camera import RenderError, SceneCamera, measure_balls
+from planner_jax.benchmarks.rendered_balls.segment import ball_thresholds, sighting
 from planner_jax.robot.arm_file import irb1600
-from planner_jax.sims import camera as scene_camera
-from planner_jax.sims.board import calibrate_camera, show_board
-from planner_jax.sims.camera import RenderError, SceneCamera, measure_balls
 from planner_jax.sims.perception.camera import project
 from planner_jax.sims.perception.flight_fit import belief_at, error_across, fit_flight
 from planner_jax.sims.perception.noise import information, stereo_noise
 from planner_jax.sims.perception.observation import mast_camera
-from planner_jax.sims.segment import ball_thresholds, sighting
 
 CAMERA = mast_camera(size=(640, 360))  # small, as a processor alone may render it
 GRAVITY = 9.81

@@ -70,12 +70,6 @@ def looking_at(
     return from_numbers(pinhole, rotation=rotation, position=position, focal=focal)
 
 
-def move_camera(camera: Camera, pose: np.ndarray) -> Camera:
-    """Return the camera at another pose, a homogeneous transform (4, 4) from camera to world."""
-    moved = functools.partial(Camera, focal=camera.focal, size=camera.size)
-    return from_numbers(moved, rotation=pose[:3, :3], position=pose[:3, 3])
-
-
 def to_camera(camera: Camera, points: Array) -> Array:
     """Convert points (..., 3) [m] from the world frame to the camera frame."""
     away = points - camera.position[(None,) * (points.ndim - 1)]

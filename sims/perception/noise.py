@@ -114,9 +114,8 @@ def information(camera: Camera, noise: Noise, points: Array) -> Array:
 def sightings(key: Array, camera: Camera, noise: Noise, points: Array) -> Array:
     """Simulate the observed positions of a ball whose true positions in N frames are `points`.
 
-    No images are rendered; `sims.segment.sighting` computes observed positions from images. A ball
-    outside the image is not seen, and occlusion is ignored. A stereo camera's pixels and
-    disparities have Gaussian errors, and some frames have no depth at random.
+    No images are rendered. A ball outside the image is not seen, and occlusion is ignored. A stereo
+    camera's pixels and disparities have Gaussian errors, and some frames have no depth at random.
 
     Returns:
         (N, 3) [m], observed positions in the world frame; NaN in frames without the ball.

@@ -5,15 +5,16 @@ grid is measured with the independent noise of a stereo camera. Poses of the arm
 for collisions.
 """
 
+import functools
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from planner_jax.benchmarks.rendered_balls.calibrate import Calibration, calibrate, pose
 from planner_jax.robot.arm import Arm, link_frames
-from planner_jax.sims.calibrate import Calibration, calibrate, pose
-from planner_jax.sims.perception.camera import Camera, in_view, move_camera, to_camera
+from planner_jax.sims.perception.camera import Camera, from_numbers, in_view, to_camera
 from planner_jax.sims.perception.noise import StereoNoise, depth_std
 
 _CORNERS = 6  # number of grid corners along each edge of the board
@@ -84,3 +85,9 @@ def calibrate_camera(
     """
     found = calibrate(*show_board(arm, camera, noise, num, seed=seed))
     return move_camera(camera, found.camera), found
+
+
+def move_camera(camera: Camera, pose: np.ndarray) -> Camera:
+    """Return the camera at another pose, a homogeneous transform (4, 4) from camera to world."""
+    moved = functools.partial(Camera, focal=camera.focal, size=camera.size)
+    return from_numbers(moved, rotation=pose[:3, :3], position=pose[:3, 3])

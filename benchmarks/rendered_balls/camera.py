@@ -21,11 +21,16 @@ import mujoco
 import numpy as np
 from jax import Array
 
+from planner_jax.benchmarks.rendered_balls.segment import (
+    BallThresholds,
+    Sighting,
+    noisy_depth,
+    sighting,
+)
 from planner_jax.core.errors import PlannerJaxError
 from planner_jax.sims.perception.camera import Camera
 from planner_jax.sims.perception.noise import StereoNoise
 from planner_jax.sims.scenery import GROUND_COLOUR, xml_colour, xml_numbers
-from planner_jax.sims.segment import BallThresholds, Sighting, noisy_depth, sighting
 from planner_jax.task.block.scene import Scene
 
 _ARM = importlib.resources.files("planner_jax.robot") / "models" / "irb1600.xml"
