@@ -130,10 +130,6 @@ def catch(name, suite, gradient, **options):
     return Entry(pj.catch.planner(name, **options), cases, "targets.ball.vel", gradient)
 
 
-def drive(planner, gradient=None):
-    return Entry(planner, lambda num: pj.intercept.draw(num, "easy", 4), "start", gradient)
-
-
 def path_then_speed(name, **options):
     small = MotionProblem(pieces=12, samples=2, checked=2)
     source = PathSource(problem=small, drawn=2, later=2, points=33)
@@ -143,7 +139,8 @@ def path_then_speed(name, **options):
     step = dataclasses.replace(step, speed=speed, projection=projection, pieces=40)
     searches = (Search(2, LevenbergConfig(15), lattice=Lattice(layers=20)),)
     options |= {"source": source, "step": step, "searches": searches}
-    return drive(pj.intercept.planner(name, **options))
+    draw = lambda num: pj.intercept.draw(num, "easy", 4)  # noqa: E731
+    return Entry(pj.intercept.planner(name, **options), draw, "start")
 
 
 def block(name, suite="pole", **options):
@@ -151,8 +148,27 @@ def block(name, suite="pole", **options):
     return Entry(pj.block.planner(name, **options), cases, "ball.vel")
 
 
+def with_room(cases):
+    """Return a batch of interceptions with room for as many obstacles as `pj.intercept.case` has.
+
+    Absent obstacles come first, and each last corner is repeated. All tests that plan with
+    `ONE_SEARCH` thus share one compiled program.
+    """
+
+    def fill(leaf):
+        leaf = np.asarray(leaf)
+        return np.concatenate([np.zeros_like(leaf[:, :1])] * (16 - leaf.shape[1]) + [leaf], axis=1)
+
+    def widen(group):
+        corners = np.asarray(group.corners)
+        last = [corners[:, :, -1:]] * (8 - corners.shape[2])
+        wide = group.replace(corners=np.concatenate([corners, *last], axis=2))
+        return jax.tree.map(lambda leaf: jnp.asarray(fill(leaf)), wide)
+
+    return cases.replace(walls=widen(cases.walls), movers=widen(cases.movers))
+
+
 BY_NET = {"of": lambda plan: plan.times[-1], "by": "net"}
-# test_intercept and the contract's tests of interceptions share one compiled program.
 ONE_SEARCH = (Search(12, lattice=Lattice(layers=22)),)
 ENTRIES = {
     "hit exact": hit("exact", {"of": "cost", "by": "racket_height", "steps": 0}, **SHORT, **NONE),
@@ -166,8 +182,10 @@ ENTRIES = {
     "catch mpp": catch(
         "mpp", "parabola2", None, decide=pj.catch.Best(finalists=2), speeds=(0.0, 1.0), nodes=6
     ),
-    "intercept spacetime": drive(
+    "intercept spacetime": Entry(
         pj.intercept.planner(searches=ONE_SEARCH),
+        lambda num: with_room(pj.intercept.draw(num, "easy", 4)),
+        "start",
         {"of": "cost", "by": "time", "steps": 0},
     ),
     "intercept lattice": path_then_speed("lattice"),

@@ -15,12 +15,14 @@ from planner_jax.robot.car_motion import Quadratic, by_unknowns, motion
 from planner_jax.task.intercept.problem import MotionProblem
 from planner_jax.task.intercept.searches import make_field, make_grid
 from planner_jax.task.intercept.terms import Weights
-from tests.planners import ONE_SEARCH
+from tests.planners import ONE_SEARCH, with_room
+from tests.trees import as_numpy
 
 # Planners in these tests make one search, so that only one program is compiled.
 PLANNER = pj.intercept.planner(searches=ONE_SEARCH)
 START = np.array([0.8, 4.0, 0.3])
 WALL = [[3.9, -0.5], [4.1, -0.5], [4.1, 8.5], [3.9, 8.5]]
+BOX = np.array([[-1.0, -0.5], [1.0, -0.5], [1.0, 0.5], [-1.0, 0.5]])
 HALF = [[3.9, -0.5], [4.1, -0.5], [4.1, 5.5], [3.9, 5.5]]
 
 
@@ -125,9 +127,13 @@ def test_the_gradient_of_the_cost_matches_finite_differences(knots, float64, mee
     np.testing.assert_allclose(2.0 * found.gradient, slopes, rtol=2e-3, atol=2e-3 * scale)
 
 
+def draw_hard():
+    return pj.intercept.draw(12, "hard", 7)
+
+
 @pytest.fixture(scope="module")
 def planned():
-    cases = jax.tree.map(np.asarray, pj.intercept.draw(12, "hard", 7))
+    cases = as_numpy(with_room(draw_hard()))
     return cases, pj.plan(PLANNER, cases)
 
 
@@ -208,26 +214,21 @@ def test_an_unsolvable_case_has_a_status_and_others_are_solved(scenes, name):
     assert verdict.success == (status == pj.Status.CONVERGED), verdict.sentence()
 
 
-def widen(obstacles, num, size):
-    corners = np.asarray(obstacles.corners)
-    more = size - corners.shape[2]
-    wide = obstacles.replace(corners=np.concatenate([corners, *[corners[:, :, -1:]] * more], 2))
-
-    def pad(leaf):
-        leaf = np.asarray(leaf)
-        return np.concatenate([np.zeros_like(leaf[:, :1])] * (num - leaf.shape[1]) + [leaf], axis=1)
-
-    return jax.tree.map(pad, wide)
-
-
-def test_absent_obstacles_and_repeated_corners_change_no_plan(planned, scenes):
-    cases, plans = planned
+def with_absent_last(cases):
+    """Return cases in which the absent obstacles, the first ones of `with_room`, come last."""
     groups = {name: getattr(cases, name) for name in ("walls", "movers")}
-    wide = cases.replace(**{name: widen(group, 16, 8) for name, group in groups.items()})
-    found = pj.plan(PLANNER, wide)
+    return cases.replace(**jax.tree.map(lambda leaf: leaf[:, ::-1], groups))
+
+
+# Arrays without room for more obstacles need another compiled program.
+@pytest.mark.parametrize("is_narrow", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_absent_obstacles_and_repeated_corners_change_no_plan(planned, scenes, is_narrow):
+    cases, plans = planned
+    same = as_numpy(draw_hard()) if is_narrow else with_absent_last(cases)
+    found = pj.plan(PLANNER, same)
     np.testing.assert_array_equal(found.status, plans.status)
     assert np.isclose(found.cost, plans.cost, rtol=1e-3).mean() >= 0.8
-    ours, theirs = (pj.intercept.judge(each, plans) for each in (wide, cases))
+    ours, theirs = (pj.intercept.judge(each, plans) for each in (same, cases))
     for name in ("success", "wall_clearance", "mover_clearance"):
         np.testing.assert_array_equal(getattr(ours, name), getattr(theirs, name))
     batch, expected = scenes
@@ -325,6 +326,109 @@ def test_latency_plans_the_remainders_of_solved_plans_again(planned):
     np.testing.assert_allclose(tasks.case.time, 8.0, atol=1e-5)
     goal = jax.vmap(lambda case: case.target.at(case.time).pos)
     np.testing.assert_allclose(goal(tasks.case), goal(cases)[pj.are_solved(plans)], atol=1e-4)
+
+
+def problem(length=1.0, time=1.0, shift=(0.0, 0.0), turn=0.0):
+    """Return a car's drive past a box, in units that are 1 / `length` m and 1 / `time` s."""
+    cos, sin = np.cos(turn), np.sin(turn)
+    shift = np.asarray(shift, float)
+
+    def move(points):
+        return length * np.asarray(points, float) @ np.array([[cos, sin], [-sin, cos]]) + shift
+
+    speed, acceleration = length / time, length / time**2
+    velocity = move([3.0, 0.5]) - move([0.0, 0.0])
+    target = pj.TurningPath(move([14.0, 3.0]), velocity / time, np.zeros(()))
+    return pj.intercept.case(
+        target,
+        6.0 * time,
+        start=(*move([0.0, 0.0]), turn),
+        initial_speed=5.0 * speed,
+        walls=[move(BOX + [9.0, 0.5])],
+        lower=-np.inf,
+        upper=np.inf,
+        tolerance=0.3 * length,
+        length=4.5 * length,
+        width=1.6 * length,
+        wheelbase=2.6 * length,
+        rear_overhang=0.9 * length,
+        speed=12.0 * speed,
+        acceleration=4.0 * acceleration,
+        lateral_acceleration=4.0 * acceleration,
+        curvature=0.18 / length,
+        steering_rate=0.6 / time,
+    )
+
+
+# Length and time of the units [1/m, 1/s], position [m] and heading [rad] of the frame.
+UNITS = [
+    (1.0, 1.0, (0.0, 0.0), 0.0),
+    (1000.0, 1.0, (0.0, 0.0), 0.0),
+    (1e-3, 1.0 / 3600.0, (0.0, 0.0), 0.0),
+    (1.0, 1.0, (5e5, 4.6e6), 0.0),
+    (1.0, 1.0, (-30.0, 20.0), 2.2),
+    (1000.0, 1.0, (5e8, 1e8), -0.7),
+]
+
+
+@pytest.fixture(scope="module")
+def in_units():
+    cases = stack([problem(*each) for each in UNITS])
+    return cases, pj.plan(PLANNER, cases)
+
+
+def test_a_problem_in_other_units_far_away_and_rotated_has_the_same_plan(in_units):
+    cases, plans = in_units
+    usual = pj.take(plans, 0)
+    assert usual.status == pj.Status.CONVERGED
+    assert pj.intercept.judge(cases, plans).success.all()
+    for k, (length, time, _, _) in enumerate(UNITS):
+        plan = pj.take(plans, k)
+        np.testing.assert_allclose(plan.speed * time / length, usual.speed, rtol=2e-3, atol=2e-3)
+        np.testing.assert_allclose(plan.curvature * length, usual.curvature, atol=1e-3)
+        np.testing.assert_allclose(plan.cost * time**3 / length**2, usual.cost, rtol=1e-2)
+
+
+def test_samples_of_a_plan_at_utm_coordinates_are_exact_to_a_millimetre(in_units):
+    shift = np.asarray(UNITS[3][2])
+    far, here = (pj.take(in_units[1], k).sample(5.0).pos for k in (3, 0))
+    assert far.dtype == np.float64
+    np.testing.assert_allclose(far[0], shift, atol=1e-9)
+    np.testing.assert_allclose(far - shift, here, atol=0.02)
+
+
+@pytest.mark.slow
+def test_the_car_avoids_a_recorded_mover_and_stops_in_a_region_with_a_margin():
+    lorry = 0.4 * BOX
+    path = ([0.0, 5.0, 10.0], [[3.0, 4.0, 0.0], [4.0, 4.0, 1.5], [5.0, 7.0, 1.6]])
+    case = pj.intercept.case(
+        pj.TurningPath(np.float32([6.5, 4.0]), np.zeros(2, np.float32), np.float32(0.0)),
+        movers=[lorry],
+        mover_paths=[path],
+        walls=[pj.intercept.Circle(4.5, 2.6, 0.3)],
+        region=[[-0.5, -0.3], [0.5, -0.3], [0.5, 0.3], [-0.5, 0.3]],
+        tolerance=0.01,
+        end_speed=(0.0, 0.05),
+        margin=0.1,
+    )
+    plan = pj.plan(PLANNER, case)
+    verdict = pj.intercept.judge(case, plan)
+    assert plan.status == pj.Status.CONVERGED and verdict.success, verdict.sentence(())
+    assert verdict.mover_clearance >= 0.099 and verdict.wall_clearance >= 0.099
+    assert verdict.end_speed <= 0.0501 and verdict.miss <= 0.01
+
+
+def test_the_status_says_why_there_is_no_plan():
+    target = pj.TurningPath(np.float32([6.5, 4.0]), np.zeros(2, np.float32), np.float32(0.0))
+    settings = {
+        pj.Status.TOO_FAR: {"time": 1.0},
+        pj.Status.BLOCKED: {"start": (0.8, 4.0, 0.0), "walls": [0.3 * BOX + [0.9, 4.0]]},
+        pj.Status.NO_PATH: {"walls": [[[2, -1], [2.2, -1], [2.2, 9], [2, 9]]]},
+    }
+    cases = [pj.intercept.case(target, **{"time": 10.0, **each}) for each in settings.values()]
+    cases.append(pj.intercept.case(target, 10.0, start=(-1.0, 4.0, 0.0)))
+    status = pj.plan(PLANNER, stack(cases)).status
+    np.testing.assert_array_equal(status, [*settings, pj.Status.BLOCKED])
 
 
 def test_bad_input_is_rejected_in_one_line():

@@ -1,4 +1,4 @@
-"""Interceptions in any units and frames, among recorded traffic, with regions and end speeds."""
+"""Interceptions: tables of poses, paths of targets, regions, arguments, and bounds on distances."""
 
 import jax
 import jax.numpy as jnp
@@ -10,84 +10,8 @@ import planner_jax as pj
 from planner_jax.plane.obstacles import place
 from planner_jax.task.intercept.plan import make_plan
 from planner_jax.task.intercept.terms import least_between, nearest_in_region
-from tests.planners import ONE_SEARCH
 
-# test_intercept plans batches of equal shapes with this planner, so that its program is shared.
-PLANNER = pj.intercept.planner(searches=ONE_SEARCH)
 BOX = np.array([[-1.0, -0.5], [1.0, -0.5], [1.0, 0.5], [-1.0, 0.5]])
-
-
-def stack(cases):
-    return jax.tree.map(lambda *leaves: np.stack(leaves), *cases)
-
-
-def problem(length=1.0, time=1.0, shift=(0.0, 0.0), turn=0.0):
-    """Return a car's drive past a box, in units that are 1 / `length` m and 1 / `time` s."""
-    cos, sin = np.cos(turn), np.sin(turn)
-    shift = np.asarray(shift, float)
-
-    def move(points):
-        return length * np.asarray(points, float) @ np.array([[cos, sin], [-sin, cos]]) + shift
-
-    speed, acceleration = length / time, length / time**2
-    velocity = move([3.0, 0.5]) - move([0.0, 0.0])
-    target = pj.TurningPath(move([14.0, 3.0]), velocity / time, np.zeros(()))
-    return pj.intercept.case(
-        target,
-        6.0 * time,
-        start=(*move([0.0, 0.0]), turn),
-        initial_speed=5.0 * speed,
-        walls=[move(BOX + [9.0, 0.5])],
-        lower=-np.inf,
-        upper=np.inf,
-        tolerance=0.3 * length,
-        length=4.5 * length,
-        width=1.6 * length,
-        wheelbase=2.6 * length,
-        rear_overhang=0.9 * length,
-        speed=12.0 * speed,
-        acceleration=4.0 * acceleration,
-        lateral_acceleration=4.0 * acceleration,
-        curvature=0.18 / length,
-        steering_rate=0.6 / time,
-    )
-
-
-# Length and time of the units [1/m, 1/s], position [m] and heading [rad] of the frame.
-UNITS = [
-    (1.0, 1.0, (0.0, 0.0), 0.0),
-    (1000.0, 1.0, (0.0, 0.0), 0.0),
-    (1e-3, 1.0 / 3600.0, (0.0, 0.0), 0.0),
-    (1.0, 1.0, (5e5, 4.6e6), 0.0),
-    (1.0, 1.0, (-30.0, 20.0), 2.2),
-    (1000.0, 1.0, (5e8, 1e8), -0.7),
-]
-
-
-@pytest.fixture(scope="module")
-def planned():
-    cases = stack([problem(*each) for each in UNITS])
-    return cases, pj.plan(PLANNER, cases)
-
-
-def test_a_problem_in_other_units_far_away_and_rotated_has_the_same_plan(planned):
-    cases, plans = planned
-    usual = pj.take(plans, 0)
-    assert usual.status == pj.Status.CONVERGED
-    assert pj.intercept.judge(cases, plans).success.all()
-    for k, (length, time, _, _) in enumerate(UNITS):
-        plan = pj.take(plans, k)
-        np.testing.assert_allclose(plan.speed * time / length, usual.speed, rtol=2e-3, atol=2e-3)
-        np.testing.assert_allclose(plan.curvature * length, usual.curvature, atol=1e-3)
-        np.testing.assert_allclose(plan.cost * time**3 / length**2, usual.cost, rtol=1e-2)
-
-
-def test_samples_of_a_plan_at_utm_coordinates_are_exact_to_a_millimetre(planned):
-    shift = np.asarray(UNITS[3][2])
-    far, here = (pj.take(planned[1], k).sample(5.0).pos for k in (3, 0))
-    assert far.dtype == np.float64
-    np.testing.assert_allclose(far[0], shift, atol=1e-9)
-    np.testing.assert_allclose(far - shift, here, atol=0.02)
 
 
 def test_a_table_of_poses_is_linear_between_its_times_and_ends_with_them(float64):
@@ -103,40 +27,6 @@ def test_a_table_of_poses_is_linear_between_its_times_and_ends_with_them(float64
     corners = group.vertices(2.0)[0, :4]
     cos, sin = np.cos(3.2), np.sin(3.2)
     np.testing.assert_allclose(corners, BOX @ [[cos, sin], [-sin, cos]] + [2.0, 0.0])
-
-
-@pytest.mark.slow
-def test_the_car_avoids_a_recorded_mover_and_stops_in_a_region_with_a_margin():
-    lorry = 0.4 * BOX
-    path = ([0.0, 5.0, 10.0], [[3.0, 4.0, 0.0], [4.0, 4.0, 1.5], [5.0, 7.0, 1.6]])
-    case = pj.intercept.case(
-        pj.TurningPath(np.float32([6.5, 4.0]), np.zeros(2, np.float32), np.float32(0.0)),
-        movers=[lorry],
-        mover_paths=[path],
-        walls=[pj.intercept.Circle(4.5, 2.6, 0.3)],
-        region=[[-0.5, -0.3], [0.5, -0.3], [0.5, 0.3], [-0.5, 0.3]],
-        tolerance=0.01,
-        end_speed=(0.0, 0.05),
-        margin=0.1,
-    )
-    plan = pj.plan(PLANNER, case)
-    verdict = pj.intercept.judge(case, plan)
-    assert plan.status == pj.Status.CONVERGED and verdict.success, verdict.sentence(())
-    assert verdict.mover_clearance >= 0.099 and verdict.wall_clearance >= 0.099
-    assert verdict.end_speed <= 0.0501 and verdict.miss <= 0.01
-
-
-def test_the_status_says_why_there_is_no_plan():
-    target = pj.TurningPath(np.float32([6.5, 4.0]), np.zeros(2, np.float32), np.float32(0.0))
-    settings = {
-        pj.Status.TOO_FAR: {"time": 1.0},
-        pj.Status.BLOCKED: {"start": (0.8, 4.0, 0.0), "walls": [0.3 * BOX + [0.9, 4.0]]},
-        pj.Status.NO_PATH: {"walls": [[[2, -1], [2.2, -1], [2.2, 9], [2, 9]]]},
-    }
-    cases = [pj.intercept.case(target, **{"time": 10.0, **each}) for each in settings.values()]
-    cases.append(pj.intercept.case(target, 10.0, start=(-1.0, 4.0, 0.0)))
-    status = pj.plan(PLANNER, stack(cases)).status
-    np.testing.assert_array_equal(status, [*settings, pj.Status.BLOCKED])
 
 
 @struct.dataclass
