@@ -96,15 +96,15 @@ def finished(request, tmp_path_factory):
 
 
 # Test modules, without "test_", of baselines, observed balls, plans that replace others, policies,
-# clusters and benchmarks, which only `make test-slow` runs.
+# clusters, devices, wheels and benchmarks, which only `make test-slow` runs, or the mark `gpu`.
 SLOW = (
     *("b_spline", "baselines", "bezier", "block_adapt", "block_library", "block_peers"),
     *("catch_peer", "hybrid_astar", "minimum_jerk", "mpp", "paper_catch", "path_smoothing"),
     *("path_then_speed", "qp", "speed", "station_time"),
     *("block_eye", "block_receding", "catch_replan", "sims_camera", "trip_peers"),
     *("policy", "training", "learned_start"),
-    "cluster",
-    *("bench", "benchmark_ipopt", "intercept_oracle"),
+    *("cluster", "devices", "gpu", "wheel"),
+    *("bench", "benchmark_ipopt", "intercept_gradient", "intercept_oracle"),
 )
 # Besides `test_sims_*`, modules in which JAX may convert types, because code of MJX, Brax or optax
 # relies on conversions (see `strict_arrays`).
@@ -113,11 +113,15 @@ MIXED = (
     *("plane_prediction", "cli", "snippets", "notebooks"),
 )
 # Test modules that start first, because they take longest or fill the compile cache for others:
-# test_exact compiles the planner of hits, test_decide the planner of catches. Worker processes get
-# whole modules in this order, so that no worker ends late, and no two compile the same program.
+# test_exact compiles the planner of hits, test_decide of catches, test_intercept of interceptions.
+# Worker processes get whole modules in this order, so that no worker ends late, and no two compile
+# the same program. The first line has the longest modules of slow tests.
 FIRST = (
-    *("along_curvature", "sims_flights", "exact", "notebooks", "intercept", "decide"),
-    *("contract", "block", "own_task", "along", "estimation"),
+    *("along_curvature", "sims_flights", "notebooks", "own_task", "along", "estimation"),
+    *("exact", "intercept", "decide", "task_reach", "intercept_group", "block", "contract"),
+    *("sweep_intercept", "sweep_catch", "sweep", "recorded_ball", "solve", "recovery"),
+    *("single_block", "live_loop", "space", "arm_kinds", "spinning_hit", "sensitivity"),
+    *("sims_parts", "intercept_suites", "extras"),
 )
 
 

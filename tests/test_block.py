@@ -122,20 +122,21 @@ def test_the_arm_is_clear_at_home_and_not_when_it_reaches_into_the_pole():
     assert at(ahead, jax.tree.map(jnp.asarray, paper_scene(has_pole=False))).min() > 0.0
 
 
-SHELF = make_scene(
-    boxes=[((0.75, 0.75, 0.9), (0.1, 0.1, 0.1), (0.9, 0.1, 0.4, 0.0))],
-    spheres=[((0.7, -0.6, 1.3), 0.06)],
-    capsules=[([(0.806, y, -0.48), (0.806, y, 2.5)], 0.05) for y in (-0.35, 0.0)],
-    cylinders=[([(0.5, 0.9, 0.0), (0.9, 0.9, 0.1)], 0.05)],
-    meshes=[(np.eye(4, 3), 0.3, (0.8, -0.9, 0.6), (1.0, 0.0, 0.2, 0.0))],
-    floor=-0.48,
-)
+def make_shelf():
+    return make_scene(
+        boxes=[((0.75, 0.75, 0.9), (0.1, 0.1, 0.1), (0.9, 0.1, 0.4, 0.0))],
+        spheres=[((0.7, -0.6, 1.3), 0.06)],
+        capsules=[([(0.806, y, -0.48), (0.806, y, 2.5)], 0.05) for y in (-0.35, 0.0)],
+        cylinders=[([(0.5, 0.9, 0.0), (0.9, 0.9, 0.1)], 0.05)],
+        meshes=[(np.eye(4, 3), 0.3, (0.8, -0.9, 0.6), (1.0, 0.0, 0.2, 0.0))],
+        floor=-0.48,
+    )
 
 
 @pytest.mark.slow
 def test_balls_are_blocked_among_two_poles_a_box_a_sphere_a_cylinder_and_a_mesh():
     usual = pj.block.draw(40, "open", 3, wide=True)
-    cases = pj.block.case(usual.ball.pos, usual.ball.vel, wide=True, scene=SHELF)
+    cases = pj.block.case(usual.ball.pos, usual.ball.vel, wide=True, scene=make_shelf())
     plans = pj.plan(pj.block.planner(), cases)
     verdict, bare = pj.block.judge(cases, plans), pj.block.judge(cases, pj.plan(SMALL, usual))
     np.testing.assert_array_equal(verdict.success, pj.are_solved(plans))

@@ -79,13 +79,21 @@ def motion(shape, end=GOAL, durations=PIECES, start=HOME):
     return np.array(pieces)
 
 
+def leaves_of(**options):
+    """Return the arrays of a case by name, with any ball."""
+    pairs, _ = jax.tree_util.tree_flatten_with_path(case(CONTACT, INCOMING, delay=DELAY, **options))
+    return {jax.tree_util.keystr(path)[1:]: np.asarray(leaf) for path, leaf in pairs}
+
+
+usual_leaves = functools.cache(leaves_of)
+
+
 def good(shape=REST_TO_REST, end=GOAL, durations=PIECES, velocity=INCOMING, at=CONTACT, **options):
     fall = np.array([0.0, 0.0, GRAVITY])
     begin = velocity + fall * CONTACT_TIME
     pos = at - begin * CONTACT_TIME + 0.5 * fall * CONTACT_TIME**2
-    pairs, _ = jax.tree_util.tree_flatten_with_path(case(pos, begin, delay=DELAY, **options))
-    leaves = {jax.tree_util.keystr(path)[1:]: np.asarray(leaf) for path, leaf in pairs}
-    leaves |= {"ball.pos": pos, "ball.vel": begin, "gravity": GRAVITY, "delay": DELAY}
+    leaves = leaves_of(**options) if options else usual_leaves()
+    leaves = leaves | {"ball.pos": pos, "ball.vel": begin, "gravity": GRAVITY, "delay": DELAY}
     leaves |= {COEFFS: motion(shape, end, durations), DURATIONS: durations}
     leaves |= {"plan.contact_time": CONTACT_TIME, "angles": HOME}
     leaves = {name: np.array(leaf)[None] for name, leaf in leaves.items()}
@@ -546,10 +554,11 @@ ABSURD, HARMLESS = (
     ("ball.pos", "angles", "arm.origin", "scene.capsule_ends", *PLANNED),
     "scene.capsule_ends",
 )
-READ = {name for name, leaf in good().items() if leaf.dtype == float} - UNREAD
+USUAL = good()
+READ = {name for name, leaf in USUAL.items() if leaf.dtype == float} - UNREAD
 READ |= {"ends_at_rest"}
 WRONG = [
     ({}, {"capsule_link": (6,) * 8}, "arm.capsule_link must be in -1, ..., 5"),
     ({COEFFS: np.zeros((1, 2, 6, 5))}, {}, r"coeffs must be \(B, M, D \+ 1, 6\), got"),
-    *(({name: good()[name][..., None]}, {}, f"{name} must be ") for name in sorted(READ)),
+    *(({name: USUAL[name][..., None]}, {}, f"{name} must be ") for name in sorted(READ)),
 ]

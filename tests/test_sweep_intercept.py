@@ -11,7 +11,7 @@ from referees import tree
 from sweeps import RunTests, columns
 
 import planner_jax as pj
-from planner_jax.plane.reach import Lattice
+from planner_jax.planning.plan import plan
 from planner_jax.referee.intercept import referee_intercepts
 from planner_jax.robot.car import CarBody, CarLimits
 from planner_jax.runs.columns import RefereedBatch
@@ -21,15 +21,11 @@ from planner_jax.sweep.intercept.figures import sample_drive
 from planner_jax.sweep.intercept.settings import InterceptSettings
 from planner_jax.sweep.intercept.sweep import InterceptSweep
 from planner_jax.task.intercept.drawing import instants
-from planner_jax.task.intercept.searches import Search
+from tests.planners import ONE_SEARCH, with_room
 
 TASK = pj.task_named("intercept")
 NUM, BATCH = 12, 6
 SETTINGS = InterceptSettings(suite="hard", num=NUM, batch=BATCH, seed=0)  # some of these fail
-
-
-def one_search():
-    return pj.intercept.planner(searches=(Search(12, lattice=Lattice(layers=22)),))
 
 
 BODY = [field.name for field in dataclasses.fields(CarBody)]
@@ -62,9 +58,11 @@ def leaves_of(found, setting):
 
 @pytest.fixture(autouse=True, scope="module")
 def quick_planners():
+    planner = pj.intercept.planner(searches=ONE_SEARCH)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(InterceptSweep, "planner", lambda *_: one_search())
-        patch.setattr(InterceptSweep, "other_planners", lambda *_: {"lattice": one_search()})
+        patch.setattr(InterceptSweep, "planner", lambda *_: planner)
+        patch.setattr(InterceptSweep, "other_planners", lambda *_: {"lattice": planner})
+        patch.setattr(InterceptSweep, "plan", lambda _, *given: plan(given[0], with_room(given[1])))
         yield
 
 

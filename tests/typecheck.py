@@ -41,15 +41,22 @@ def check(function):
     """
     if function.__name__ == "__init__":
         return function
-    try:
-        checked = _check(function)
-    except BeartypeDecorHintException:
-        return function
     if not inspect.isfunction(function):  # a class, whose methods are checked one by one
-        return checked
+        return _add_checks(function)
+    checked = None
 
     @functools.wraps(function)
     def call(*args, **kwargs):
+        nonlocal checked
+        if checked is None:  # functions that no test calls get no checks, which takes time
+            checked = _add_checks(function)
         return (checked if is_on else function)(*args, **kwargs)
 
     return call
+
+
+def _add_checks(function):
+    try:
+        return _check(function)
+    except BeartypeDecorHintException:
+        return function

@@ -1,6 +1,7 @@
 """Invalid cases of a batch, such as with NaN, are found and change no plan of other cases."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -14,12 +15,16 @@ from planner_jax.task.block.scene import paper_scene
 from planner_jax.task.catch.decide import MOST_SEARCHED
 
 TASKS = ("hit", "catch", "intercept", "block")
-CASES = {name: jax.tree.map(np.asarray, pj.task_named(name).draw(3)) for name in TASKS}
 SOUND = jax.jit(is_sound)
 # Planners that decide the order and times of catches replace these arrays without reading them, so
 # bad values in them have no effect.
 REPLACED = ("order", "times")
 BAD = (np.nan, np.inf, -np.inf, -1.0, 0.0, 1e6)
+
+
+@functools.cache
+def draw_three(name):
+    return jax.tree.map(np.asarray, pj.task_named(name).draw(3))
 
 
 def poisons(case):
@@ -97,7 +102,7 @@ def test_a_table_names_arrays_of_its_case_and_every_rule_can_be_broken(name):
         far = vars(pj.reach.make_scene(boxes=[box], cylinders=[rod]))
         solid = {key: far[key] for key in far if key.startswith(("box_", "cylinder_"))}
         options = {"scene": dataclasses.replace(paper_scene(), **solid)}
-    drawn = pj.task_named(name).draw(1, **options) if options else CASES[name]
+    drawn = pj.task_named(name).draw(1, **options) if options else draw_three(name)
     case = pj.take(jax.tree.map(np.asarray, drawn), 0)
     present = [field for field in type(case).rules if part_at(case, field.name) is not None]
     places = {place for place, _ in poisons(case)}
@@ -106,7 +111,7 @@ def test_a_table_names_arrays_of_its_case_and_every_rule_can_be_broken(name):
 
 @pytest.mark.parametrize("name", TASKS)
 def test_every_broken_rule_marks_its_lane_alone_in_both_forms(name):
-    cases = CASES[name]
+    cases = draw_three(name)
     bad = poisons(pj.take(cases, 0))
     whole = jax.tree.map(lambda leaf: np.repeat(leaf[:1], 2 * len(bad), axis=0), cases)
     lanes = np.arange(0, 2 * len(bad), 2)
@@ -119,7 +124,7 @@ def test_every_broken_rule_marks_its_lane_alone_in_both_forms(name):
 
 @pytest.mark.parametrize("name", TASKS)
 def test_the_host_names_field_rule_value_and_lane(name):
-    cases = CASES[name]
+    cases = draw_three(name)
     for place, value in poisons(pj.take(cases, 0))[::5]:
         broken = jax.tree.map(np.array, cases)
         part_at(broken, place)[1] = value
