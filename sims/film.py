@@ -77,8 +77,10 @@ class Scene:
         self.back = np.where(after[:, :1], balls[:, 0], np.nan)  # trajectory of the returned ball
         self.axes: Any = figure.add_subplot(projection="3d")
         wanted = self.plan_path()
-        plan = self.axes.plot(*wanted.T, color=INK, lw=1.0, ls="--", label="plan")
-        self.moving = plan[:0]
+        for k, path in enumerate(np.moveaxis(wanted, 1, 0)):
+            label = "_" if k else "plan"
+            self.axes.plot(*path.T, color=INK, lw=1.0, ls="--", label=label)
+        self.moving: list[Any] = []
         number, thing = balls.shape[1], task.THING
         colours = [BALL_COLOURS[k % len(BALL_COLOURS)] for k in range(number)]
         names = [thing] if number == 1 else [f"{thing} {k + 1}" for k in range(number)]
@@ -106,7 +108,8 @@ class Scene:
         edges += [line for prism in standing for line in prism.outlines(0.0)]
         if task.BOUNDS is None:
             moved = world.robot.place(recording.robot[flight, : self.num_samples])
-            points = np.concatenate([wanted, moved, balls.reshape(-1, 3), *edges, *patches])
+            moved, planned = moved.reshape(-1, 3), wanted.reshape(-1, 3)
+            points = np.concatenate([planned, moved, balls.reshape(-1, 3), *edges, *patches])
             low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
             thin = np.maximum(1.6 - (high - low), 0.0)  # [m], padding of axes with a short range
             low, high = low - 0.2 - 0.5 * thin, high + 0.2 + 0.5 * thin
@@ -125,7 +128,7 @@ class Scene:
             axis.set_major_locator(MaxNLocator(most, steps=[1, 2, 5, 10], prune="both"))
             axis.pane.set_facecolor("white")
             axis.labelpad = 6.0
-        for path in (wanted, *np.moveaxis(balls, 1, 0)):
+        for path in (*np.moveaxis(wanted, 1, 0), *np.moveaxis(balls, 1, 0)):
             self.axes.plot(path[:, 0], path[:, 1], 0.0, color=PALE, lw=1.0, zorder=0)
         for line in edges:
             self.axes.plot(*line.T, color=GREY, lw=0.8, zorder=1)
@@ -159,9 +162,10 @@ class Scene:
         return self.axes.add_collection3d(Poly3DCollection(faces, **style))
 
     def plan_path(self) -> np.ndarray:
-        """Return the planned positions of the robot, one per row [m], up to the last contact."""
+        """Return planned positions (K, N, 3) [m] of N robots, up to the last contact."""
         wanted = self.recording.wanted[self.flight, : self.find_last_contact() + 1]
-        return wanted[np.isfinite(wanted).all(axis=1)]
+        wanted = wanted[np.isfinite(wanted).all(axis=1)]
+        return wanted.reshape(len(wanted), -1, 3)
 
     def find_last_contact(self) -> int:
         """Return the index of the first sample after the last contact of a ball with the robot.

@@ -58,6 +58,7 @@ class World:
     timestep: float = 0.002  # [s]
     scenery: tuple[Part, ...] = ()  # visual parts of the surroundings
     mouth: tuple[float, float, float] | None = None  # [m], where balls leave the pitching machine
+    floats: bool = False  # whether balls have no weight, and without drag a constant velocity
 
     def __post_init__(self) -> None:
         if self.num_balls < 0:
@@ -141,13 +142,13 @@ def step(world: World, physics: Physics, command: Array, drag: Array) -> Physics
     """
     model, data = _mjx_model(world)
     controls, forces = world.robot.drive(physics, command, world.timestep)
-    drags = _drag_force(world, physics.qvel[world.robot.num_vel :], drag)
+    on_balls = _ball_forces(world, physics.qvel[world.robot.num_vel :], drag)
     data = data.replace(
         qpos=physics.qpos,
         qvel=physics.qvel,
         act=physics.act,
         ctrl=controls,
-        qfrc_applied=jnp.concatenate([forces, drags]),
+        qfrc_applied=jnp.concatenate([forces, on_balls]),
     )
     # MJX combines arrays of different ranks, which this library's tests forbid in other code.
     with jax.numpy_rank_promotion("allow"):
@@ -155,15 +156,22 @@ def step(world: World, physics: Physics, command: Array, drag: Array) -> Physics
     return Physics(qpos=data.qpos, qvel=data.qvel, act=data.act)
 
 
-def _drag_force(world: World, qvel: Array, drag: Array) -> Array:
-    """Return the drag  -m K_D |v| v  [N] of N balls of mass m and velocity v, as (3 N,)."""
+def _ball_forces(world: World, qvel: Array, drag: Array) -> Array:
+    """Return the drag  -m K_D |v| v  [N] of N balls of mass m and velocity v, as (3 N,).
+
+    A lift that balances the weight is added if the balls float.
+    """
     vel = qvel.reshape(world.num_balls, 3)
     speed = jnp.sqrt(jnp.sum(vel**2, axis=1, keepdims=True))
-    return (-BALL_MASS * drag[:, None] * speed * vel).ravel()
+    forces = -BALL_MASS * drag[:, None] * speed * vel
+    return (forces.at[:, 2].add(BALL_MASS * world.gravity) if world.floats else forces).ravel()
 
 
 def at_rest(world: World, place: Array) -> Physics:
-    """Return the state of a world: robot at standstill at `place` (3,) [m], balls 100 m away."""
+    """Return the state of a world: robot at standstill at `place` (3,) [m], balls 100 m away.
+
+    Several robots stand still at `place` (N, 3).
+    """
     place = jnp.asarray(place)
     qpos, qvel, act = world.robot.at_rest(place, world.gravity)
     away = jnp.tile(jnp.array([100.0, 0.0, 0.0], place.dtype), world.num_balls)
@@ -212,5 +220,5 @@ def ball_velocity(world: World, vel: Array, drag: Array) -> Array:
 
 
 def _ball_accelerations(world: World, vel: Array, drag: Array) -> Array:
-    gravity = jnp.asarray(world.gravity, vel.dtype)
+    gravity = jnp.asarray(0.0 if world.floats else world.gravity, vel.dtype)
     return jax.vmap(ball_acceleration, in_axes=(0, 0, None))(vel, drag, gravity)

@@ -40,7 +40,7 @@ class Recording:
     success: np.ndarray  # (F,) bool, whether the flight succeeded
     time: np.ndarray  # (F, K) [s], times of the samples
     robot: np.ndarray  # (F, K, R), joint positions of the robot
-    wanted: np.ndarray  # (F, K, 3) [m], planned position of the robot
+    wanted: np.ndarray  # (F, K, 3 Q) [m], planned positions of Q robots, by default 1
     balls: np.ndarray  # (F, K, N, 3) [m], positions of the balls
     met: np.ndarray  # (F, N) [s], time of the contact with each ball
     contact: np.ndarray  # (F, N, 3) [m], position of the ball's centre at the contact
@@ -203,7 +203,7 @@ _COLUMNS = leaves_of(
     ("success", "", "by the task's criterion", BOOL),
     ("time", "s", "of each sample", LIST),
     ("robot", "", "samples x R, flat; joint positions in MuJoCo's order, m and rad", LIST),
-    ("wanted", "m", "samples x 3, flat; planned position of the robot", LIST),
+    ("wanted", "m", "samples x 3 for each robot, flat; planned position", LIST),
     ("balls", "m", "samples x balls x 3, flat; NaN where not in flight", LIST),
     ("met", "s", "time of the contact with each ball, NaN for never", LIST),
     ("contact", "m", "balls x 3, flat; position of each ball at its contact", LIST),

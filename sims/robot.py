@@ -126,7 +126,10 @@ class Robot(Protocol):
         ...
 
     def place(self, poses: np.ndarray) -> np.ndarray:
-        """Return the robot's position, a point (..., 3) [m], at R joint positions (..., R)."""
+        """Return the robot's position, a point (..., 3) [m], at R joint positions (..., R).
+
+        For N robots in one world the result is (..., 3 N).
+        """
         ...
 
     def find_held_ball(self, pose: np.ndarray) -> np.ndarray:

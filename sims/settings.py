@@ -22,6 +22,7 @@ from planner_jax.task.catch.spec import TASK as CATCH
 from planner_jax.task.hit.spec import TASK as HIT
 from planner_jax.task.intercept.spec import TASK as INTERCEPT
 from planner_jax.task.rally.spec import TASK as RALLY
+from planner_jax.task.team.spec import TASK as TEAM
 
 _REPLAN = "replanning rate, 0 for never (default: {} with {}, 0 with other planners)"
 # Cases of flights contain no order and times of catches, which the decision "given" would use.
@@ -276,6 +277,29 @@ class RallyFly(BallFly):
         require(self.rate > 0.0, "replan", "> 0, as rallies must be planned again", self.rate)
         is_one = self.batch is None or self.batch >= self.num
         require(self.state is None or is_one, "batch", "left out with a file of states", self.batch)
+
+
+@dataclasses.dataclass(frozen=True)
+class TeamFly(FlySettings):
+    """Settings of flights in which several quadrotors catch balls that they share."""
+
+    num: int = option(16, "N", "number of flights")
+    replan: float | None = option(None, "HZ", "replanning rate: 0, as teams plan once")
+    suite: str = option("team2-swarm12", "NAME", "suite of teams")
+    noise: str = option("lab", "NAME", f"preset of sensing noise: {', '.join(NOISES)}")
+
+    TASK: ClassVar[Task] = TEAM
+    FLIGHT: ClassVar[str] = "planner_jax.sims.tasks.team:TeamFlight"
+    RATE: ClassVar[float] = 0.0
+
+    def __post_init__(self) -> None:
+        require_one_of(NOISES, "noise", self.noise)
+        require_one_of(TEAM.suites, "suite", self.suite)
+        super().__post_init__()
+
+    def check_rate(self) -> None:
+        """Raise `ValueError` unless the rate is 0, because teams are planned once."""
+        require(self.rate == 0.0, "replan", "0, as teams plan once", self.rate)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -254,9 +254,14 @@ class Viewer:
             drawn = self._add_parts(
                 "/machine", machine_parts(*launch) if launch and self.world.mouth else []
             )
+            flown = self.world.robot.place(recording.robot[row])
             paths = [
-                ("/flown", self.world.robot.place(recording.robot[row]), BLUE, 0.012),
-                ("/plan", recording.wanted[row], INK, 0.006),
+                (f"{name}{k}", path, colour, thickness)
+                for name, all_paths, colour, thickness in (
+                    ("/flown", flown, BLUE, 0.012),
+                    ("/plan", recording.wanted[row], INK, 0.006),
+                )
+                for k, path in enumerate(np.split(all_paths, all_paths.shape[1] // 3, axis=1))
             ]
             paths += [
                 (f"/path{k}", recording.balls[row, :, k], GREY, 0.004)

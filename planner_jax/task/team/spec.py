@@ -13,5 +13,6 @@ TASK = Task(
     suites={
         k: f"The targets of `{of}`, shared by {num} robots." for k, (of, num) in SUITES.items()
     },
+    flight="planner_jax.sims.settings:TeamFly",
     bench={"decide": "greedy"},
 )

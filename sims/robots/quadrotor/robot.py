@@ -42,25 +42,28 @@ class Quadrotor:
         """The racket or net that hits or catches balls."""
         return self.model.tool
 
-    def mjcf(self) -> tuple[str, str]:
-        """Return two texts in MJCF, MuJoCo's format: the body with rotors and tool, and motors."""
+    def mjcf(self, name: str = "") -> tuple[str, str]:
+        """Return two texts in MJCF, MuJoCo's format: the body with rotors and tool, and motors.
+
+        All names in the texts end with `name`, which differs between robots of one world.
+        """
         model, rotors = self.model, self.model.rotors
         discs = "".join(
-            f'<site name="rotor{i}" pos="{xml_numbers(*place)}"/>'
+            f'<site name="rotor{i}.{name}" pos="{xml_numbers(*place)}"/>'
             f'<geom type="cylinder" size="{rotors.radius:g} .003" '
             f'pos="{xml_numbers(*place)}" rgba=".2 .2 .2 .6" {VISUAL}/>'
             f'<geom type="capsule" size=".008" fromto="0 0 0 {xml_numbers(*place)}" {VISUAL}/>'
             for i, place in enumerate(rotors.positions)
         )
         motors = "".join(
-            f'<general site="rotor{i}" gear="0 0 1 0 0 {xml_numbers(torque)}" ctrllimited="true" '
-            f'ctrlrange="{xml_numbers(rotors.min_thrust, rotors.max_thrust)}" '
+            f'<general site="rotor{i}.{name}" gear="0 0 1 0 0 {xml_numbers(torque)}" '
+            f'ctrllimited="true" ctrlrange="{xml_numbers(rotors.min_thrust, rotors.max_thrust)}" '
             f'dyntype="filterexact" dynprm="{xml_numbers(rotors.lag)}"/>'
             for i, torque in enumerate(rotors.torque_arms)
         )
         inertia = "diaginertia" if len(model.inertia) == 3 else "fullinertia"
         body = (
-            '<body name="quadrotor"><freejoint/><inertial pos="0 0 0" '
+            f'<body name="quadrotor{name}"><freejoint/><inertial pos="0 0 0" '
             f'mass="{model.mass}" {inertia}="{xml_numbers(*model.inertia)}"/>'
             f"{discs}{self._tool_xml()}</body>"
         )
