@@ -182,8 +182,11 @@ def test_assignment_catches_as_many_as_all_divisions():
     points = np.concatenate([near, near + [40.0, 0.0, 0.0]])
     case = hanging(points, [[-1.0, 0.0, 1.0], [39.0, 0.0, 1.0]])
     cases = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], case)
-    (taken,) = assign(cases, 16, 0.8)
-    np.testing.assert_array_equal(taken, np.kron(np.eye(2, dtype=bool), np.ones(4, bool)))
+    choices = assign(cases, 16, (1.0, 1.5))
+    each = np.kron(np.eye(2, dtype=bool), np.ones(4, bool))
+    np.testing.assert_array_equal(choices.taken, np.tile(each, (1, 2, 1, 1)))
+    catches = choices.times[0, :, :, 3]  # of the last catch; faster robots are earlier
+    assert (catches[1] < catches[0]).all()
 
 
 @pytest.mark.slow

@@ -17,19 +17,17 @@ from planner_jax.cost.moving import MovingKeepOut
 from planner_jax.recovery.case import RecoveryCase, end_state
 from planner_jax.recovery.planner import RecoveryPlanner
 
-# Fractions of the speed limit with which a plan is searched again if its recovery fails.
-_SLOWER = (0.8, 0.65, 0.5)
-
 
 @struct.dataclass
 class RecoveringPlanner(PlannerAround[CaseT, PlanT]):
     """A planner of a quadrotor's task, followed by a planner of recovery trajectories.
 
-    If the recovery exceeds a limit, the plan is searched again with a lower speed limit. Without
-    a recovery the plan counts as unsolved.
+    If the recovery exceeds a limit, the plan is searched again with a lower speed limit, for each
+    fraction in `slower` of the case's speed limit. Without a recovery the plan counts as unsolved.
     """
 
     recovery_planner: RecoveryPlanner
+    slower: tuple[float, ...] = struct.field(pytree_node=False, default=(0.8, 0.65, 0.5))
 
     def settle(
         self, cases: PyTree, plan_of: Callable[[Planner, PyTree], PyTree] | None = None
@@ -53,7 +51,7 @@ class RecoveringPlanner(PlannerAround[CaseT, PlanT]):
         plans, left = self._plan_at(1.0, drive, cases)
         if not drive.is_pure:
             plans = jax.tree.map(np.array, plans)
-        for factor in _SLOWER:
+        for factor in self.slower:
             slower = lambda some, factor=factor: self._plan_at(factor, drive, some)[0]  # noqa: E731
             plans = drive.plan_again(slower, cases, plans, left)
             left = left & ~is_solved(plans.status)

@@ -87,36 +87,38 @@ class Sequences:
     times: Array  # (W, N) [s], of the catch of each target in the sequence
 
 
-def beam(
-    case: CatchCase, table: Timetable, width: int, margin: float = estimate.MARGIN
-) -> CatchChoice:
+def beam(case: CatchCase, table: Timetable, width: int) -> CatchChoice:
     """Search for W orders of one case that catch most targets, and catch them early.
 
     These are the longest sequences that `sequences` finds. If fewer than W orders are found, the
     first one is repeated. For N targets the leaves of the result have the shape (W, N).
     """
-    depths = sequences(case, table, width, margin)
+    depths = sequences(case, table, width, estimate.MARGIN)
     most = jnp.sum(jnp.any(jnp.isfinite(depths.rank[1:]), axis=1))
     found = jax.tree.map(lambda leaf: leaf[most], depths)
     chosen = jnp.where(jnp.isfinite(found.rank), np.arange(width), 0)
-    return jax.vmap(_choice)(found.position[chosen], found.times[chosen])
+    return jax.vmap(choose)(found.position[chosen], found.times[chosen])
 
 
-def sequences(case: CatchCase, table: Timetable, width: int, margin: float) -> Sequences:
+def sequences(
+    case: CatchCase, table: Timetable, width: int, margin: float, haste: float = 1.0
+) -> Sequences:
     """Search for sequences of 0, 1, ..., N catches of one case, W of each length.
 
     It is a beam search of width W = `width` among the possible catches in `table`. After each catch
     the W sequences with the least ranks continue. The rank is the estimated time plus 10 s for each
     metre that the quadrotor would lack to reach its targets in time, at most `margin` [m] for an
     optional target. Among sequences with the same targets and the same last target only the best
-    continues. The leaves of the result have the shape (N + 1, W, ...).
+    continues. `haste` is the factor on the agility in `estimate.arrival`. The leaves of the result
+    have the shape (N + 1, W, ...).
 
     Raises:
         ValueError: there are more than `MOST_SEARCHED` targets.
     """
-    num, speed = case.num_targets, estimate.top_speed(case)
+    num, speed = case.num_targets, estimate.top_speed(case, haste)
     require(num <= MOST_SEARCHED, "targets", f"at most {MOST_SEARCHED} of a case", num)
-    from_all = jax.vmap(estimate.arrivals, (None, 0, 0, None))
+    arrival = functools.partial(estimate.arrival, speed=speed, haste=haste)
+    from_all = jax.vmap(jax.vmap(arrival, (0, None, None)), (None, 0, 0))
     # The set of caught targets is stored as bits of a few 32-bit integers. The last integer also
     # holds the index of the last target.
     words = np.arange(0, num, _WORD)
@@ -125,7 +127,7 @@ def sequences(case: CatchCase, table: Timetable, width: int, margin: float) -> S
     bits = jnp.asarray(np.where(inside, 1 << np.clip(place, 0, _WORD - 1), 0), jnp.int32)
 
     def advance(now: Sequences, step: Array) -> tuple[Sequences, Sequences]:
-        times, places, shortfalls = from_all(table, now.time, now.place, speed)
+        times, places, shortfalls = from_all(table, now.time, now.place)
         times = jnp.maximum(times, now.time[:, None] + estimate.INSTANT)
         left = now.position == num
         possible = left & jax.vmap(estimate.can_be_next, (None, 0, None))(case, shortfalls, margin)
@@ -164,7 +166,8 @@ def sequences(case: CatchCase, table: Timetable, width: int, margin: float) -> S
     return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), begin, depths)
 
 
-def _choice(position: Array, times: Array) -> CatchChoice:
+def choose(position: Array, times: Array) -> CatchChoice:
+    """Return the choice that a sequence of N targets makes: its `position` and `times`, (N,)."""
     num = position.size
     order = jnp.argsort(position, stable=True)
     taken = position < num
@@ -219,8 +222,6 @@ class Best(CatchDecision):
 
     finalists: int = 6  # number of orders that are planned
     width: int = 64  # number of partial orders that the beam search continues
-    # [m], distances by which estimated flights may miss optional targets; a search for each one
-    margins: tuple[float, ...] = (estimate.MARGIN,)
 
     def __post_init__(self) -> None:
         require_settings(self)
@@ -230,9 +231,9 @@ class Best(CatchDecision):
         """Return the orders (F, N) of a case with the least ranks, best first for each margin."""
         table = timetable(case)
         if case.optional or case.num_targets > MOST_PERMUTED:
-            found = [beam(case, table, self.width, margin) for margin in self.margins]
-            first = lambda *leaves: jnp.concatenate([x[: self.finalists] for x in leaves])  # noqa: E731
-            return in_several_lengths(case, jax.tree.map(first, *found))
+            found = beam(case, table, self.width)
+            first = jax.tree.map(lambda leaf: leaf[: self.finalists], found)
+            return in_several_lengths(case, first)
         orders = jnp.asarray(list(itertools.permutations(range(case.num_targets))), jnp.int32)
         choices, shortfall = jax.vmap(functools.partial(estimate.follow, case, table))(orders)
         rank = choices.times[:, -1] + 10.0 * shortfall

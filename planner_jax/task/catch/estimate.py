@@ -69,18 +69,19 @@ def length(vectors: Array) -> Array:
 
 
 def arrival(
-    table: Timetable, begin: Array, place: Array, speed: Array
+    table: Timetable, begin: Array, place: Array, speed: Array, haste: float = 1.0
 ) -> tuple[Array, Array, Array]:
     """Return time () [s], position (3,) [m] and shortfall () [m] of a target's earliest catch.
 
     The quadrotor leaves the position `place` (3,) [m] at `begin` () [s]; `speed` () [m/s] is its
-    greatest speed. The shortfall is 0 if a catch is possible. Else it is the distance by which the
-    quadrotor misses the target, plus a penalty [m] if the target is too low or rises too steeply,
-    at the time at which this sum is least.
+    greatest speed. It tilts `haste` times as fast, and accelerates `haste`^2 times as much, as in
+    cautious estimates. The shortfall is 0 if a catch is possible. Else it is the distance by which
+    the quadrotor misses the target, plus a penalty [m] if the target is too low or rises too
+    steeply, at the time at which this sum is least.
     """
     times, places, penalty = table.times, table.places, table.penalty
     late = jnp.where(times > begin, 0.0, 100.0)
-    short = _out_of_reach(places - place[:, None], times - begin, speed) + penalty + late
+    short = _out_of_reach(places - place[:, None], times - begin, speed, haste) + penalty + late
     # Index of the first time at which a catch is possible, else of the least shortfall.
     first = jnp.argmin(jnp.where(short <= 0.0, np.arange(-short.size, 0.0), short))
     return times[first], places[:, first], short[first]
@@ -89,10 +90,10 @@ def arrival(
 arrivals = jax.vmap(arrival, (0, None, None, None))  # `arrival` for N targets from one position
 
 
-def _out_of_reach(offset: Array, span: Array, speed: Array) -> Array:
-    span = jnp.maximum(span - _TURNING, 0.0)
-    rise = speed / _ACCELERATION
-    reach = jnp.where(span < rise, 0.5 * _ACCELERATION * span**2, speed * span - 0.5 * speed * rise)
+def _out_of_reach(offset: Array, span: Array, speed: Array, haste: float = 1.0) -> Array:
+    span, acc = jnp.maximum(span - _TURNING / haste, 0.0), _ACCELERATION * haste**2
+    rise = speed / acc
+    reach = jnp.where(span < rise, 0.5 * acc * span**2, speed * span - 0.5 * speed * rise)
     return jnp.maximum(length(offset) - reach, 0.0)
 
 
@@ -166,9 +167,9 @@ def can_be_next(case: CatchCase, shortfalls: Array, margin: float = MARGIN) -> A
     return case.present & (shortfalls <= margin) if case.optional else case.present
 
 
-def top_speed(case: CatchCase) -> Array:
-    """Return the greatest speed () [m/s] in estimates: 0.9 times the quadrotor's limit."""
-    return 0.9 * case.limits.speed
+def top_speed(case: CatchCase, haste: float = 1.0) -> Array:
+    """Return the greatest speed () [m/s] in estimates: 0.9 `haste` times the limit, at most it."""
+    return min(0.9 * haste, 1.0) * case.limits.speed
 
 
 def _leave_from(
