@@ -111,8 +111,8 @@ def _fly_to_observation(
     times = state.time + world.timestep * jnp.arange(loop.steps_per_observation, dtype=dtype)
     references = robot.references(plans, times, world)
     no_drag = jnp.zeros(world.num_balls, dtype)
-    axes: Any = Moment(*[0] * 4, *[None] * 2)  # pyright: ignore[reportCallIssue]
-    pass_all = jax.vmap(passage, (None, axes, axes, None, 0, 0))
+    axes: tuple[Any, ...] = 0, 0, 0, 0, None, None  # of a moment's leaves
+    pass_all = jax.vmap(passage, (None, Moment(*axes), Moment(*axes), None, 0, 0))
 
     def advance(carry: tuple, now: tuple) -> tuple[tuple, None]:
         state, before = carry

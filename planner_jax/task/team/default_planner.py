@@ -18,6 +18,7 @@ from planner_jax.core.origin import without_origin
 from planner_jax.core.planner import Drive, Planner
 from planner_jax.core.protocol import is_solved
 from planner_jax.cost.moving import MovingKeepOut
+from planner_jax.recovery.with_recovery import RecoveringPlanner
 from planner_jax.task.catch.case import CatchCase
 from planner_jax.task.catch.plan import CatchPlan
 from planner_jax.task.team.case import TeamCase
@@ -49,7 +50,7 @@ class ExactTeam(Planner[TeamCase, TeamPlan]):
 
     case_type: ClassVar[type] = TeamCase
 
-    planner: Planner[CatchCase, CatchPlan]  # plans the catches and the recovery of one robot
+    planner: RecoveringPlanner[CatchCase, CatchPlan]  # plans catches and recovery of one robot
     turns: int = struct.field(pytree_node=False, default=3)  # how often a robot plans in turn
 
     @property
@@ -88,7 +89,7 @@ class ExactTeam(Planner[TeamCase, TeamPlan]):
         """Return N robots' plans of B cases, and in which cases the distance costs catches."""
         num, batch = cases.num_robots, len(cases.head_states)
         choices = jax.tree.map(np.asarray, assign(cases, _WIDTH, _HASTES))
-        alone = self.planner.replace(planner=self.inner, slower=())
+        alone = dataclasses.replace(self.planner, planner=self.inner, slower=())
         # Plans of each robot, leaves (B, ...): to hover, then for each joint decision. A robot
         # hovers where it has no plan.
         pool = [[self._hover(drive, cases, k)] * (1 + len(_HASTES)) for k in range(num)]
@@ -110,7 +111,8 @@ class ExactTeam(Planner[TeamCase, TeamPlan]):
                 new = jax.tree.map(lambda leaf: leaf[part[solved]], found)  # noqa: B023
                 _put(pool[k][1 + h], new, lanes[solved])
             most = _select(pool, within)[1]
-        chosen, best = _select(pool, _near(pool, _SPARE * cases.least_distance))
+        apart = _SPARE * np.asarray(cases.least_distance)
+        chosen, best = _select(pool, _near(pool, apart))
         number = np.arange(batch)
         pick = lambda at: lambda *leaves: np.stack(leaves)[at, number]  # noqa: E731
         return [jax.tree.map(pick(chosen[k]), *pool[k]) for k in range(num)], most > best
@@ -123,7 +125,8 @@ class ExactTeam(Planner[TeamCase, TeamPlan]):
         lasting = np.full(still.shape[:2], _HOVER / pieces, start.dtype)
         idle = cases.of_robot(k, present=np.zeros_like(cases.shared.present))
         plans: PyTree = drive(self.inner, idle)[0]
-        return plans.replace(recovery=PiecewisePolynomial(still, lasting))
+        recovery: PyTree = still, lasting
+        return plans.replace(recovery=PiecewisePolynomial(*recovery))
 
     def _plan_in_turn(self, drive: Drive, cases: TeamCase, plans: list[PyTree]) -> list[PyTree]:
         """Return the plans of N robots, leaves (B, ...), after new plans with more catches."""
