@@ -255,7 +255,9 @@ class RallyFly(BallFly):
     replan: float | None = option(None, "HZ", _REPLAN.format(25, "exact"))
     planner: str = option("exact", "NAME", "planner of plans from scratch")
     suite: str = option("juggle", "NAME", "suite of rallies")
-    hits: int = option(100, "N", "number of hits after which a trial ends")
+    hits: int | None = option(
+        None, "N", "number of hits after which a trial ends (default: the suite's own)"
+    )
     restitution_error: float = option(
         0.1, "F", "relative error of the initial estimate of the restitution, of random sign"
     )
@@ -271,7 +273,7 @@ class RallyFly(BallFly):
     def __post_init__(self) -> None:
         super().__post_init__()
         require_one_of(RALLY.suites, "suite", self.suite)
-        require_count("hits", self.hits, 1)
+        require_count("hits", self.hits, 1, none=True)
         error = self.restitution_error
         require(0.0 <= error < 1.0, "restitution_error", ">= 0 and < 1", error)
         require(self.rate > 0.0, "replan", "> 0, as rallies must be planned again", self.rate)

@@ -92,7 +92,12 @@ def referee_rallies(
     shapes = {
         **{"ball.pos": (3,), "ball.vel": (3,), "head_state": (4, 3), "drag": ()},
         **{"places": (hits, 3), "place_range": (hits, 3), "restitution": ()},
-        **{"racket_height": (), "racket_radius": (), "hit_limits.hitting_speed": (3,)},
+        **{
+            "ball_time": (),
+            "racket_height": (),
+            "racket_radius": (),
+            "hit_limits.hitting_speed": (3,),
+        },
         **{f"hit_limits.{name}": () for name in names},
     }
     leaves |= judging.read_leaves(cases, shapes, num)
@@ -160,7 +165,7 @@ def _judge_contact(case: dict, k: int, ball: np.ndarray, tolerances: dict) -> tu
     Returns the balls' states (6, B) just before and after the impact, measurements, and tests.
     """
     times, air = case["plan.strokes.time"], np.stack([case["drag"], case["gravity"]])
-    time, before = times[:, k], times[:, k - 1] if k else np.zeros(len(times))
+    time, before = times[:, k], times[:, k - 1] if k else case["ball_time"]
     for _ in range(_STEPS):
         ball = ball_step(ball, (time - before) / _STEPS, air)
     pos, vel, thrust = _motion_at(case, time)

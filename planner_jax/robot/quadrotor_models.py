@@ -1,6 +1,6 @@
 """Define the quadrotors that users select by name, such as the robots of [Yu2023catch].
 
-They are the robots of [Yu2023catch] and [Yu2023bat], a Crazyflie, a racer and an X500.
+They are the robots of [Yu2023catch] and [Yu2023bat], a Crazyflie, a racer, an X500 and an Iris.
 
 Numbers without a source are assumptions; the field `source` of a robot lists them. All tools are
 massless. All limits, and the tools of Crazyflie, racer and X500, are assumptions.
@@ -76,6 +76,28 @@ X500 = QuadrotorModel(
     "assumed",
 )
 
+# The Iris of the benchmark VolleyBots [Xu2025], from the file iris.yaml of OmniDrones: mass,
+# inertia, angles and lengths of arms, and rotors of 8.54858e-6 N s^2 x (838 rad/s)^2. The file's
+# moment 0.0977 about z exceeds the sum of the others, which no rigid body has; the sum is taken.
+# The racket of [Xu2025] has a radius of 0.2 m and a restitution of 0.8. The ball, with a radius of
+# 0.1 m, meets the racket when its centre is 0.15 m above the propellers, which is an assumption.
+IRIS = QuadrotorModel(
+    name="iris",
+    mass=1.52,
+    inertia=(0.0347563, 0.0458929, 0.0806),
+    rotors=Rotors(
+        ((0.22, 0.13), (-0.2, 0.13), (-0.2, -0.13), (0.22, -0.13)),
+        max_thrust=6.003,
+        torque_ratio=0.016,
+        lag=0.025,
+        radius=0.12,
+    ),
+    tool=Tool(RACKET, height=0.15, radius=0.2, restitution=0.8),
+    limits=FlightLimits(speed=5.0, body_rate=4.0),
+    source="OmniDrones iris.yaml (body, rotors), VolleyBots (racket, restitution); lag, height of "
+    "the racket and limits assumed",
+)
+
 
 def _with_net(model: QuadrotorModel, height: float, radius: float) -> QuadrotorModel:
     tool = Tool(NET, height=height, radius=radius)
@@ -91,6 +113,7 @@ MODELS = {
         RACER,
         _with_net(RACER, 0.2, 0.125),
         X500,
+        IRIS,
         _with_net(X500, 0.3, 0.2),
     )
 }
@@ -99,9 +122,9 @@ MODELS = {
 def robot_named(word: str) -> QuadrotorModel:
     """Return the quadrotor of a name, or read a quadrotor from a file.
 
-    The names are `paper-catcher`, `paper-hitter`, `crazyflie`, `racer`, `racer-net`, `x500` and
-    `x500-net`. The command `planner-jax robots` prints their main numbers. A `word` that ends in
-    .yaml, .yml or .xml is the path of a file; see `read_robot`.
+    The names are `paper-catcher`, `paper-hitter`, `crazyflie`, `racer`, `racer-net`, `x500`, `iris`
+    and `x500-net`. The command `planner-jax robots` prints their main numbers. A `word` that ends
+    in .yaml, .yml or .xml is the path of a file; see `read_robot`.
 
     Raises:
         UnknownName: no quadrotor and no file has this name. The message lists the names.

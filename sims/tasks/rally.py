@@ -15,8 +15,8 @@ import numpy as np
 from planner_jax.core.errors import ArgumentError
 from planner_jax.host.files import open_plain, replacing
 from planner_jax.planning.plan import plan as plan_all
-from planner_jax.robot.quadrotor_model import PAPER_HITTER
 from planner_jax.runs.columns import COUNT, NUMBER, Column, leaves_of
+from planner_jax.runs.summary import percent
 from planner_jax.sims.launch import flight_keys
 from planner_jax.sims.loop_state import Loop
 from planner_jax.sims.model import World
@@ -24,16 +24,18 @@ from planner_jax.sims.rally_loop import (
     RallyPilot,
     Trial,
     begin_trials,
-    believed_cases,
+    first_cases,
     fly_on,
+    partner_cases,
 )
 from planner_jax.sims.recording import Recording
 from planner_jax.sims.robots.quadrotor.robot import Quadrotor
 from planner_jax.sims.settings import RallyFly
 from planner_jax.sims.task import BallTask, FlightCases, Flights
 from planner_jax.task.rally.case import RallyCase
-from planner_jax.task.rally.suites import draw
+from planner_jax.task.rally.suites import COURSES, Course, draw
 
+_AHEAD = 2  # number of hits of one robot that are planned together, at most one for each box
 _SEEN = 0.25  # [s], time for which the first ball is observed before the first plan
 _CHUNK = 100  # number of planning periods that are simulated by one call of the program
 _SHOWN = 12.0  # [s], duration of the recording of a trial, for pictures and films
@@ -57,8 +59,8 @@ class FlownRally:
     trial: Trial  # leaves (B, ...)
     tracking: np.ndarray  # (B, 2) [m], rms and worst tracking error
     time: np.ndarray  # (K,) [s], times of the K recorded states
-    qpos: np.ndarray  # (B, K, R + 3), joint positions of robot and ball
-    wanted: np.ndarray  # (B, K, 3) [m], planned positions of the robot
+    qpos: np.ndarray  # (B, K, N, R + 3), joint positions of each of N robots and the ball
+    wanted: np.ndarray  # (B, K, N, 3) [m], planned positions of the robots
 
 
 @dataclasses.dataclass(frozen=True)
@@ -138,23 +140,28 @@ def fly_rallies(
     believed = jnp.asarray(rallies.believed_drag), jnp.asarray(rallies.believed_restitution)
     keys = flight_keys(seed, rallies.index)
     trials = begin_trials(loop, cases, *believed, keys, _SEEN)
-    known = believed_cases(loop, trials, cases)
+    known = first_cases(loop, trials, cases, min(_AHEAD, cases.places.shape[1]))
     clock = time.perf_counter()
     first = jax.device_get(plan_all(pilot.planner.planner, known))
+    plans = [first]
+    if cases.home is not None:
+        plans.append(jax.device_get(plan_all(pilot.planner.planner, partner_cases(known, first))))
     planning = time.perf_counter() - clock
-    trials = dataclasses.replace(trials, plan=jax.tree.map(jnp.asarray, first))
+    plan = jax.tree.map(lambda *leaves: jnp.stack(leaves, axis=1), *plans)
+    trials = dataclasses.replace(trials, plan=plan)
     steps = loop.observations_per_plan * _CHUNK
     size = steps * (int(np.ceil(_SHOWN / (_CHUNK * loop.period))) if record else 0)
     now = {
         "trials": dataclasses.replace(trials, key=jax.random.key_data(trials.key)),
         "calls": np.zeros((), int),  # number of calls of `fly_on` so far
-        "qpos": np.zeros((len(rallies), size, trials.physics.qpos.shape[-1]), np.float32),
-        "wanted": np.zeros((len(rallies), size, 3), np.float32),
+        "qpos": np.zeros((len(rallies), size, *trials.physics.qpos.shape[1:]), np.float32),
+        "wanted": np.zeros((len(rallies), size, len(plans), 3), np.float32),
     }
     now = now if state is None else state.load(now)
     trials = jax.tree.map(jnp.asarray, now["trials"])
     trials = dataclasses.replace(trials, key=jax.random.wrap_key_data(trials.key))
-    stored, limit = time.monotonic(), _LONGEST * (hits + 1) / (_CHUNK * loop.period)
+    longest = min(pilot.course.seconds, _LONGEST * (hits + 1))
+    stored, limit = time.monotonic(), longest / (_CHUNK * loop.period) - 1e-6
     while now["calls"] < limit:
         if np.all(np.asarray(trials.lost) | (np.asarray(trials.hits) >= hits)):
             break
@@ -184,9 +191,9 @@ def fly_rallies(
 
 
 def _by_trial(frames: Any) -> np.ndarray:
-    """Return states (B, P O, ...) of B trials from states (P, B, O, ...) of P periods."""
+    """Return states (B, P O, N, ...) of B trials from states (P, B, O, ...) of P periods."""
     states = np.moveaxis(np.asarray(frames), 0, 1)
-    return states.reshape(states.shape[0], -1, states.shape[-1])
+    return states.reshape(states.shape[0], -1, *states.shape[3:])
 
 
 _LAST = leaves_of(
@@ -221,6 +228,8 @@ class RallyFlight(BallTask):
             "verdict.flown.trial",
             ("hits", "", "in a row", COUNT),
             ("worst_offset", "m", "of a hit from the racket's centre", NUMBER),
+            ("aimed", "", "hits that send the ball to the circle of the suite", COUNT),
+            ("inside", "", "of these balls were met in the circle", COUNT),
         ),
         Column(
             "mean_offset",
@@ -235,17 +244,26 @@ class RallyFlight(BallTask):
     @property
     def SUCCESS(self) -> str:  # type: ignore[override]
         """The predicate of a successful trial in sentences."""
-        return f"had {self.settings.hits:,} hits without a loss of the ball"
+        return f"had {self.hits:,} hits without a loss of the ball"
+
+    @property
+    def course(self) -> Course:
+        """The rules of a trial of the suite."""
+        return COURSES.get(self.settings.suite, Course())
+
+    @property
+    def hits(self) -> int:
+        """The number of hits after which a trial ends."""
+        return self.settings.hits or self.course.hits
 
     def world(self) -> World:
         """Return the simulated world."""
-        robot = self.settings.robot or PAPER_HITTER
+        robot = self.settings.robot or self.course.robot
         gravity = float(np.asarray(self._draw(1).gravity)[0])
         return World(Quadrotor(robot, **self.settings.air()), gravity)
 
     def _draw(self, num: int) -> RallyCase:
-        known = self.settings.known_robot() or PAPER_HITTER
-        settings = self.settings
+        settings, known = self.settings, self.settings.known_robot()
         return draw(num, settings.suite, settings.seed, robot=known, wind=settings.wind)
 
     def cases(self) -> Rallies:
@@ -269,15 +287,22 @@ class RallyFlight(BallTask):
             others = {**dataclasses.asdict(settings), "state": None, "hits": None}
             identity = json.dumps([others, [int(cases.index[0]), len(cases)]], default=str)
             state = StateFile(Path(settings.state), identity)
-        given = {"record": record, "state": state}
-        return fly_rallies(self.loop(False), cases, settings.hits, settings.seed, **given)
+        return fly_rallies(
+            self.loop(False),
+            cases,
+            self.hits,
+            settings.seed,
+            pilot=RallyPilot(course=self.course),
+            record=record,
+            state=state,
+        )
 
     def recording(
         self, cases: Rallies, flights: RallyFlights, lanes: Sequence[int] | np.ndarray
     ) -> Recording:
         """Return a recording of the first seconds of the trials with the indices `lanes`."""
         flown, number = flights.flown, len(lanes)
-        qpos, size = flown.qpos[lanes].astype(float), flown.qpos.shape[2] - 3
+        qpos, size = flown.qpos[lanes, :, 0].astype(float), flown.qpos.shape[-1] - 3
         balls = qpos[:, :, None, size:]
         balls[balls[..., 2] < 0.0] = np.nan
         return Recording(
@@ -285,7 +310,7 @@ class RallyFlight(BallTask):
             success=flights.success[lanes],
             time=np.broadcast_to(flown.time, (number, flown.time.size)),
             robot=qpos[:, :, :size],
-            wanted=flown.wanted[lanes].astype(float),
+            wanted=flown.wanted[lanes, :, 0].astype(float),
             balls=balls,
             met=np.full((number, 1), np.nan),
             contact=np.full((number, 1, 3), np.nan),
@@ -311,11 +336,20 @@ class RallyFlight(BallTask):
             "hits": int(column("hits").sum()),
             "fewest_hits": int(column("hits").min()),
             "mean_offset": float(column("mean_offset").mean()),
+            "aimed": int(column("aimed").sum()),
+            "inside": int(column("inside").sum()),
         }
 
     def findings(self, summary: Mapping[str, Any]) -> list[str]:
         """Return a sentence about the numbers of hits and their distance from the centre."""
-        return [
+        lines = [
             f"{summary['hits']:,} hits in all, at least {summary['fewest_hits']:,} in a trial, "
             f"{100 * summary['mean_offset']:.1f} cm from the racket's centre on average."
         ]
+        if np.isfinite(self.course.circle):
+            inside, aimed = summary["inside"], summary["aimed"]
+            lines.append(
+                f"{percent(inside, aimed)} % of {aimed:,} hits to the circle of "
+                f"{self.course.circle:g} m sent the ball into it."
+            )
+        return lines

@@ -26,6 +26,8 @@ RULES: Table = (
     *(field for field in HIT_RULES if field.name != "target"),
     Field("places", ("K", 3)),
     Field("place_range", ("K", 3), rules.NOT_NEGATIVE),
+    Field("ball_time"),
+    Field("home", (3,)),
     Field("hit_limits.min_contact", (), rules.POSITIVE),
     Field("hit_limits.min_contact", (), rules.below("hit_limits.max_contact")),
     Field("hit_limits.max_contact", (), rules.below("hit_limits.max_apex")),
@@ -48,13 +50,18 @@ class RallyCase(RacketCase):
     """
 
     rules: ClassVar[Table] = RULES
-    positions: ClassVar[dict] = {**RacketCase.positions, "places": ()}
+    positions: ClassVar[dict] = {**RacketCase.positions, "places": (), "home": ()}
 
     hit_limits: RallyLimits  # pyright: ignore[reportIncompatibleVariableOverride]
     # (K, 3) [m], centre of the box in which the place after each hit is chosen
     places: Array = struct.field(kw_only=True)
     # (K, 3) [m], half the box's width; zeros for a fixed place
     place_range: Array = struct.field(kw_only=True)
+    # () [s], time at which the ball has the state `ball`, such as a partner's planned hit
+    ball_time: Array = struct.field(kw_only=True)
+    # (3,) [m], where the racket waits after the last hit until a partner has returned the ball;
+    # None: the robot itself hits the ball at the last place.
+    home: Array | None = struct.field(kw_only=True, default=None)
 
 
 def case(
@@ -65,6 +72,8 @@ def case(
     place_range=(0.5, 0.5, 0.2),
     min_contact=1.0,
     max_contact=2.0,
+    ball_time=0.0,
+    home=None,
     start=START,
     origin=None,
     dtype=jnp.float32,
@@ -73,14 +82,17 @@ def case(
     """Make one case of K hits in a row, or a batch.
 
     Args:
-        ball_pos: (..., 3) [m], position of the ball at time 0, above the ground at z = 0.
-        ball_vel: (..., 3) [m/s], velocity of the ball at time 0.
+        ball_pos: (..., 3) [m], position of the ball at `ball_time`, above the ground at z = 0.
+        ball_vel: (..., 3) [m/s], velocity of the ball at `ball_time`.
         places: (K, 3) or (..., K, 3) [m], centre of the box to which each hit sends the ball. The
             next hit happens at the place in the box that the planner chooses.
         place_range: (3,), (K, 3) or (..., K, 3) [m], half the width of the boxes; zeros fix the
             places.
         min_contact: [m], least height of the contacts.
         max_contact: [m], greatest height of the contacts.
+        ball_time: [s], time after the start of the plan, such as a partner's planned hit.
+        home: (3,) or (..., 3) [m], where the racket waits after the last hit while a partner
+            returns the ball. By default the quadrotor itself hits the ball at the last place.
         start: (3,) or (..., 3) [m], position of the quadrotor at time 0.
         origin: (2,) x, y [m], world position that is subtracted from all positions, as in hits.
         dtype: type of every floating leaf.
@@ -101,7 +113,8 @@ def case(
         raise ArgumentError("places", "the shape (K, 3) with K >= 1", shape, verb="have")
     shift = find_origin(start, origin, batch, dtype)
     leaf = functools.partial(array_of, batch=batch, dtype=dtype)
-    near = move("places", places, None if shift is None else -shift, dtype)
+    back = None if shift is None else -shift
+    near = move("places", places, back, dtype)
     if shape_of("place_range", place_range) == (3,):
         place_range = np.broadcast_to(np.asarray(place_range), shape[-2:])
     base = hit_case(
@@ -127,6 +140,8 @@ def case(
         **values,
         places=leaf("places", near, *shape[-2:]),
         place_range=leaf("place_range", place_range, *shape[-2:]),
+        ball_time=leaf("ball_time", ball_time),
+        home=None if home is None else leaf("home", move("home", home, back, dtype), 3),
     )
     names = {f"hit_limits.{field.name}": field.name for field in dataclasses.fields(RallyLimits)}
     require_sound(cases, names)

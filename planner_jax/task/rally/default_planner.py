@@ -103,8 +103,8 @@ class ExactRally(ChainPlanner[RallyCase, RallyPlan]):
     Three further terms keep the rally going: place_weight * squares of the place variables and of
     the first contact's height off the middle; apex_weight * squares of the apexes off the middle;
     and next_weight * energy_weight * the least energy of a next segment, which ends at standstill,
-    level, below the last place. Without the last term, the last hit may end in a state from which
-    no further hit keeps the limits.
+    level, below the last place, or below `home` after twice the flight time. Without the last term,
+    the last hit may end in a state from which no further hit keeps the limits.
     """
 
     case_type = RallyCase
@@ -149,7 +149,7 @@ class ExactRally(ChainPlanner[RallyCase, RallyPlan]):
         case, limits = context.case, context.case.hit_limits
         height = limits.min_contact + contact * (limits.max_contact - limits.min_contact)
         fall, falls = drag_free_fall_time(case.ball, height, case.gravity)
-        first = jnp.where(falls, fall, 0.5 * context.landing_time)
+        first = case.ball_time + jnp.where(falls, fall, 0.5 * context.landing_time)
         flights = self.guess_flights(case, height, apex)
         durations = jnp.concatenate([first[None], flights[:-1]])
         thrusts = jnp.broadcast_to(thrust * case.gravity, flights.shape)
@@ -178,7 +178,7 @@ class ExactRally(ChainPlanner[RallyCase, RallyPlan]):
         limits = case.hit_limits
         durations, thrusts = jnp.exp(natural[:, 0]), jnp.exp(natural[:, 2])
         flights = jnp.concatenate([durations[1:], jnp.exp(natural[-1:, 1])])
-        first = target_at(context.path, durations[0])
+        first = target_at(context.path, durations[0] - case.ball_time)
         share = natural[:, 8:]
         places = case.places + case.place_range * share * jax.lax.rsqrt(1.0 + share * share)
         pos = jnp.concatenate([first.pos[None], places[:-1]])
@@ -221,6 +221,8 @@ class ExactRally(ChainPlanner[RallyCase, RallyPlan]):
 
     def _cost_to_go(self, state: Array, place: Array, time: Array, case: RallyCase) -> Array:
         """Return the least snap energy with which a robot can wait for the next ball, level."""
+        if case.home is not None:  # a partner's hit and a second flight come before the next hit
+            place, time = case.home, 2.0 * time
         below = place - case.racket_height * jnp.array([0.0, 0.0, 1.0], place.dtype)
         onward = jnp.zeros_like(state).at[0].set(below)
         piece = time / self.num_pieces
@@ -233,7 +235,7 @@ class ExactRally(ChainPlanner[RallyCase, RallyPlan]):
 
     def rules_out(self, context: RallyContext) -> Array:
         """Return whether the ball is provably never within the quadrotor's reach, () bool."""
-        return is_too_far(context)
+        return is_too_far(context) & (context.case.ball_time <= 0.0)
 
     def make_plan(
         self,

@@ -95,7 +95,8 @@ class ReplanRally(OptimisedPlanner):
             name: resolve_argument(name, given, usual, elapsed)
             for name, (given, usual) in own.items()
         }
-        now = dataclasses.replace(cases, ball=ball, **news)
+        start = 0.0 * cases.ball_time
+        now = dataclasses.replace(cases, ball=ball, ball_time=start, **news)
         return Replanning(case=now, previous=previous, elapsed=elapsed)
 
     def with_settings(self, settings: Settings) -> "ReplanRally":
@@ -117,7 +118,8 @@ class ReplanRally(OptimisedPlanner):
         guessed = planner.guess_flights(case, case.places[0, 2], jnp.asarray(_NEW_APEX))
         guessed = guessed.astype(strokes.time.dtype)
         flights = jnp.concatenate([strokes.flight_time, guessed])
-        next_time = strokes.time[-1] + strokes.flight_time[-1]
+        flights_between = 1.0 if case.home is None else 2.0
+        next_time = strokes.time[-1] + flights_between * strokes.flight_time[-1]
         times = jnp.append(strokes.time, next_time + jnp.cumsum(guessed) - guessed)
         flights, times = flights[index], times[index] - task.elapsed
         begins = jnp.concatenate([jnp.zeros_like(times[:1]), times[:-1]])
