@@ -8,9 +8,11 @@ from rallies import bounces, fly_on
 
 import planner_jax as pj
 from planner_jax.ball.flight import BallState
+from planner_jax.core import GRAVITY
 from planner_jax.planning.replan import Replanning
 from planner_jax.task.hit.court import fly
 from planner_jax.task.rally.replan import count_done
+from planner_jax.task.rally.suites import COURSES
 from tests.trees import assert_same
 
 PLACES = np.tile([0.0, 0.0, 1.5], (2, 1))
@@ -45,6 +47,65 @@ def test_drawn_balls_fall_into_the_volume():
     assert aside.max() <= 0.55 and pos[..., 2].max() <= apex.max() + 0.01
 
 
+def test_the_first_ball_of_a_volley_comes_over_the_net_to_the_first_robot():
+    cases = pj.rally.draw(50, "volley")
+    course = COURSES["volley"]
+    time = np.linspace(0.0, 1.9, 400)[:, None]
+    pos, vel = fly(cases.ball.pos, cases.ball.vel, time, cases.drag, cases.gravity)
+    over = np.abs(pos[..., 0]).argmin(axis=0)
+    assert (pos[over, np.arange(50), 2] > course.net + 0.5).all()
+    falls = (np.abs(pos[..., 2] - 1.5) < 0.05) & (vel[..., 2] < 0.0)
+    aside = np.abs(pos - np.array(course.home))[..., :2].max(axis=-1)
+    assert falls.any(axis=0).all() and np.where(falls, aside, 0.0).max() < 1.2
+
+
+def test_robots_of_volleybots_start_tilted_below_a_ball_at_rest():
+    cases = pj.rally.draw(200, "volleybots-juggle")
+    start = np.asarray(cases.head_state)[:, 0]
+    np.testing.assert_allclose(cases.ball.pos, start + np.array([0.0, 0.0, 2.0]), atol=1e-6)
+    assert not np.any(cases.ball.vel) and not np.any(cases.drag)
+    assert (np.abs(start - np.array([4.5, 0.0, 2.0])) <= np.array([0.5, 0.5, 0.2]) + 1e-6).all()
+    thrust = np.asarray(cases.head_state)[:, 2] + np.array([0.0, 0.0, GRAVITY])
+    tilt = np.arccos(thrust[:, 2] / np.linalg.norm(thrust, axis=1))
+    assert 0.3 < tilt.max() <= np.arccos(np.cos(0.1 * np.pi) ** 2) + 1e-3
+    np.testing.assert_allclose(np.linalg.norm(thrust, axis=1), GRAVITY, rtol=1e-4)
+
+
+def test_boxes_of_a_suite_repeat():
+    places = np.asarray(pj.rally.draw(1, "target", hits=7).places)[0]
+    np.testing.assert_array_equal(places[:3], places[3:6])
+    np.testing.assert_allclose(places[2], COURSES["target"].places[2])
+    assert (places[6] == places[0]).all() and (places[2] != places[0]).any()
+
+
+def test_a_ball_that_is_struck_later_is_met_later():
+    case, _ = bounces(hits=1)
+    later = case.replace(ball_time=np.full(1, 0.7))
+    natural = np.zeros((1, 11))
+    natural[0, :3] = np.log([0.6, 1.0, 9.8])
+    planner = pj.rally.planner()
+    meet = jax.jit(lambda case, natural: planner.meet(natural, planner.prepare(case)))
+    first = meet(pj.take(case, 0), natural)
+    natural[0, 0] = np.log(1.3)
+    second = meet(pj.take(later, 0), natural)
+    np.testing.assert_allclose(first.tail_states, second.tail_states, atol=2e-3)
+    assert float(second.contact[0].time[0]) == pytest.approx(1.3)
+
+
+def test_a_plan_with_a_home_ends_where_the_way_home_is_short():
+    case, plan = pj.take(bounces(hits=1), 0), pj.rally.planner()
+    tail = np.zeros((4, 3))
+    tail[0] = case[0].head_state[0]
+    costs = []
+    for away in (0.0, 1.0, 2.0):
+        home = np.array([away, 0.0, 1.5], np.float32)
+        at_home = case[0].replace(home=home)
+        place, time = at_home.places[0], jnp.asarray(1.0)
+        costs.append(float(plan._cost_to_go(jnp.asarray(tail), place, time, at_home)))
+    assert costs[0] < 1e-6 * costs[2]
+    np.testing.assert_allclose(costs[2], 4.0 * costs[1], rtol=1e-3)  # energy is quadratic
+
+
 def test_draws_continue_and_depend_on_the_seed():
     whole = pj.rally.draw(8, "juggle", 3)
     assert_same(pj.rally.draw(3, seed=3, first=5), pj.take(whole, slice(5, 8)))
@@ -60,6 +121,8 @@ def test_draws_continue_and_depend_on_the_seed():
         ({"max_contact": 0.9}, "min_contact must be .* got 1"),
         ({"max_apex": 1.8, "min_apex": 1.0}, "max_contact must be .* got 2"),
         ({"place_range": (-0.1, 0.0, 0.0)}, "place_range must be >= 0"),
+        ({"ball_time": np.nan}, "ball_time must be finite"),
+        ({"home": (0.0, 1.0)}, "home must have the shape"),
         ({"restitution": 1.5}, r"restitution must be in \[0, 1\]"),
     ],
 )
@@ -77,6 +140,14 @@ def test_a_hit_is_done_from_its_planned_time_on():
     for elapsed, done in ((0.0, 0), (time - 1e-3, 1), (time, 2), (99.0, 3)):
         assert int(count_done(plan, np.asarray(elapsed))) == done
         assert int(count_done(plan, jnp.asarray(elapsed))) == done
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("suite", ["target", "volley", "volleybots-juggle", "volleybots-hit"])
+def test_plans_of_all_suites_are_accepted(suite):
+    cases = pj.rally.draw(32, suite, seed=6)
+    verdict = pj.rally.judge(cases, pj.plan(pj.rally.planner(), cases))
+    assert verdict.success.all(), [verdict.sentence(k) for k in np.flatnonzero(~verdict.success)]
 
 
 @pytest.mark.slow

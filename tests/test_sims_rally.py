@@ -16,6 +16,7 @@ from planner_jax.sims.scoring import racket_impact
 from planner_jax.sims.sensing import RlsState
 from planner_jax.sims.settings import RallyFly
 from planner_jax.sims.tasks.rally import StateFile
+from planner_jax.task.rally.suites import COURSES
 from tests.trees import assert_same
 
 DRAG, GRAVITY = jnp.asarray(0.06), jnp.asarray(9.8)
@@ -38,6 +39,7 @@ def trial(time, bounce_time, is_due):
     )
 
 
+FIELDS = [field.name for field in dataclasses.fields(rally_loop.Trial)]
 LOOP = types.SimpleNamespace(
     world=types.SimpleNamespace(gravity=9.8), sensing=types.SimpleNamespace(latency=0.02)
 )
@@ -71,6 +73,62 @@ def test_the_covariance_across_an_impact_has_the_jacobian_of_the_impact_map():
     expected[3:, 3:] += 0.01 * approach**2 * np.outer(NORMAL, NORMAL)
     np.testing.assert_allclose(after.covariance, expected, rtol=1e-4, atol=1e-7)
     np.testing.assert_allclose(after.mean[3:], of(BALL.vel), atol=1e-5)
+
+
+def test_two_robots_hit_in_turn():
+    own = [
+        rally_loop._own_hits(types.SimpleNamespace(hits=jnp.asarray(hits)), jnp.arange(2)).tolist()
+        for hits in range(5)
+    ]
+    assert own == [[0, 0], [1, 0], [1, 1], [2, 1], [2, 2]]
+
+
+@pytest.mark.parametrize(
+    ("course", "height", "before", "after", "breaks"),
+    [
+        ("volley", 1.0, (-0.01, 0.0, 1.5), (0.01, 0.0, 1.5), True),
+        ("volley", 1.0, (-0.01, 0.0, 1.6), (0.01, 0.0, 1.6), False),
+        ("volley", 1.0, (0.2, 0.0, 1.0), (0.1, 0.0, 1.0), False),
+        ("juggle", 9.0, (-0.01, 0.0, 1.0), (0.01, 0.0, 1.0), False),
+        ("volleybots-juggle", 2.4, (0.2, 0.0, 3.0), (0.1, 0.0, 3.0), False),
+        ("volleybots-juggle", 2.6, (0.2, 0.0, 3.0), (0.1, 0.0, 3.0), True),
+        ("volleybots-juggle", 0.3, (0.2, 0.0, 3.0), (0.1, 0.0, 3.0), True),
+    ],
+)
+def test_a_trial_ends_at_the_net_and_outside_the_robots_heights(
+    course, height, before, after, breaks
+):
+    at = lambda ball: types.SimpleNamespace(  # noqa: E731
+        robot_pos=jnp.array([[0.0, 0.0, 1.0], [0.0, 0.0, height]]),
+        ball_pos=jnp.tile(jnp.asarray(ball), (2, 1, 1)),
+    )
+    assert bool(rally_loop._breaks_rule(COURSES[course], at(before), at(after))) == breaks
+
+
+@pytest.mark.parametrize(("aside", "inside"), [(0.2, 1), (0.3, 0)])
+def test_balls_of_every_third_hit_count_in_the_circle(aside, inside):
+    zero = jnp.zeros(())
+    where = jnp.asarray(COURSES["target"].places[2]) + jnp.array([0.0, aside, 0.1])
+    contact = types.SimpleNamespace(
+        met=jnp.ones((), bool), ball_pos=where, **dict.fromkeys(("offset", "tracking"), zero)
+    )
+    contact.time = contact.planned_time = zero
+    case = types.SimpleNamespace(
+        restitution=zero, drag=zero, places=jnp.asarray(COURSES["target"].places)
+    )
+    counts = []
+    for hits in range(7):
+        state = rally_loop.Trial(**dict.fromkeys(FIELDS, zero)).replace(
+            restitution=RlsState(zero, zero),
+            estimate=types.SimpleNamespace(drag=zero),
+            hits=jnp.asarray(hits),
+            lost=jnp.zeros((), bool),
+            last=rally_loop.Passage(*[zero] * 6),
+        )
+        after = rally_loop._score(state, case, COURSES["target"], jnp.ones((), bool), contact)
+        assert int(after.hits) == hits + 1
+        counts.append((int(after.aimed), int(after.inside)))
+    assert counts == [(0, 0)] * 3 + [(1, inside)] + [(0, 0)] * 2 + [(1, inside)]
 
 
 @pytest.mark.parametrize(
@@ -111,6 +169,19 @@ def test_a_run_that_continues_from_its_state_equals_a_run_in_one_piece(tmp_path)
     state = {"state": str(tmp_path / "trials.npz")}
     trials(2, **state)
     assert_same(vars(trials(8, **state)), vars(trials(8)))
+
+
+@pytest.mark.slow
+def test_two_robots_keep_a_ball_over_the_net():
+    task = RallyFly(num=3, seed=7, suite="volley", hits=8).flight()
+    cases = task.cases()
+    flights = task.fly(cases, record=True)
+    end = flights.flown.trial
+    assert flights.success.all() and (end.worst_offset < 0.08).all()
+    balls = flights.flown.qpos[..., -3:]
+    np.testing.assert_allclose(balls[:, :, 0], balls[:, :, 1], atol=1e-4)
+    turns = (np.diff(np.sign(balls[0, :, 0, 0])) != 0).sum()
+    assert turns >= end.hits[0]  # the first ball comes over the net, too
 
 
 @pytest.mark.slow
