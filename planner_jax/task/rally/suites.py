@@ -64,15 +64,16 @@ _TARGET, _HALF = (0.8, 0.0, 1.5), 2.5  # [m], the circle of `target`; distance o
 # state the ball without drag, the starts, 16 s an episode, the least mean apex of 3.5 m and the
 # heights of the robot. The heights of contacts and the greatest apexes are choices of this project.
 _VOLLEYBOTS = Course(
-    places=((4.5, 0.0, 2.2),) * 2,
+    places=((4.5, 0.0, 2.45),) * 2,
     ranges=((0.5, 0.5, 0.0),) * 2,
-    contact=(1.7, 2.5),
-    apex=(3.5, 4.1),
+    contact=(2.0, 2.5),
+    apex=(3.5, 3.6),
     start=(4.5, 0.0, 2.0),
     robot=IRIS,
     drag=0.0,
     gravity=STANDARD_GRAVITY,
     drop=2.0,
+    hits=17,
     seconds=16.0,
     heights=(0.4, 2.5),
 )
@@ -98,6 +99,7 @@ COURSES = {
         _VOLLEYBOTS,
         places=((-1.0, 0.0, 2.0),),
         ranges=((0.0, 0.0, 0.0),),
+        contact=(1.7, 2.5),
         apex=(3.5, 12.0),
         drop=3.0,
         hits=1,
