@@ -12,6 +12,9 @@ referee, an independent check in float64, judges every plan. The decisions are:
 * `policy`: plan the mean action of a neural network, the shipped policy or the one in --policy;
 * `policy, 6`: plan six proposals of this network, and use the plan with the earliest last catch.
 
+If targets may be left out, `best` and `policy` search for orders, and continue 64 and 8 partial
+orders. Four further rows have other numbers: 1 and 4 for `policy`, 4 and 8 for `best`.
+
 "Caught" is the mean number of targets that successful plans catch; in some suites targets may be
 left out. "Last catch" is the mean time of the last catch over accepted plans. The optimal time
 ratio (OTR) is the mean relative difference between the proposed and the optimised times. "At 25" is
@@ -107,9 +110,14 @@ def measure(bench: Bench, suites: list[str], options: argparse.Namespace) -> Non
         "| decision |",
         "|---|---|---|---|---|---|---|---|---|",
     )
+    widths: dict[str, Any] = {
+        **{f"policy, width {k}": policy(options.policy, width=k) for k in (1, 4)},
+        **{f"best, width {k}": pj.catch.Best(finalists=1, width=k) for k in (4, 8)},
+    }
     for suite in suites:
         best = None
-        for name, decision in decisions.items():
+        rows = {**decisions, **widths} if SUITES[suite].optional else decisions
+        for name, decision in rows.items():
             row = run_row(bench, suite, name, decision, options)
             best = best or row["last"]
             bench.row(**row)

@@ -14,12 +14,14 @@ can be caught earliest. Every action gives a valid decision: an order and increa
 
 import dataclasses
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
 from planner_jax.task.catch.case import CatchCase, CatchChoice
 from planner_jax.task.catch.context import targets_at
+from planner_jax.task.catch.decide import beam
 from planner_jax.task.catch.estimate import INSTANT, Timetable, arrivals, earliest_next, top_speed
 
 HANDICAP = 4.0  # [s] added to a target's earliest catch time if its first action component is 1
@@ -57,7 +59,7 @@ def observe(case: CatchCase, table: Timetable) -> Array:
     return jnp.where(case.present[:, None], seen, 0.0).astype(case.gravity.dtype)
 
 
-def choice_of(case: CatchCase, table: Timetable, action: Array) -> CatchChoice:
+def choice_of(case: CatchCase, table: Timetable, action: Array, width: int = 1) -> CatchChoice:
     """Return the order and times of catches for one case, from an action of a policy.
 
     Args:
@@ -66,9 +68,15 @@ def choice_of(case: CatchCase, table: Timetable, action: Array) -> CatchChoice:
         action: (N, 2), from -1 to 1 for each target: a handicap, in units of 4 s, which is added to
             its earliest catch time to order the targets; and a stretch, twice the logarithm of a
             factor on its estimated catch time.
+        width: number of partial orders that a beam search with these handicaps continues, if
+            targets are optional; for 1, and if no target is optional, there is no search.
     """
     action = jnp.where(case.present[:, None], action, 0.0)
-    choice = earliest_next(case, table, HANDICAP * action[:, 0])
+    handicap = HANDICAP * action[:, 0]
+    if case.optional and width > 1:
+        choice = jax.tree.map(lambda leaf: leaf[0], beam(case, table, width, handicap=handicap))
+    else:
+        choice = earliest_next(case, table, handicap)
     times = choice.times * jnp.exp(STRETCH * action[choice.order, 1])
     taken = choice.taken[choice.order]
     times = jnp.where(taken, jnp.minimum(times, case.horizon[choice.order]), times)

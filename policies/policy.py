@@ -33,6 +33,7 @@ class Policy(CatchDecision):
     A proposal is an order and times of catches. The first proposal for a case is the mean of the
     network's distribution of actions. Further proposals are drawn from it, with equal random
     numbers for every case. The planner plans all and selects the plan with the earliest last catch.
+    If targets are optional, a beam search for orders adds the network's handicaps to the ranks.
     """
 
     params: Any  # weights of the network, the leaves of this pytree
@@ -42,9 +43,13 @@ class Policy(CatchDecision):
     # Factor on the times of the catches. With a factor above 1 the planner needs fewer iterations,
     # and the last catch is later.
     stretch: float = struct.field(pytree_node=False, default=1.0)
+    # Number of partial orders that continue in the search with the network's handicaps, if targets
+    # are optional; 1: no search.
+    width: int = struct.field(pytree_node=False, default=8)
 
     def __post_init__(self) -> None:
         require_size("proposals", self.proposals)
+        require_size("width", self.width)
         require_number("spread", self.spread, NOT_NEGATIVE)
         require_number("stretch", self.stretch, POSITIVE)
         if not callable(getattr(self.network, "apply", None)):
@@ -75,7 +80,8 @@ class Policy(CatchDecision):
         actions = jnp.tanh(mean + self.spread * deviation * jnp.asarray(noise, mean.dtype))
         later = np.array([0.0, np.log(self.stretch) / STRETCH], mean.dtype)
         actions = jnp.clip(actions + later, -1.0, 1.0)
-        choices = jax.vmap(functools.partial(choice_of, case, table))(actions)
+        decide = functools.partial(choice_of, case, table, width=self.width)
+        choices = jax.vmap(decide)(actions)
         return in_several_lengths(case, choices)
 
 
@@ -87,11 +93,13 @@ def policy(file: str | os.PathLike = "catch", **options: Any) -> Policy:
             the package: "catch", trained on cases of one to twelve targets, or "rush6", trained on
             cases of six targets with deadlines.
         **options: `proposals`, number of proposals for a case (default 1); `spread`, factor on the
-            standard deviations of drawn proposals (1); `stretch`, factor on catch times (0.95).
+            standard deviations of drawn proposals (1); `stretch`, factor on catch times (0.95);
+            `width`, number of partial orders in the search if targets are optional (8).
 
     Raises:
         TypeError: an option has the wrong type.
-        ValueError: `proposals` is below 1, or another option is negative, zero or not finite.
+        ValueError: `proposals` or `width` is below 1, or another option is negative, zero or not
+            finite.
         ArgumentError: the file is not a checkpoint of a policy, or has another format.
     """
     found = checkpoint_of(file)

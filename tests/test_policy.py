@@ -15,9 +15,10 @@ from planner_jax.cli.main import main
 from planner_jax.planning.decided import first_choice
 from planner_jax.policies.checkpoint import load_checkpoint, save_checkpoint
 from planner_jax.policies.networks import NETWORKS
-from planner_jax.policies.observation import FEATURES, PER_TARGET, choice_of, observe
+from planner_jax.policies.observation import FEATURES, HANDICAP, PER_TARGET, choice_of, observe
 from planner_jax.policies.policy import Policy, policy
 from planner_jax.policies.settings import WEIGHTS
+from planner_jax.task.catch.decide import beam
 from planner_jax.task.catch.estimate import INSTANT, timetable
 from planner_jax.task.catch.suites import draw_by_key
 
@@ -106,6 +107,34 @@ def test_of_several_proposals_the_earliest_stays():
     some = pj.plan(pj.catch.planner(decide=policy(proposals=3)), cases)
     assert pj.are_solved(some).all()
     assert (some.times[:, -1] <= 1.001 * one.times[:, -1]).all()
+
+
+def test_a_search_of_width_one_is_greedy_with_the_same_handicaps():
+    cases = cases_of("swarm12")
+    actions = np.random.default_rng(0).uniform(-1.0, 1.0, (NUM, 12, PER_TARGET))
+    actions = jnp.asarray(actions * [1.0, 0.0], jnp.float32)
+
+    @jax.jit
+    @jax.vmap
+    def by_both(case, action):
+        table = timetable(case)
+        searched = beam(case, table, 1, handicap=HANDICAP * action[:, 0])
+        return choice_of(case, table, action), pj.take(searched, 0)
+
+    greedy, searched = by_both(cases, actions)
+    np.testing.assert_array_equal(greedy.taken, searched.taken)
+    where = np.take_along_axis(np.asarray(greedy.taken), np.asarray(greedy.order), axis=1)
+    np.testing.assert_array_equal(greedy.order[where], searched.order[where])
+    np.testing.assert_allclose(greedy.times[where], searched.times[where], rtol=1e-5)
+
+
+def test_of_optional_targets_a_wider_search_finds_more():
+    cases = jax.tree.map(np.asarray, pj.catch.draw(64, "swarm12", 5))
+    one, usual = (
+        np.asarray(first_choice(decision, cases).present).sum(axis=1).mean()
+        for decision in (policy(width=1), policy())
+    )
+    assert usual >= 1.04 * one
 
 
 def test_a_checkpoint_gives_back_what_was_saved(tmp_path, fresh):

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jax import Array, lax
+from jax.typing import ArrayLike
 
 from planner_jax.core.choices import require
 from planner_jax.core.protocol import Status, is_unsolved, require_settings
@@ -87,13 +88,13 @@ class Sequences:
     times: Array  # (W, N) [s], of the catch of each target in the sequence
 
 
-def beam(case: CatchCase, table: Timetable, width: int) -> CatchChoice:
+def beam(case: CatchCase, table: Timetable, width: int, handicap: ArrayLike = 0.0) -> CatchChoice:
     """Search for W orders of one case that catch most targets, and catch them early.
 
     These are the longest sequences that `sequences` finds. If fewer than W orders are found, the
     first one is repeated. For N targets the leaves of the result have the shape (W, N).
     """
-    depths = sequences(case, table, width, estimate.MARGIN)
+    depths = sequences(case, table, width, estimate.MARGIN, handicap=handicap)
     most = jnp.sum(jnp.any(jnp.isfinite(depths.rank[1:]), axis=1))
     found = jax.tree.map(lambda leaf: leaf[most], depths)
     chosen = jnp.where(jnp.isfinite(found.rank), np.arange(width), 0)
@@ -101,21 +102,28 @@ def beam(case: CatchCase, table: Timetable, width: int) -> CatchChoice:
 
 
 def sequences(
-    case: CatchCase, table: Timetable, width: int, margin: float, haste: float = 1.0
+    case: CatchCase,
+    table: Timetable,
+    width: int,
+    margin: float,
+    haste: float = 1.0,
+    handicap: ArrayLike = 0.0,
 ) -> Sequences:
     """Search for sequences of 0, 1, ..., N catches of one case, W of each length.
 
     It is a beam search of width W = `width` among the possible catches in `table`. After each catch
     the W sequences with the least ranks continue. The rank is the estimated time plus 10 s for each
     metre that the quadrotor would lack to reach its targets in time, at most `margin` [m] for an
-    optional target. Among sequences with the same targets and the same last target only the best
-    continues. `haste` is the factor on the agility in `estimate.arrival`. The leaves of the result
-    have the shape (N + 1, W, ...).
+    optional target. `handicap` (N,) [s] of every caught target is added to the rank. Among
+    sequences with the same targets and the same last target only the best continues. `haste` is the
+    factor on the agility in `estimate.arrival`. The leaves of the result have the shape
+    (N + 1, W, ...).
 
     Raises:
         ValueError: there are more than `MOST_SEARCHED` targets.
     """
     num, speed = case.num_targets, estimate.top_speed(case, haste)
+    handicap = jnp.broadcast_to(jnp.asarray(handicap, case.gravity.dtype), (1, num))
     require(num <= MOST_SEARCHED, "targets", f"at most {MOST_SEARCHED} of a case", num)
     arrival = functools.partial(estimate.arrival, speed=speed, haste=haste)
     from_all = jax.vmap(jax.vmap(arrival, (0, None, None)), (None, 0, 0))
@@ -132,7 +140,8 @@ def sequences(
         left = now.position == num
         possible = left & jax.vmap(estimate.can_be_next, (None, 0, None))(case, shortfalls, margin)
         short = now.short[:, None] + shortfalls
-        rank = estimate.later_by_shortfall(times, short)
+        later = jnp.sum(jnp.where(left, 0.0, handicap), axis=1, keepdims=True) + handicap
+        rank = estimate.later_by_shortfall(times, short) + later
         rank = jnp.where(possible & jnp.isfinite(now.rank)[:, None], rank, jnp.inf).ravel()
         taken = jnp.sum(jnp.where(left, 0, bits[:, None]), axis=2, keepdims=True)
         *others, last = (taken | bits[:, None]).reshape(len(words), -1)
