@@ -13,6 +13,7 @@ from planner_jax.core.protocol import is_solved
 from planner_jax.referee import hit as referee
 from planner_jax.referee.spin import rub_ball
 from planner_jax.task.hit.spin import meet_spin, predict_spin
+from tests.trees import as_numpy
 
 float64 = pytest.mark.usefixtures("float64")
 SERVE = (4.0, 0.3, 2.0), (-7.0, 0.0, 5.0), (3.0, 0.5, 0.0)
@@ -36,12 +37,17 @@ def air_of(of):
 def test_without_spin_and_friction_the_impact_is_that_of_a_ball_with_drag():
     plain = case(np.zeros(3), ball=SMOOTH, wind=np.zeros(3))
     normal, racket, after, apex = meet(plain, BALL, TIME, SPEEDS)
-    expected = aim_with_drag(BALL.pos, plain.target, TIME, plain.drag, plain.gravity)
+
+    @jax.jit
+    def without_spin(after):
+        aimed = aim_with_drag(BALL.pos, plain.target, TIME, plain.drag, plain.gravity)
+        highest = apex_with_drag(BallState(BALL.pos, after), TIME, plain.drag, plain.gravity)
+        return aimed, highest, *solve_impact(BALL.vel, after, plain.restitution)
+
+    expected, highest, along, speed = without_spin(after)
     np.testing.assert_allclose(after, expected, atol=2e-4)
-    along, speed = solve_impact(BALL.vel, after, plain.restitution)
     np.testing.assert_allclose(normal, along, atol=1e-9)
-    assert racket @ normal == pytest.approx(float(speed), abs=1e-9)
-    highest = apex_with_drag(BallState(BALL.pos, after), TIME, plain.drag, plain.gravity)
+    assert np.dot(racket, normal) == pytest.approx(float(speed), abs=1e-9)
     assert apex == pytest.approx(float(highest), abs=2e-3)
 
 
@@ -77,13 +83,13 @@ def test_a_spin_about_the_normal_leaves_a_ball_that_comes_along_the_normal():
 @float64
 def test_the_path_of_a_spinning_ball_is_that_of_the_referee():
     of = case()
-    table = jax.jit(predict_spin, static_argnums=1)(of, 36)
+    table = as_numpy(jax.jit(predict_spin, static_argnums=1)(of, 36))
     state, step = np.concatenate([of.ball.pos, of.ball.vel])[:, None], float(table.resolution)
     for k in range(1, 36):
         np.testing.assert_allclose(table.pos[k], state[:3, 0], atol=1e-5)
         state = referee.ball_step(state, np.array([step]), air_of(of))
     assert table.pos[-1, 2] < 0.0 < table.pos[-8, 2]
-    straight = pj.predict_path(of.ball, 33 * step, of.drag, of.gravity, num_nodes=36)
+    straight = as_numpy(pj.predict_path(of.ball, 33 * step, of.drag, of.gravity, num_nodes=36))
     assert np.linalg.norm(straight.pos[-1] - table.pos[-1]) > 0.5
 
 
@@ -91,9 +97,10 @@ def test_the_path_of_a_spinning_ball_is_that_of_the_referee():
 def test_a_batch_of_impacts_equals_a_loop():
     spins = np.random.default_rng(0).normal(size=(3, 3)) * 100.0
     cases = [case(spin) for spin in spins]
-    balls = jax.tree.map(lambda x: jnp.tile(x, (3, 1)), BALL)
-    many = jax.tree.map(lambda *leaves: jnp.stack(leaves), *cases)
-    whole = jax.jit(jax.vmap(meet_spin, (0, 0, None, None)))(many, balls, TIME, SPEEDS)
+    balls = jax.tree.map(lambda x: np.tile(x, (3, 1)), BALL)
+    many = jax.tree.map(lambda *leaves: np.stack(leaves), *cases)
+    meet_all = jax.jit(jax.vmap(meet_spin, (0, 0, None, None)))
+    whole = as_numpy(meet_all(many, balls, TIME, SPEEDS))
     for k, one in enumerate(cases):
         for own, alone in zip(whole, meet(one, BALL, TIME, SPEEDS), strict=True):
             np.testing.assert_allclose(own[k], alone, rtol=1e-9, atol=1e-9)
