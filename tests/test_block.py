@@ -29,6 +29,7 @@ from planner_jax.task.block.motion import angles_at, polynomial, profiles, step_
 from planner_jax.task.block.scene import entry_time, make_scene, paper_scene
 from planner_jax.trajectory.polynomial import evaluate
 from tests.derivatives import double
+from tests.trees import as_numpy
 
 SMALL = OnlineBlock(
     pieces=6, points=10, searches=(Search(straight=12, tries=3, solver=LevenbergConfig(8)),)
@@ -113,13 +114,14 @@ def test_profiles_turn_by_one(ends_at_rest):
 
 
 def test_the_arm_is_clear_at_home_and_not_when_it_reaches_into_the_pole():
-    arm, scene = jax.tree.map(jnp.asarray, (irb1600(), paper_scene()))
-    at = jax.jit(lambda angles, scene: clearances(arm, scene, angles[None])[:, 0])
-    home = at(arm.home, scene)
-    ahead, num = jnp.zeros(6).at[1].set(0.9), num_of_obstacles(arm, scene)
+    arm, scene = as_numpy((irb1600(), paper_scene()))
+    compiled = jax.jit(lambda angles, scene: clearances(arm, scene, angles[None])[:, 0])
+    at = lambda *given: np.asarray(compiled(*given))  # noqa: E731
+    home, num = at(arm.home, scene), num_of_obstacles(arm, scene)
+    ahead = np.array([0.0, 0.9, 0.0, 0.0, 0.0, 0.0], np.float32)
     assert home.min() > 0.003 and home.size > num
     assert at(ahead, scene)[:num].min() < 0.0 < at(ahead, scene)[num:].min()
-    assert at(ahead, jax.tree.map(jnp.asarray, paper_scene(has_pole=False))).min() > 0.0
+    assert at(ahead, as_numpy(paper_scene(has_pole=False))).min() > 0.0
 
 
 def make_shelf():
@@ -469,7 +471,7 @@ def test_throws_at_another_arm_are_scaled_to_its_reach():
     np.testing.assert_allclose(cases.scene.inner.upper, 0.5 * usual.scene.inner.upper, rtol=1e-6)
     ends, of_usual = cases.scene.capsule_ends, usual.scene.capsule_ends
     np.testing.assert_allclose(ends, 0.5 * of_usual, rtol=1e-6)
-    flight = jax.vmap(flight_of)(cases)
+    flight = jax.jit(jax.vmap(flight_of))(cases)
     assert flight.comes.all()
     with pytest.raises(ValueError, match="size must be > 0"):
         paper_scene(size=0.0)

@@ -5,6 +5,7 @@ import functools
 from types import SimpleNamespace
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from flown_plans import SOLVED, quadrotor, table
@@ -61,9 +62,10 @@ def assert_refused(rule, function, *arguments, **options):
         function(*arguments, **options)
 
 
+@jax.jit
 def states(path, time=None):
     time = total_duration(path) if time is None else time
-    return np.stack([evaluate(path, time, order) for order in range(4)])
+    return jnp.stack([evaluate(path, time, order) for order in range(4)])
 
 
 def test_a_recovery_continues_the_trajectory_to_standstill(hits, braked):
@@ -71,9 +73,9 @@ def test_a_recovery_continues_the_trajectory_to_standstill(hits, braked):
     assert pj.hit.judge(hits, braked).success.all()
     for k in range(NUM):
         plan = pj.take(braked, k)
-        end = np.asarray(end_state(plan.trajectory))
-        np.testing.assert_allclose(states(plan.recovery, 0.0), end, atol=5e-3)
-        np.testing.assert_allclose(states(plan.recovery)[1:], 0.0, atol=2e-2)
+        end = jax.jit(end_state)(plan.trajectory)
+        np.testing.assert_allclose(states(plan.recovery, np.float32(0.0)), end, atol=5e-3)
+        np.testing.assert_allclose(np.asarray(states(plan.recovery))[1:], 0.0, atol=2e-2)
     # The appended recovery trajectory does not change the plan's contact time.
     plain = pj.plan(pj.hit.planner("exact"), hits)
     np.testing.assert_allclose(braked.stroke.time, plain.stroke.time, rtol=1e-6)

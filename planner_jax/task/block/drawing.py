@@ -6,6 +6,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Polygon, Rectangle
@@ -79,12 +80,10 @@ def draw_motion(
     """Draw a motion of an arm from the time `begin` [s] in three panels, which are returned."""
     figure.suptitle(verdict.sentence(), x=0.01, ha="left", fontsize="medium")
     panels = figure.subplots(1, 3, width_ratios=(1.2, 1.2, 1.0))
-    motion, moved = jax.tree.map(jnp.asarray, (motion, arm))
     arm, limits, scene = jax.tree.map(np.asarray, (arm, limits, scene))
-    end = float(jnp.sum(motion.durations))
-    angles = jax.vmap(lambda time: evaluate(motion, time))(jnp.linspace(0.0, end, _SHOWN))
-    arms = np.asarray(jax.vmap(capsules, (None, 0))(moved, angles))
-    turns, middles = (np.asarray(x) for x in jax.vmap(shield_pose, (None, 0))(moved, angles))
+    end = float(np.sum(motion.durations))
+    at = np.linspace(0.0, end, _SAMPLES, dtype=np.float32)
+    arms, turns, middles, speeds = jax.device_get(_sample_arm(arm, motion, at))
     corners = middles[:, None] + np.einsum("kij,cj->kci", turns[:, :, 1:], arm.shield_corners)
     turn = np.linspace(0.0, 2.0 * np.pi, 24)
     around = np.stack([np.cos(turn), np.sin(turn)], axis=1)
@@ -98,14 +97,22 @@ def draw_motion(
         axes.autoscale_view()
         axes.set_aspect("equal")
         style.label(axes, f"{'xyz'[view[0]]} [m]", f"{'xyz'[view[1]]} [m]", title)
-    at = jnp.linspace(0.0, end, _SAMPLES)
-    speeds = np.asarray(jax.vmap(lambda time: evaluate(motion, time, 1))(at))
     for name, rate in zip(arm.joint_names, (speeds / limits.velocity).T, strict=True):
         panels[2].plot(begin + at, rate, label=name)
     panels[2].set_ylim(-1.1, 1.6)  # leaves room for the legend
     panels[2].legend(fontsize="x-small", ncols=2, loc="upper center")
     style.label(panels[2], "time [s]", "rate / limit", "joints")
     return panels
+
+
+@jax.jit
+def _sample_arm(arm: Arm, motion: PiecewisePolynomial, at: Array) -> tuple[Array, ...]:
+    """Return capsules and shield poses at `_SHOWN` equidistant times, and joint rates at `at`."""
+    shown = jnp.linspace(at[0], at[-1], _SHOWN)
+    angles = jax.vmap(lambda time: evaluate(motion, time))(shown)
+    poses = jax.vmap(shield_pose, (None, 0))(arm, angles)
+    rates = jax.vmap(lambda time: evaluate(motion, time, 1))(at)
+    return jax.vmap(capsules, (None, 0))(arm, angles), *poses, rates
 
 
 def _draw_box(axes: Axes, box: Box, view: list[int], **look: Any) -> None:
