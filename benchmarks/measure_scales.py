@@ -1,4 +1,4 @@
-"""Measure the scales of the decision variables of `ExactHit` and `ExactCatch`.
+"""Measure the scales of the variables of `ExactHit` and `ExactCatch`, and the metric of rallies.
 
     python -m benchmarks.measure_scales [--write] [--out DIR]
 
@@ -13,6 +13,9 @@ cases of catches are throws of the suite `hard`, with limits multiplied by 1 and
 prints the largest ratio of a measured to a shipped scale, and the share of plans with the measured
 scales that the referee, an independent check in float64, accepts. --write replaces the shipped
 files.
+
+The metric of rallies is the inverse square root of the median over cases of the Hessian at the
+optimum, in units of the shipped scale. The cases are those of the suite `juggle`.
 """
 
 import dataclasses
@@ -59,6 +62,7 @@ _CATCH_FLOOR = 0.1
 # Type of a function that returns the residuals (R,) of a planner at n decision variables (n,). Its
 # third argument is the result of the planner's `prepare` for one case.
 Residuals = Callable[[Any, jax.Array, Any], jax.Array]
+_LEAST_EIGENVALUE = 3e-3  # Least eigenvalue of the Hessian for a metric, relative to the greatest.
 _ROUNDS = 3  # Number of measurements, each with the scales that the previous one measured.
 
 
@@ -108,6 +112,30 @@ def measure_scale(
         scale = 1.0 / np.sqrt(floor + np.nanmedian(curvature, axis=0))
         planner = dataclasses.replace(planner, scale=tuple(scale.tolist()))
     return np.asarray(planner.scale)
+
+
+def measure_metric(planner: Any, cases: Any) -> dict[str, np.ndarray]:
+    """Measure the metric of a planner's n variables on a batch of cases.
+
+    Returns:
+        `factor` (n, n), the inverse square root of the median Hessian, whose small eigenvalues are
+        raised; and `shift` (n,), the median displacement of the optimum from the first guess.
+    """
+    config = LbfgsConfig(max_steps=60, tolerance=1e-6, patience=6)
+
+    def search(case: Any) -> tuple[jax.Array, jax.Array]:
+        context = planner.prepare(case)
+        cost = lambda x: planner.objective(x, context)  # noqa: E731
+        start = planner.guesses(context, 1)[0]
+        point = minimise(cost, start, config).point
+        return jax.hessian(lambda x: cost(x).cost)(point), point - start
+
+    hessians, shifts = map(np.asarray, jax.jit(jax.vmap(search))(cases))
+    sound = np.isfinite(hessians).all(axis=(1, 2))
+    values, vectors = np.linalg.eigh(np.median(hessians[sound].astype(np.float64), axis=0))
+    sizes = np.sqrt(np.maximum(values, _LEAST_EIGENVALUE * values[-1]))
+    factor = np.median(sizes) * (vectors / sizes) @ vectors.T
+    return {"factor": factor, "shift": np.median(shifts[sound], axis=0)}
 
 
 def chain_residuals(planner: ChainPlanner, point: jax.Array, context: Any) -> jax.Array:
@@ -252,11 +280,24 @@ def main() -> None:
     parser = argument_parser("measure_scales", __doc__, num=100, seed=7)
     parser.add_argument("--write", action="store_true", help="replace the shipped files")
     parser.add_argument(
-        "--tasks", nargs="+", choices=TASKS, default=list(TASKS), help="default: all"
+        "--tasks",
+        nargs="+",
+        choices=[*TASKS, "rally"],
+        default=[*TASKS],
+        help="default: %(default)s",
     )
     options = parser.parse_args()
     with begin(parser, options) as bench:
         for task in options.tasks:
+            if task == "rally":
+                cases = pj.rally.draw(options.num, seed=options.seed)
+                metric = measure_metric(pj.rally.ExactRally(metric=False), cases)
+                path = locate_file(task).with_name("metric_exact-6.npz")
+                bench.say(f"condition of the metric: {np.linalg.cond(metric['factor']):.1f}")
+                if options.write:
+                    factor, shift = (each.astype(np.float32) for each in metric.values())
+                    np.savez_compressed(path, factor=factor, shift=shift)
+                continue
             found = measure(bench, task, options.num, options.seed)
             if options.write:
                 rounded = {

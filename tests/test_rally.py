@@ -193,3 +193,25 @@ def test_the_start_of_a_replan_is_the_plan_itself_and_the_ball_may_change():
     left = again.begin(case, plan, elapsed, ball=moved).case
     assert pj.rally.judge(left, new).success
     assert abs(float(new.strokes.time[0]) - float(plan.strokes.time[0]) + elapsed) < 0.1
+
+
+@pytest.mark.slow
+def test_the_metric_of_two_hits_changes_variables_only(float64):
+    case, planner = pj.rally.draw(1, seed=3, dtype=jnp.float64), pj.rally.planner()
+    plain = pj.rally.planner(metric=False)
+    context = planner.prepare(pj.take(case, 0))
+    point = planner.guesses(context, 2)[1]
+    again = plain.join(*planner.split(point))
+    np.testing.assert_allclose(again, plain.guesses(context, 2)[1], atol=1e-9)
+    np.testing.assert_allclose(planner.join(*planner.split(point)), point, atol=1e-9)
+    direction = jnp.cos(jnp.arange(point.size))
+
+    @jax.jit
+    def derive(point):
+        found = planner.curvature_at(point, context)
+        slope = jax.grad(lambda x: planner.objective(x, context).cost)
+        own = found.gradient, found.products()(direction)
+        return own, jax.jvp(slope, (point,), (direction,))
+
+    for own, other in zip(*derive(point), strict=True):
+        np.testing.assert_allclose(own, other, rtol=1e-5, atol=1e-8)
