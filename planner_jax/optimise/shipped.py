@@ -1,8 +1,7 @@
-"""Measured units and metrics of variables, and networks for starting points, stored with tasks.
+"""Measured units of variables, and trained networks for starting points, stored with each task.
 
 A quasi-Newton method converges faster if all variables have second derivatives of similar size. So
-each planner uses units of variables that `python -m benchmarks.measure_scales` measured. Rallies
-also use a metric: linear combinations of variables with few mixed second derivatives.
+each planner uses units of variables that `python -m benchmarks.measure_scales` measured.
 
 The networks predict starting points. `python -m benchmarks.learn_starts --train MINUTES` trains
 them to lower the planner's own objective, without solved examples. A search starts at a network's
@@ -61,24 +60,6 @@ def load_scale(package: str, name: str) -> tuple[float, ...]:
             f"no measured scale for {name!r}: pass `scale`, or use one of {', '.join(scales)}"
         )
     return tuple(scales[name])
-
-
-@struct.dataclass
-class Metric:
-    """A measured linear map to n variables in their units, and a typical change of the guess."""
-
-    factor: np.ndarray  # (n, n), symmetric; variables = factor @ point of the search
-    inverse: np.ndarray  # (n, n), of F
-    shift: np.ndarray  # (n,), median over cases of the optimum minus the guess
-
-
-@functools.cache
-def load_metric(package: str, name: str) -> Metric:
-    """Load the metric `name` of the variables from a task's package."""
-    path = importlib.resources.files(package) / f"metric_{name}.npz"
-    with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
-        factor, shift = (file[key].astype(np.float64) for key in ("factor", "shift"))
-    return Metric(factor=factor, inverse=np.linalg.inv(factor), shift=shift)
 
 
 @functools.cache

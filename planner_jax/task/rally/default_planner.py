@@ -26,7 +26,7 @@ from planner_jax.cost.quadrotor import Measure
 from planner_jax.optimise.chain import ChainEnds, ChainPlanner
 from planner_jax.optimise.planner import pending
 from planner_jax.optimise.settings import Curvature, LbfgsConfig, Round
-from planner_jax.optimise.shipped import Metric, load_metric, load_scale
+from planner_jax.optimise.shipped import load_scale
 from planner_jax.robot.quadrotor import tangent_basis
 from planner_jax.task.hit.context import (
     HitContext,
@@ -38,6 +38,7 @@ from planner_jax.task.hit.context import (
 from planner_jax.task.hit.default_planner import state_at_impact
 from planner_jax.task.hit.plan import Stroke
 from planner_jax.task.rally.case import RallyCase
+from planner_jax.task.rally.metric import Metric, load_metric
 from planner_jax.task.rally.plan import RallyPlan
 from planner_jax.trajectory.polynomial import PiecewisePolynomial
 from planner_jax.trajectory.proportional_minco import boundary_energy, boundary_rows
