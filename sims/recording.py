@@ -40,7 +40,7 @@ class Recording:
     success: np.ndarray  # (F,) bool, whether the flight succeeded
     time: np.ndarray  # (F, K) [s], times of the samples
     robot: np.ndarray  # (F, K, R), joint positions of the robot
-    wanted: np.ndarray  # (F, K, 3 Q) [m], planned positions of Q robots, by default 1
+    wanted: np.ndarray  # (F, K, 3) [m], planned position of the robot; (F, K, Q, 3) of Q robots
     balls: np.ndarray  # (F, K, N, 3) [m], positions of the balls
     met: np.ndarray  # (F, N) [s], time of the contact with each ball
     contact: np.ndarray  # (F, N, 3) [m], position of the ball's centre at the contact

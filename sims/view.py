@@ -255,14 +255,10 @@ class Viewer:
                 "/machine", machine_parts(*launch) if launch and self.world.mouth else []
             )
             flown = self.world.robot.place(recording.robot[row])
-            paths = [
-                (f"{name}{k}", path, colour, thickness)
-                for name, all_paths, colour, thickness in (
-                    ("/flown", flown, BLUE, 0.012),
-                    ("/plan", recording.wanted[row], INK, 0.006),
-                )
-                for k, path in enumerate(np.split(all_paths, all_paths.shape[1] // 3, axis=1))
-            ]
+            paths = []
+            for k, path in enumerate(np.moveaxis(flown.reshape(len(flown), -1, 3), 1, 0)):
+                plan = recording.wanted[row].reshape(len(flown), -1, 3)[:, k]
+                paths += [(f"/flown{k}", path, BLUE, 0.012), (f"/plan{k}", plan, INK, 0.006)]
             paths += [
                 (f"/path{k}", recording.balls[row, :, k], GREY, 0.004)
                 for k in range(recording.balls.shape[2])

@@ -182,7 +182,7 @@ def test_assignment_catches_as_many_as_all_divisions():
     points = np.concatenate([near, near + [40.0, 0.0, 0.0]])
     case = hanging(points, [[-1.0, 0.0, 1.0], [39.0, 0.0, 1.0]])
     cases = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], case)
-    choices = assign(cases, 16, (1.0, 1.5))
+    choices = assign(cases, 16, jnp.array([1.0, 1.5]))
     each = np.kron(np.eye(2, dtype=bool), np.ones(4, bool))
     np.testing.assert_array_equal(choices.taken, np.tile(each, (1, 2, 1, 1)))
     catches = choices.times[0, :, :, 3]  # of the last catch; faster robots are earlier
@@ -229,6 +229,17 @@ def test_team_plans_are_accepted_and_catch_more_than_one_robot():
     assert verdict.success.all()
     assert (verdict.num_caught >= plans.robots.num_taken.max(axis=1) + 1).all()
     np.testing.assert_array_equal(verdict.num_caught, plans.num_taken)
+
+
+@pytest.mark.slow
+def test_one_robot_catches_two_targets_that_are_too_near_for_two_robots():
+    # Each robot is nearest to a target of its own, and the targets are nearer than the distance.
+    case = hanging([[-0.3, 0.0, 2.0], [0.3, 0.0, 2.0]], [[-2.0, 0.0, 1.0], [2.0, 0.0, 1.0]])
+    case = dataclasses.replace(case, least_distance=jnp.float32(1.5))
+    plan = pj.plan(pj.team.planner(decide="greedy", **QUICK), case)
+    verdict = pj.team.judge(case, plan)
+    assert verdict.success, verdict.sentence()
+    assert verdict.num_caught == 2 and sorted(plan.taken.sum(axis=1)) == [0, 2]
 
 
 def test_teams_are_planned_on_the_host_only():

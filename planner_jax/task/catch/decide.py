@@ -106,7 +106,7 @@ def sequences(
     table: Timetable,
     width: int,
     margin: float,
-    haste: float = 1.0,
+    haste: Array | float = 1.0,
     handicap: ArrayLike = 0.0,
 ) -> Sequences:
     """Search for sequences of 0, 1, ..., N catches of one case, W of each length.

@@ -69,7 +69,7 @@ def length(vectors: Array) -> Array:
 
 
 def arrival(
-    table: Timetable, begin: Array, place: Array, speed: Array, haste: float = 1.0
+    table: Timetable, begin: Array, place: Array, speed: Array, haste: Array | float = 1.0
 ) -> tuple[Array, Array, Array]:
     """Return time () [s], position (3,) [m] and shortfall () [m] of a target's earliest catch.
 
@@ -90,7 +90,7 @@ def arrival(
 arrivals = jax.vmap(arrival, (0, None, None, None))  # `arrival` for N targets from one position
 
 
-def _out_of_reach(offset: Array, span: Array, speed: Array, haste: float = 1.0) -> Array:
+def _out_of_reach(offset: Array, span: Array, speed: Array, haste: Array | float = 1.0) -> Array:
     span, acc = jnp.maximum(span - _TURNING / haste, 0.0), _ACCELERATION * haste**2
     rise = speed / acc
     reach = jnp.where(span < rise, 0.5 * acc * span**2, speed * span - 0.5 * speed * rise)
@@ -167,9 +167,9 @@ def can_be_next(case: CatchCase, shortfalls: Array, margin: float = MARGIN) -> A
     return case.present & (shortfalls <= margin) if case.optional else case.present
 
 
-def top_speed(case: CatchCase, haste: float = 1.0) -> Array:
+def top_speed(case: CatchCase, haste: Array | float = 1.0) -> Array:
     """Return the greatest speed () [m/s] in estimates: 0.9 `haste` times the limit, at most it."""
-    return min(0.9 * haste, 1.0) * case.limits.speed
+    return jnp.minimum(0.9 * haste, 1.0) * case.limits.speed
 
 
 def _leave_from(

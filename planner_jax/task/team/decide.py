@@ -23,24 +23,23 @@ _AT_ONCE = 4  # number of cases whose pairs of sequences are compared at once; b
 PER_SECOND = 1e-3  # value of a second of a sequence's rank, in caught targets
 
 
-@functools.partial(jax.jit, static_argnums=(1, 2))
-def assign(cases: TeamCase, width: int, hastes: tuple[float, ...]) -> CatchChoice:
+@functools.partial(jax.jit, static_argnums=1)
+def assign(cases: TeamCase, width: int, hastes: Array) -> CatchChoice:
     """Return the choices of N robots of B cases, for each of H factors on the robots' agility.
 
     A choice says which of M targets a robot shall catch, in which order and when. No target is
     chosen for two robots. Leaves have the shape (B, H, N, M). The search keeps `width` sequences of
-    each length for each robot. `estimate.arrival` explains the factors `hastes`: the greater the
-    factor, the more catches are chosen, and the fewer plans fulfil their choice.
+    each length for each robot. `estimate.arrival` explains the factors `hastes` (H,): the greater
+    the factor, the more catches are chosen, and the fewer plans fulfil their choice.
     """
 
     def one(case: TeamCase) -> CatchChoice:
-        each = [_assign(case, width, haste) for haste in hastes]
-        return jax.tree.map(lambda *leaves: jnp.stack(leaves), *each)
+        return lax.map(functools.partial(_assign, case, width), hastes)
 
     return lax.map(one, cases, batch_size=_AT_ONCE)
 
 
-def _assign(case: TeamCase, width: int, haste: float) -> CatchChoice:
+def _assign(case: TeamCase, width: int, haste: Array) -> CatchChoice:
     table, num = timetable(case.shared), case.shared.num_targets
 
     def search(head: Array) -> decide.Sequences:

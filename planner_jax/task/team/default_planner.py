@@ -33,7 +33,7 @@ _SPARE = 1.01  # planned least distance between robots, relative to the least di
 _WIDTH = 128  # number of sequences of each length in the joint decision
 # Factors on the agility of robots in the joint decision, in the order of trial. Plans nearly always
 # fulfil the choices of the first one. Greater factors find more catches, which some plans miss.
-_HASTES = (1.3, 1.5, 1.7, 1.15, 1.0)
+_HASTES = (1.3, 1.5, 1.7, 1.6, 1.4, 1.9, 1.8, 1.15, 1.0)
 
 
 @struct.dataclass
@@ -88,7 +88,7 @@ class ExactTeam(Planner[TeamCase, TeamPlan]):
     def _plan_jointly(self, drive: Drive, cases: TeamCase) -> tuple[list[PyTree], np.ndarray]:
         """Return N robots' plans of B cases, and in which cases the distance costs catches."""
         num, batch = cases.num_robots, len(cases.head_states)
-        choices = jax.tree.map(np.asarray, assign(cases, _WIDTH, _HASTES))
+        choices = jax.tree.map(np.asarray, assign(cases, _WIDTH, np.array(_HASTES, np.float32)))
         alone = dataclasses.replace(self.planner, planner=self.inner, slower=())
         # Plans of each robot, leaves (B, ...): to hover, then for each joint decision. A robot
         # hovers where it has no plan.

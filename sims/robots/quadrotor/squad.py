@@ -1,7 +1,7 @@
 """Several simulated quadrotors of one kind in one world, as one `sims.robot.Robot`.
 
 States, references, plans and noise have a leading axis N, the number of quadrotors. MuJoCo's arrays
-hold the numbers of one quadrotor after the other.
+hold the numbers of one quadrotor after the other. `sims.robot` explains the methods.
 """
 
 import dataclasses
@@ -12,7 +12,7 @@ import jax
 import numpy as np
 from jax import Array
 
-from planner_jax.robot.quadrotor_model import QuadrotorModel, Tool
+from planner_jax.robot.quadrotor_model import Tool
 from planner_jax.sims.model import World
 from planner_jax.sims.robot import Physics, Shape
 from planner_jax.sims.robots.quadrotor.control import RobotState
@@ -27,7 +27,7 @@ class Squad:
     member: Quadrotor
     number: int  # N
 
-    WORDS: ClassVar[str] = f"in each flight several quadrotors: {Quadrotor.WORDS}"
+    WORDS: ClassVar[str] = f"several quadrotors in one world: {Quadrotor.WORDS}"
 
     @property
     def num_pos(self) -> int:
@@ -45,68 +45,57 @@ class Squad:
         return self.number, *self.member.noise_shape
 
     @property
-    def model(self) -> QuadrotorModel:
-        """The model of every quadrotor for which plans are made."""
-        return self.member.model
-
-    @property
-    def wind(self) -> tuple[float, ...]:
-        """The velocity of the air, (3,) [m/s]."""
-        return self.member.wind
-
-    @property
     def tool(self) -> Tool:
         """The racket or net that every quadrotor carries."""
         return self.member.tool
 
     def mjcf(self) -> tuple[str, str]:
-        """Return two texts in MJCF, MuJoCo's format: all bodies, and the motors of all bodies."""
+        """Return two texts in MJCF: all bodies, and all motors."""
         bodies, motors = zip(*(self.member.mjcf(f"{k}") for k in range(self.number)), strict=True)
         return "".join(bodies), "".join(motors)
 
     def at_rest(self, place: Array, gravity: float) -> tuple[Array, Array, Array]:
         """Return `qpos`, `qvel` and `act` of N quadrotors that hover at positions (N, 3) [m]."""
-        hover = functools.partial(self.member.at_rest, gravity=gravity)
-        qpos, qvel, act = jax.vmap(hover)(place)
-        return qpos.ravel(), qvel.ravel(), act.ravel()
-
-    def drive(self, physics: Physics, command: Array, timestep: float) -> tuple[Array, Array]:
-        """Return the rotor thrusts [N] of all quadrotors unchanged, and their drag as forces."""
-        drive = functools.partial(self.member.drive, timestep=timestep)
-        controls, forces = jax.vmap(drive)(self._split(physics), command.reshape(self.number, -1))
-        return controls.ravel(), forces.ravel()
+        parts = jax.vmap(functools.partial(self.member.at_rest, gravity=gravity))(place)
+        return parts[0].ravel(), parts[1].ravel(), parts[2].ravel()
 
     def _split(self, physics: Physics) -> Physics:
         """Return the part of each quadrotor, leaves (N, ...), without the balls."""
         pos, vel = physics.qpos[: self.num_pos], physics.qvel[: self.num_vel]
-        parts = (leaf.reshape(self.number, -1) for leaf in (pos, vel, physics.act))
-        return Physics(*parts)
+        return Physics(*(leaf.reshape(self.number, -1) for leaf in (pos, vel, physics.act)))
+
+    def drive(self, physics: Physics, command: Array, timestep: float) -> tuple[Array, Array]:
+        """Return the rotor thrusts [N] unchanged, and the quadrotors' drag as extra forces."""
+        drive = functools.partial(self.member.drive, timestep=timestep)
+        controls, forces = jax.vmap(drive)(self._split(physics), command.reshape(self.number, -1))
+        return controls.ravel(), forces.ravel()
 
     def state(self, physics: Physics) -> RobotState:
         """Return the true states of the quadrotors from the simulated physics."""
         return jax.vmap(self.member.state)(self._split(physics))
 
     def sense(self, state: RobotState, noise: Array, stds: tuple[float, ...]) -> RobotState:
-        """Return the estimated states: the true states plus errors; `noise` is (N, 4, 3)."""
-        return jax.vmap(lambda own, noise: self.member.sense(own, noise, stds))(state, noise)
+        """Return the estimated states: the true states plus errors."""
+        return jax.vmap(functools.partial(self.member.sense, stds=stds))(state, noise)
 
     def tool_motion(self, state: RobotState) -> tuple[Array, Array, Array, Array]:
         """Return position, velocity, rate and z axis of the N bodies, each (N, 3)."""
         return jax.vmap(self.member.tool_motion)(state)
 
     def head_state(self, plan: Any, time: Array) -> Array:
-        """Return the planned states (N, 4, 3) of the quadrotors at a time () [s]."""
-        return jax.vmap(self.member.head_state, (0, None))(plan, time)
+        """Return the planned states (4, N, 3) of the quadrotors at a time () [s]."""
+        return jax.vmap(self.member.head_state, (0, None), 1)(plan, time)
 
     def references(self, plan: Any, times: Array, world: World) -> Reference:
         """Return the references at K times [s] since the start of the plans, leaves (K, N, ...)."""
-        one = lambda plan: self.member.references(plan, times, world)  # noqa: E731
+        one = functools.partial(self.member.references, times=times, world=world)
         return jax.vmap(one, out_axes=1)(plan)
 
     def command(self, state: RobotState, reference: Reference, world: World) -> Array:
         """Return the rotor thrusts (4 N,) [N] with which each quadrotor tracks its reference."""
-        command = lambda state, reference: self.member.command(state, reference, world)  # noqa: E731
-        return jax.vmap(command)(state, reference).ravel()
+        return jax.vmap(functools.partial(self.member.command, world=world))(
+            state, reference
+        ).ravel()
 
     def shapes(self) -> list[Shape]:
         """Return the parts of all quadrotors for drawing."""
@@ -122,5 +111,5 @@ class Squad:
         return self.member.place(own).reshape(*poses.shape[:-1], -1)
 
     def find_held_ball(self, pose: np.ndarray) -> np.ndarray:
-        """Return NaN (3,), as the joint positions do not tell which quadrotor holds a ball."""
+        """Return NaN (3,), as joint positions do not tell which quadrotor holds a ball."""
         return np.full(3, np.nan)
