@@ -164,8 +164,8 @@ class Scene:
     def plan_path(self) -> np.ndarray:
         """Return planned positions (K, N, 3) [m] of N robots, up to the last contact."""
         wanted = self.recording.wanted[self.flight, : self.find_last_contact() + 1]
-        wanted = wanted[np.isfinite(wanted).all(axis=1)]
-        return wanted.reshape(len(wanted), -1, 3)
+        wanted = wanted.reshape(len(wanted), -1, 3)
+        return wanted[np.isfinite(wanted).all(axis=(1, 2))]
 
     def find_last_contact(self) -> int:
         """Return the index of the first sample after the last contact of a ball with the robot.

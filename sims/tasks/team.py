@@ -38,8 +38,9 @@ from planner_jax.task.team.case import TeamCase
 from planner_jax.task.team.plan import TeamPlan
 from planner_jax.task.team.suites import draw
 
-# [m], added to the least distance in plans, because two robots do not track their plans exactly.
-_TRACKING = 0.1
+# Robots do not track their plans exactly. Plans therefore have a least distance that is greater by
+# `_TRACKING` [m], and nets whose radius is `_INSIDE` times the true radius.
+_TRACKING, _INSIDE = 0.1, 0.8
 _AFTER = 0.2  # [s], simulated time after the last robot has stopped
 
 
@@ -172,10 +173,15 @@ class TeamFlight(BallFlightTask):
 
     def fly(self, cases: Teams, record: bool) -> TeamFlights:
         """Plan and simulate the flights of `cases`, whose states are always recorded."""
-        settings, least = self.settings, cases.cases.least_distance
-        wider = dataclasses.replace(cases.cases, least_distance=least + np.float32(_TRACKING))
+        settings, shared = self.settings, cases.cases.shared
+        net = dataclasses.replace(shared.net, radius=np.float32(_INSIDE) * shared.net.radius)
+        stricter = TeamCase(
+            dataclasses.replace(shared, net=net),
+            cases.cases.head_states,
+            cases.cases.least_distance + np.float32(_TRACKING),
+        )
         clock = time.perf_counter()
-        plans = plan_all(team_planner(settings.planner, lift=LIFT), wider)
+        plans = plan_all(team_planner(settings.planner, lift=LIFT), stricter)
         planning = time.perf_counter() - clock
         return fly_teams(self.loop(True), cases, plans, settings.seed, planning=planning)
 
