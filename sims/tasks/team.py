@@ -39,8 +39,9 @@ from planner_jax.task.team.plan import TeamPlan
 from planner_jax.task.team.suites import draw
 
 # Robots do not track their plans exactly. Plans therefore have a least distance that is greater by
-# `_TRACKING` [m], and nets whose radius is `_INSIDE` times the true radius.
-_TRACKING, _INSIDE = 0.1, 0.8
+# `_TRACKING` [m], nets whose radius is `_INSIDE` times the true radius, and balls that enter a net
+# with at least `_ENTRY` [m/s].
+_TRACKING, _INSIDE, _ENTRY = 0.1, 0.8, 0.3
 _AFTER = 0.2  # [s], simulated time after the last robot has stopped
 
 
@@ -181,7 +182,7 @@ class TeamFlight(BallFlightTask):
             cases.cases.least_distance + np.float32(_TRACKING),
         )
         clock = time.perf_counter()
-        plans = plan_all(team_planner(settings.planner, lift=LIFT), stricter)
+        plans = plan_all(team_planner(settings.planner, lift=LIFT, entry=_ENTRY), stricter)
         planning = time.perf_counter() - clock
         return fly_teams(self.loop(True), cases, plans, settings.seed, planning=planning)
 

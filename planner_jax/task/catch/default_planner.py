@@ -105,6 +105,8 @@ class ExactCatch(ChainPlanner[CatchCase, CatchPlan]):
     # the greatest thrust. Near -1 catches are earliest; larger values leave a margin for feedback
     # control in flight.
     lift: float = _GUESSES[0, 3].item()
+    # [m/s], least speed at which a ball enters the net from above; None: it may enter from below.
+    entry: float | None = None
     learned: bool = True  # whether a network predicts a starting point for a single catch
 
     @property
@@ -230,7 +232,8 @@ class ExactCatch(ChainPlanner[CatchCase, CatchPlan]):
 
         The variables are log duration, catch point (2,) in the net, velocity, acceleration and jerk
         (3,). The field `excess` (2, N) of the result has two rows: relative excess of the net's
-        angle over its limit, and of the catch's time over the latest allowed time.
+        angle over its limit, and of the catch's time over the latest allowed time. With `entry`
+        there is a third row: the lack of speed at which the ball enters, over the speed limit.
         """
         case, net = context.case, context.case.net
         durations = jnp.exp(natural[:, 0])
@@ -251,11 +254,15 @@ class ExactCatch(ChainPlanner[CatchCase, CatchPlan]):
         tail_states = jnp.stack([pos, vel, acc, natural[:, 9:12]], axis=1)
         # Feasible plans may exceed a limit by the tolerance, added here so that no catch is late.
         late = times / context.horizon - 1.0 + FEASIBILITY_TOLERANCE
+        rows = [excess, late]
+        if self.entry is not None:
+            rising = jnp.sum((ball.vel - vel) * axis, axis=1)
+            rows.append((rising + self.entry) / case.limits.speed)
         return ChainEnds(
             durations=durations,
             tail_states=tail_states,
             total_time=times[-1],
-            excess=jnp.where(context.active, jnp.stack([excess, late]), -1.0),
+            excess=jnp.where(context.active, jnp.stack(rows), -1.0),
             contact=times,
         )
 

@@ -27,6 +27,9 @@ from planner_jax.task.team.plan import TeamPlan
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
 
 _NODES = 256  # number of nodes of the table of a robot's path
+# Relative difference of the limits in plans of several robots from the case's limits: between the
+# samples at which a planner evaluates limits, a trajectory may exceed them slightly.
+_STRICTER = 2e-3
 _TIMES = 1024  # number of times at which the distance of two robots is compared
 _HOVER = 1.0  # [s], duration of the recovery of a robot that catches nothing
 _SPARE = 1.01  # planned least distance between robots, relative to the least distance of the case
@@ -70,7 +73,7 @@ class ExactTeam(Planner[TeamCase, TeamPlan]):
         if cases.num_robots == 1:
             robots = [drive(self.planner, cases.of_robot(0))[0]]
         else:
-            cases = jax.tree.map(np.asarray, cases)
+            cases = jax.tree.map(np.asarray, _with_stricter_limits(cases))
             robots, wanting = self._plan_jointly(drive, cases)
             lanes = np.flatnonzero(wanting)
             if lanes.size:
@@ -151,6 +154,15 @@ class ExactTeam(Planner[TeamCase, TeamPlan]):
             plans[k] = jax.tree.map(pick, new, old)
             paths[k] = _tabulate(plans[k].whole)
         return plans
+
+
+def _with_stricter_limits(cases: TeamCase) -> TeamCase:
+    limits = cases.shared.limits.scale(1.0 - _STRICTER, cases.shared.gravity)
+    height = limits.min_height + _STRICTER * abs(limits.min_height)
+    shared = dataclasses.replace(
+        cases.shared, limits=dataclasses.replace(limits, min_height=height)
+    )
+    return dataclasses.replace(cases, shared=shared)
 
 
 def _put(old: PyTree, new: PyTree, lanes: np.ndarray) -> None:
