@@ -20,6 +20,7 @@ from planner_jax.runs.summary import percent
 from planner_jax.sims.launch import flight_keys
 from planner_jax.sims.loop_state import Loop
 from planner_jax.sims.model import World
+from planner_jax.sims.noise import NOISES
 from planner_jax.sims.rally_loop import (
     RallyPilot,
     Trial,
@@ -30,11 +31,16 @@ from planner_jax.sims.rally_loop import (
 )
 from planner_jax.sims.recording import Recording
 from planner_jax.sims.robots.quadrotor.robot import Quadrotor
+from planner_jax.sims.robots.quadrotor.squad import Squad
+from planner_jax.sims.scenery import Part
 from planner_jax.sims.settings import RallyFly
 from planner_jax.sims.task import BallTask, FlightCases, Flights
+from planner_jax.sims.tasks.hit import court_parts
+from planner_jax.task.hit.court import HALF_WIDTH
 from planner_jax.task.rally.case import RallyCase
 from planner_jax.task.rally.suites import COURSES, Course, draw
 
+_NET = "#7F8C8D"  # colour of the net in pictures
 _AHEAD = 2  # number of hits of one robot that are planned together, at most one for each box
 _SEEN = 0.25  # [s], time for which the first ball is observed before the first plan
 _CHUNK = 100  # number of planning periods that are simulated by one call of the program
@@ -257,10 +263,22 @@ class RallyFlight(BallTask):
         return self.settings.hits or self.course.hits
 
     def world(self) -> World:
-        """Return the simulated world."""
-        robot = self.settings.robot or self.course.robot
+        """Return the world that pictures show: all robots, and the net with the court's lines."""
+        settings, net = self.settings, self.course.net
+        robot = Quadrotor(settings.robot or self.course.robot, **settings.air())
         gravity = float(np.asarray(self._draw(1).gravity)[0])
-        return World(Quadrotor(robot, **self.settings.air()), gravity)
+        if self.course.home is None:
+            return World(robot, gravity)
+        fabric = Part("box", (0.02, 2.0 * HALF_WIDTH, net), (0.0, 0.0, 0.5 * net), _NET, 0.0, 0.25)
+        scenery = (*court_parts(), fabric)
+        return World(Squad(robot, 2), gravity, scenery=scenery)
+
+    def loop(self, record: bool) -> Loop:
+        """Return the closed loop's settings, with the world of one robot."""
+        settings, world = self.settings, self.world()
+        own = getattr(world.robot, "member", world.robot)
+        world = World(own, world.gravity)
+        return Loop(world, NOISES[settings.noise], replan=settings.rate, record=record)
 
     def _draw(self, num: int) -> RallyCase:
         settings, known = self.settings, self.settings.known_robot()
@@ -302,15 +320,15 @@ class RallyFlight(BallTask):
     ) -> Recording:
         """Return a recording of the first seconds of the trials with the indices `lanes`."""
         flown, number = flights.flown, len(lanes)
-        qpos, size = flown.qpos[lanes, :, 0].astype(float), flown.qpos.shape[-1] - 3
-        balls = qpos[:, :, None, size:]
+        qpos, size = flown.qpos[lanes].astype(float), flown.qpos.shape[-1] - 3
+        balls = qpos[:, :, :1, size:]
         balls[balls[..., 2] < 0.0] = np.nan
         return Recording(
             index=cases.index[lanes],
             success=flights.success[lanes],
             time=np.broadcast_to(flown.time, (number, flown.time.size)),
-            robot=qpos[:, :, :size],
-            wanted=flown.wanted[lanes, :, 0].astype(float),
+            robot=qpos[..., :size].reshape(*qpos.shape[:2], -1),
+            wanted=flown.wanted[lanes].astype(float),
             balls=balls,
             met=np.full((number, 1), np.nan),
             contact=np.full((number, 1, 3), np.nan),

@@ -81,7 +81,7 @@ COURSES = {
     "juggle": Course(),
     "target": Course(
         places=(_LEVEL, _LEVEL, _TARGET),
-        ranges=(_WIDE, _WIDE, (0.05, 0.05, 0.0)),
+        ranges=(_WIDE, _WIDE, (0.0, 0.0, 0.0)),
         circle=0.25,
     ),
     "volley": Course(
