@@ -1,5 +1,7 @@
 """Rallies: cases, suites, the planner's equations, plans and re-plans."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,6 +11,7 @@ from rallies import bounces, fly_on
 import planner_jax as pj
 from planner_jax.ball.flight import BallState
 from planner_jax.core import GRAVITY
+from planner_jax.optimise.settings import LbfgsConfig
 from planner_jax.planning.replan import Replanning
 from planner_jax.task.hit.court import fly
 from planner_jax.task.rally.replan import count_done
@@ -215,3 +218,19 @@ def test_the_metric_of_two_hits_changes_variables_only(float64):
 
     for own, other in zip(*derive(point), strict=True):
         np.testing.assert_allclose(own, other, rtol=1e-5, atol=1e-8)
+
+
+@pytest.mark.slow
+def test_the_gradient_of_a_plans_cost_agrees_with_plans_of_changed_cases(float64):
+    case = pj.take(pj.rally.draw(1, seed=904, dtype=jnp.float64), 0)
+    steps = 1e-4 * np.concatenate([np.zeros((1, 4)), np.eye(4), -np.eye(4)])
+    cases = jax.tree.map(lambda leaf: np.broadcast_to(leaf, (len(steps), *np.shape(leaf))), case)
+    ball = dataclasses.replace(cases.ball, pos=cases.ball.pos + steps[:, :3])
+    cases = dataclasses.replace(cases, ball=ball, drag=cases.drag + steps[:, 3])
+    solver = LbfgsConfig(max_steps=300, memory=20, tolerance=0.0, patience=20)
+    found = pj.gradient(
+        pj.rally.planner(), cases, of="cost", by=("ball.pos", "drag"), steps=0, solver=solver
+    )
+    cost = np.asarray(found.plans.cost)
+    slopes = np.append(found.by["ball.pos"][0], found.by["drag"][0])
+    np.testing.assert_allclose(slopes, (cost[1:5] - cost[5:]) / 2e-4, rtol=1e-3, atol=1e-6)
