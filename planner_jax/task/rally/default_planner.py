@@ -26,7 +26,7 @@ from planner_jax.cost.quadrotor import Measure
 from planner_jax.optimise.chain import ChainEnds, ChainPlanner
 from planner_jax.optimise.planner import pending
 from planner_jax.optimise.settings import Curvature, LbfgsConfig, Round
-from planner_jax.optimise.shipped import load_scale
+from planner_jax.optimise.shipped import load_scale, select_start
 from planner_jax.robot.quadrotor import tangent_basis
 from planner_jax.task.hit.context import (
     HitContext,
@@ -75,11 +75,13 @@ _ANY_FEASIBLE = (
 _HARD = LbfgsConfig(max_steps=200, memory=12, tolerance=1e-6, patience=5)
 # A round is an attempt to solve the cases that are unsolved so far.
 ROUNDS = (
-    Round(1, LbfgsConfig(max_steps=5)),
+    Round(1, LbfgsConfig(max_steps=12)),
     Round(1, LbfgsConfig(max_steps=60)),
     Round(1, _HARD, _ANY_FEASIBLE),
     Round(5, _HARD, _ANY_FEASIBLE, first=1),
 )
+# The first round in the measured metric. A re-plan, whose start is no guess, uses `ROUNDS[0]`.
+_SHORT = Round(1, LbfgsConfig(max_steps=5))
 
 
 @struct.dataclass
@@ -161,13 +163,21 @@ class ExactRally(ChainPlanner[RallyCase, RallyPlan]):
         return point if metric is None else _multiply(metric.inverse, point)
 
     def guesses(self, context: RallyContext, num: int) -> Array:
-        """Return starting points (num, n), the first one moved to the typical optimum."""
+        """Return starting points (num, n), the first one moved by the metric if that costs less."""
         points = super().guesses(context, num)
         metric = self._metric(points.shape[1])
         if metric is None:
             return points
-        points = points.at[0].add(jnp.asarray(metric.shift, points.dtype))
-        return jax.vmap(lambda point: _multiply(metric.inverse, point))(points)
+        points = jax.vmap(functools.partial(_multiply, metric.inverse))(points)
+        moved = points[0] + jnp.asarray(metric.inverse @ metric.shift, points.dtype)
+        cost = lambda point: self.objective(point, context).cost  # noqa: E731
+        return points.at[0].set(select_start(cost, points[0], moved))
+
+    def load_attempt(self, attempt: Round, cases: RallyCase) -> PyTree:
+        """Return an attempt (search settings) as arrays, with fewer iterations with a metric."""
+        size = cases.places.shape[-2] * len(self.scale)
+        is_short = attempt == ROUNDS[0] and self._metric(size) is not None
+        return super().load_attempt(_SHORT if is_short else attempt, cases)
 
     def curvature_at(self, point: Array, context: RallyContext) -> Curvature:
         """Return evaluation, gradient, Hessian products and preconditioner at a point (n,)."""
