@@ -73,7 +73,7 @@ _VOLLEYBOTS = Course(
     drag=0.0,
     gravity=STANDARD_GRAVITY,
     drop=2.0,
-    hits=17,
+    hits=15,
     seconds=16.0,
     heights=(0.4, 2.5),
 )
