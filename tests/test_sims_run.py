@@ -31,7 +31,7 @@ from tests.recordings import recording
 
 # Each row has invalid settings of a run, and the beginning of the error message.
 BAD = """
-fly_settings("dodge") | task must be one that can be flown (hit, rally, catch, team, intercept, block)
+fly_settings("dodge") | task must be one that can be flown (hit, rally, catch, team, intercept
 CatchFly(balls=2, replan=100.0 / 3.0) | replan must be such that its period divides 0.8 s, got 33.3
 CatchFly(decide="given") | decide must be one of best, greedy, random, policy, got 'given'
 CatchFly(decide="best:file") | decide must be best without a file, got 'best:file'
