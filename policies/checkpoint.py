@@ -17,8 +17,8 @@ from flax import traverse_util
 
 from planner_jax.core.checks import require_path_name
 from planner_jax.core.errors import ArgumentError
-from planner_jax.core.plan_files import UNREADABLE
-from planner_jax.host.files import open_plain, replacing
+from planner_jax.core.plan_files import UNREADABLE, name_damage, read_archive
+from planner_jax.host.files import LARGEST, replacing
 from planner_jax.policies.networks import NETWORKS
 from planner_jax.policies.observation import FEATURES
 
@@ -73,15 +73,14 @@ def load_checkpoint(path: str | os.PathLike) -> Checkpoint:
     require_path_name("checkpoint", path)
     name = os.fspath(path)
     try:
-        with open_plain(path) as file, np.load(file, allow_pickle=False) as archive:
-            arrays = {key: archive[key] for key in archive.files}
-        about = json.loads(str(arrays.pop("about")))
+        text, arrays = read_archive(path, "about", LARGEST)
+        about = json.loads(text)
         found, network = about["format"], about["network"]
     except UNREADABLE as error:
         raise ArgumentError(
             "checkpoint",
             "one that `planner-jax train` wrote",
-            shown=f"{name!r} ({type(error).__name__})",
+            shown=f"{name!r} ({name_damage(error)})",
         ) from error
     if found != FORMAT or about["features"] != FEATURES:
         raise ArgumentError(

@@ -14,8 +14,8 @@ import jax
 import numpy as np
 import orbax.checkpoint as orbax
 
-from planner_jax.host.files import open_plain, replacing
-from planner_jax.runs.manifest import JsonError, parse_written, to_write
+from planner_jax.host.files import read_plain, replacing
+from planner_jax.runs.manifest import LARGEST, JsonError, parse_written, to_write
 
 
 class KeptParts:
@@ -50,8 +50,7 @@ class KeptParts:
             like: parameters with the shapes and types of the stored parameters, of any values.
         """
         try:
-            with open_plain(self._note(number)) as file:
-                note = parse_written(file.read())
+            note = parse_written(read_plain(self._note(number), LARGEST))
             found = jax.device_get(self._keeper.restore(self._place(number), like))
             if _digest(found) == note["sha256"]:
                 return found

@@ -31,8 +31,9 @@ from tqdm import tqdm
 
 from planner_jax.core.errors import ArgumentError
 from planner_jax.host import signals as stopping
-from planner_jax.host.files import open_plain
+from planner_jax.host.files import read_plain
 from planner_jax.runs.manifest import (
+    LARGEST,
     JsonError,
     parse_object,
     parse_written,
@@ -174,8 +175,7 @@ def read_rows(folder: Path) -> list[dict[str, Any]]:
     """
     shown = repr(str(folder))
     try:
-        with open_plain(folder / FILE) as file:
-            text = file.read()
+        text = read_plain(folder / FILE, LARGEST)
     except OSError as error:
         rule = f"the folder of a training, with its {FILE}"
         raise ArgumentError("run", rule, shown=f"{shown} ({error.strerror})") from None

@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import errno
 import json
 import os
 import struct
@@ -20,6 +21,8 @@ from planner_jax.core.rules import nodes_of
 from planner_jax.host.files import open_plain, replacing
 
 VERSION = 1
+LARGEST = 1 << 28  # [B] greatest size of a file of plans, and of all its arrays together
+_DIRECTORY, _LONGEST = 1 << 20, 1 << 16  # [B] greatest directory of an archive; [characters] header
 # Exceptions that NumPy and the archive's reader raise on a damaged file.
 UNREADABLE = (
     *(OSError, ValueError, KeyError, TypeError, EOFError, RuntimeError, MemoryError),
@@ -41,6 +44,10 @@ def save_arrays(path: str | os.PathLike, tree: PyTree) -> None:
     for name, array in arrays.items():
         if array.dtype.kind in "OSU":  # NumPy would pickle objects
             raise ArgumentTypeError(name, "an array of numbers", shown=str(array.dtype))
+    most = LARGEST - _DIRECTORY
+    if (size := sum(array.nbytes for array in arrays.values())) > most:
+        rule = f"of at most {most} bytes; save parts of the batch, as pj.take(plans, k) gives them"
+        raise ArgumentError("plans", rule, shown=f"{size} bytes")
     with replacing(path) as scratch, open(scratch, "wb") as file:
         np.savez(file, **{_HEADER: np.array(header), **arrays})  # type: ignore[arg-type]
 
@@ -79,18 +86,51 @@ def _other_file(
 
 def _read(path: str | os.PathLike) -> tuple[object, object, dict[str, np.ndarray]]:
     try:
-        # NumPy would not close a broken file that it has opened itself.
-        with open_plain(path) as raw, np.load(raw, allow_pickle=False) as file:
-            arrays = dict(file)
-        header = json.loads(str(arrays.pop(_HEADER)))
+        text, arrays = read_archive(path, _HEADER, LARGEST)
+        header = json.loads(text)
         version, name = header["version"], header["class"]
     except UNREADABLE as error:
         if isinstance(error, FileNotFoundError):
             raise PlanFileError("path", "a file of plans", str(path)) from None
         raise PlanFileError(
-            "path", "a whole file of plans", shown=f"{str(path)!r} ({type(error).__name__})"
+            "path", "a whole file of plans", shown=f"{str(path)!r} ({name_damage(error)})"
         ) from None
     return version, name, arrays
+
+
+def read_archive(
+    path: str | os.PathLike, header: str, most: int
+) -> tuple[str, dict[str, np.ndarray]]:
+    """Return the text of the array `header` of a NumPy archive, and its other arrays by name.
+
+    The file has at most `most` bytes, and so have all its arrays together. Nothing is unpickled. A
+    damaged archive raises one of `UNREADABLE`.
+    """
+    with open_plain(path, most) as file:
+        # An archive ends with the 22 bytes of its end record, which state the directory's size. A
+        # second record in front of them could name a directory of millions of members instead.
+        file.seek(-min(42, os.fstat(file.fileno()).st_size), os.SEEK_END)
+        end = file.read()
+        is_usual = end[-22:-18] == b"PK\5\6" and not end.startswith(b"PK\6\7")
+        if not is_usual or int.from_bytes(end[-10:-6], "little") > _DIRECTORY:
+            raise zipfile.BadZipFile("it is no archive of NumPy")
+        with zipfile.ZipFile(file) as archive:
+            size = sum(member.file_size for member in archive.infolist())
+        if size > most:
+            raise OSError(errno.EFBIG, f"its arrays are larger than {most} bytes", os.fspath(path))
+        file.seek(0)
+        # NumPy would not close a broken file that it has opened itself.
+        with np.load(file, allow_pickle=False) as found:
+            arrays = dict(found)
+    text = arrays.pop(header)
+    if text.shape or text.dtype.kind != "U" or text.dtype.itemsize > 4 * _LONGEST:
+        raise ValueError(f"{header} is no text")
+    return str(text), arrays
+
+
+def name_damage(error: Exception) -> str:
+    """Return why a file cannot be read: the reason of an `OSError`, or the class of the error."""
+    return getattr(error, "strerror", None) or type(error).__name__
 
 
 def leaves_by_name(tree: PyTree, prefix: str = "") -> dict[str, PyTree]:

@@ -1,22 +1,52 @@
-"""Functions that read regular files only, and write files atomically."""
+"""Functions that read regular files of bounded size, and write files atomically.
+
+All readers of users' files open them here, so that no pipe blocks and no file fills the memory.
+"""
 
 import contextlib
 import errno
 import os
 import stat
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
 
+LARGEST = 1 << 26  # [B] greatest size of a file whose reader states no bound of its own
 
-def open_plain(path: str | os.PathLike) -> BinaryIO:
-    """Open a regular file to read bytes; raise `OSError` for a folder, a pipe or a device."""
+
+def open_plain(path: str | os.PathLike, most: int = LARGEST) -> BinaryIO:
+    """Open a regular file of at most `most` bytes to read bytes; links are followed.
+
+    Raises:
+        OSError: the file cannot be read, is larger, or is a folder, a pipe, a socket or a device.
+    """
     # Without O_NONBLOCK, opening a pipe waits for a writer.
     handle = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
-    if not stat.S_ISREG(os.fstat(handle).st_mode):
+    found = os.fstat(handle)
+    if not stat.S_ISREG(found.st_mode) or found.st_size > most:
         os.close(handle)
-        raise OSError(errno.EINVAL, "it is no plain file", os.fspath(path))
+        is_large = stat.S_ISREG(found.st_mode)
+        problem = f"it is larger than {most} bytes" if is_large else "it is no plain file"
+        raise OSError(errno.EFBIG if is_large else errno.EINVAL, problem, os.fspath(path))
     return os.fdopen(handle, "rb")
+
+
+def read_plain(path: str | os.PathLike, most: int = LARGEST) -> bytes:
+    """Return the content of a regular file of at most `most` bytes; see `open_plain` for errors."""
+    with open_plain(path, most) as file:
+        content = file.read(most + 1)  # the file may grow after it is opened
+    if len(content) > most:
+        raise OSError(errno.EFBIG, f"it is larger than {most} bytes", os.fspath(path))
+    return content
+
+
+def crc32_of(file: BinaryIO) -> int:
+    """Return the CRC-32 checksum of the remainder of an open file, which is read in blocks."""
+    found = 0
+    while block := file.read(1 << 20):
+        found = zlib.crc32(block, found)
+    return found
 
 
 @contextlib.contextmanager

@@ -6,9 +6,9 @@ from typing import Any
 
 import yaml
 
-from planner_jax.host.files import open_plain
+from planner_jax.host.files import read_plain
 
-_LARGEST = 1 << 20  # [B], greatest size of a file
+LARGEST = 1 << 16  # [B] greatest size of a file
 
 Value = Any  # a field's value: text, number, list of texts and numbers, dictionary, or None
 
@@ -20,10 +20,7 @@ def read_fields(path: str | os.PathLike) -> dict[str, Value]:
         ValueError: the file holds no fields; the message says what it must be.
         OSError: the file cannot be read.
     """
-    with open_plain(path) as file:
-        text = file.read(_LARGEST + 1)
-    if len(text) > _LARGEST:
-        raise ValueError(f"must be at most {_LARGEST} bytes")
+    text = read_plain(path, LARGEST)
     try:
         fields = yaml.load(text, _Loader)
     except yaml.YAMLError as error:
@@ -45,11 +42,12 @@ class _Loader(yaml.SafeLoader):
         return super().compose_node(parent, index)
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> Value:
-        names = [key.value for key, _ in node.value]
+        names: set[str] = set()
         for key, _ in node.value:
-            if names.count(key.value) > 1:
+            if str(key.value) in names:
                 problem = f"{key.value} only once"
                 raise yaml.MarkedYAMLError(None, None, problem, key.start_mark)
+            names.add(str(key.value))
         return super().construct_mapping(node, deep)
 
 

@@ -16,11 +16,12 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from pyarrow import dataset
 
-from planner_jax.host.files import open_plain, replacing
+from planner_jax.host.files import crc32_of, open_plain, replacing
 from planner_jax.runs.manifest import Entries, Row
 
 # Number of rows in one row group of a Parquet file, the smallest unit that can be read, about 3 MB.
 ROW_GROUP = 2048
+_LARGEST = 1 << 30  # [B] greatest size of a part that is read
 _RECORD = b"part"  # key of a part's record in the metadata of its file
 _NAME = re.compile(r"part-([0-9]{6,12})-([0-9a-f]{8})\.parquet")
 
@@ -56,16 +57,15 @@ def number_of(path: Path) -> int:
 def check_part(path: Path) -> Entries:
     """Return the JSON metadata of a file of rows; raise `DamagedPart` if the file is damaged."""
     number_of(path)
-    with open_plain(path) as file:
-        content = file.read()
-    if f"{zlib.crc32(content):08x}" != path.stem.rpartition("-")[2]:
-        raise DamagedPart("is damaged: its checksum is not the one in its name")
-    try:
-        with pq.ParquetFile(pa.BufferReader(content)) as file:
-            record = json.loads((file.schema_arrow.metadata or {})[_RECORD])
-            return {**record, "num": file.metadata.num_rows}
-    except (pa.ArrowException, OSError, KeyError, TypeError, ValueError):
-        raise DamagedPart("is not a part of a run") from None
+    with open_plain(path, _LARGEST) as file:
+        if f"{crc32_of(file):08x}" != path.stem.rpartition("-")[2]:
+            raise DamagedPart("is damaged: its checksum is not the one in its name")
+        try:
+            with pq.ParquetFile(file) as part:
+                record = json.loads((part.schema_arrow.metadata or {})[_RECORD])
+                return {**record, "num": part.metadata.num_rows}
+        except (pa.ArrowException, OSError, KeyError, TypeError, ValueError):
+            raise DamagedPart("is not a part of a run") from None
 
 
 class Dataset:

@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from planner_jax.core.errors import ArgumentError, PlannerJaxError
-from planner_jax.host.files import open_plain
+from planner_jax.host.files import read_plain
 
 FORMAT = 2  # version number of the format of all files in a run's folder
 MANIFEST = "manifest.json"
-_LARGEST = 1 << 26  # [bytes] greatest size of a file that is read
+LARGEST = 1 << 22  # [B] greatest size of a file that is read
 
 Entries: TypeAlias = dict[str, Any]  # entries of a JSON object, such as a manifest
 Row: TypeAlias = Mapping[str, Any]  # values of a row by column
@@ -72,14 +72,11 @@ def read_written(path: Path, name: str, what: str) -> Entries:
     """
     shown = repr(str(path.parent))
     try:
-        with open_plain(path) as file:
-            text = file.read(_LARGEST + 1)
-        if len(text) > _LARGEST:
-            raise JsonError(f"is larger than {_LARGEST} bytes")
-        return parse_written(text)
-    except OSError:
+        return parse_written(read_plain(path, LARGEST))
+    except OSError as error:
         rule = f"the folder of {what}, with its {path.name}"
-        raise ArgumentError(name, rule, shown=shown) from None
+        why = "" if isinstance(error, FileNotFoundError) else f" ({error.strerror})"
+        raise ArgumentError(name, rule, shown=f"{shown}{why}") from None
     except JsonError as error:
         rule = f"{what} whose {path.name} is whole"
         raise ArgumentError(name, rule, shown=f"{shown}, where it {error}") from None

@@ -3,12 +3,10 @@
 import contextlib
 import functools
 import os
-import zlib
 from collections import deque
 from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TypedDict
 
 import numpy as np
@@ -17,7 +15,7 @@ from tqdm import tqdm
 
 from planner_jax.core.planner import Planner
 from planner_jax.host import signals as stopping
-from planner_jax.host.files import open_plain
+from planner_jax.host.files import crc32_of, open_plain
 from planner_jax.host.machine import as_here
 from planner_jax.runs.columns import RefereedBatch, rows_of
 from planner_jax.runs.dataset import Dataset, encode
@@ -29,6 +27,7 @@ from planner_jax.runs.summary import percent
 from planner_jax.runs.timing import CompileClock, Stopwatch, measure, measure_warm
 from planner_jax.sweep.sweep import Sweep
 
+_LARGEST = 1 << 32  # [B] greatest size of a file that a setting names
 _PENDING = 2  # greatest number of chunks that are judged or written while the next chunk is planned
 _MEASURED = {
     "compile_seconds": "JAX tracing, lowering, compiling or reading its cache, while chunks were "
@@ -120,9 +119,8 @@ def _files_of(parameters: Entries) -> dict[str, int]:
     for name, value in parameters.items():
         path = value.partition(":")[2] if isinstance(value, str) else ""
         if os.path.isfile(path):
-            with open_plain(Path(path)) as file:
-                for block in iter(lambda file=file: file.read(1 << 20), b""):
-                    found[name] = zlib.crc32(block, found.get(name, 0))
+            with open_plain(path, _LARGEST) as file:
+                found[name] = crc32_of(file)
     return found
 
 

@@ -6,14 +6,14 @@ import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from planner_jax.core.errors import ArgumentError
-from planner_jax.host.files import open_plain, replacing
+from planner_jax.core.plan_files import LARGEST, UNREADABLE, read_archive
+from planner_jax.host.files import replacing
 from planner_jax.planning.plan import plan as plan_all
 from planner_jax.runs.columns import COUNT, NUMBER, Column, leaves_of
 from planner_jax.runs.summary import percent
@@ -86,10 +86,9 @@ class StateFile:
             return like
         leaves, structure = jax.tree.flatten(like)
         try:
-            with open_plain(self.path) as file, np.load(file) as stored:
-                identity = str(stored["identity"])
-                found = [stored[f"leaf{k}"] for k in range(len(leaves))]
-        except (OSError, ValueError, KeyError, TypeError, EOFError, BadZipFile) as error:
+            identity, stored = read_archive(self.path, "identity", LARGEST)
+            found = [stored[f"leaf{k}"] for k in range(len(leaves))]
+        except UNREADABLE as error:
             why = " ".join(str(error).split())
             raise ArgumentError("state", f"a whole file: {why}", self.path.name) from None
         if identity != self.identity:

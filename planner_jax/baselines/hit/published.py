@@ -13,7 +13,7 @@ import numpy as np
 
 from planner_jax.core.choices import require
 from planner_jax.core.errors import ArgumentError
-from planner_jax.host.files import open_plain
+from planner_jax.host.files import read_plain
 from planner_jax.task.hit import court
 from planner_jax.task.hit.court import landing
 from planner_jax.task.hit.spec import DRAG
@@ -23,6 +23,7 @@ _FILE_NAME = re.compile(r"([1-4])_([1-4])_([1-4])_([plb])\.csv")
 _FILE_PLANNER = {"p": "bat", "l": "bat-lite", "b": "juggle"}
 _SERVE_COLUMNS = ("serve position", "serve velocity", "landing position", "target")
 _HIT_COLUMNS = (("hitting position", 3), ("hitting velocity", 3), ("hitting attitude", 4))
+_LARGEST = 1 << 20  # [B] greatest size of a trial file; the published files have 1,000 lines
 _LISTED = 5  # greatest number of problems that an error message lists
 
 # Line number -> 12 numbers of a serve (`Trial.numbers`: positions, velocity, target), and whether
@@ -94,8 +95,7 @@ def _find_trial_files(folder) -> dict[int, dict[str, Path]]:
 def _read_file(path: Path, problems: list[str]) -> _Table:
     """Read the table of one trial file; append a problem for each line that does not parse."""
     try:
-        with open_plain(path) as file:
-            lines = file.read().decode("utf-8-sig", errors="replace").splitlines()
+        lines = read_plain(path, _LARGEST).decode("utf-8-sig", errors="replace").splitlines()
     except OSError as error:
         problems.append(f"{path.name}: file must be readable, got {error.strerror}")
         return {}
