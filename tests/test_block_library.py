@@ -1,4 +1,6 @@
 import dataclasses
+import json
+import zlib
 from typing import Any
 
 import jax
@@ -228,11 +230,10 @@ def test_a_library_of_other_cases_is_rejected_with_both_hashes():
         planner.check(pj.block.case(np.ones(3), np.ones(3), angles=np.zeros(6)))
 
 
-def test_a_file_holds_the_library_and_is_mapped(tmp_path):
+def test_a_file_holds_the_library_bit_for_bit(tmp_path):
     library, path = make_library(homes=2), tmp_path / "a.lib"
     save_library(path, library)
     again = load_library(path)
-    assert isinstance(again.table.rows, np.memmap)
     for a, b in zip(jax.tree.leaves(library), jax.tree.leaves(again), strict=True):
         assert np.asarray(a).dtype == np.asarray(b).dtype
         np.testing.assert_array_equal(a, b)
@@ -241,28 +242,99 @@ def test_a_file_holds_the_library_and_is_mapped(tmp_path):
     assert not list(tmp_path.glob("*.tmp"))
 
 
-def test_damaged_files_are_rejected_in_one_line(tmp_path, monkeypatch):
+def assert_rejected(path, says):
+    with pytest.raises(ArgumentError, match=says) as caught:
+        load_library(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_damaged_files_are_rejected_in_one_line(tmp_path):
     path = tmp_path / "a.lib"
-
-    def rejects(says):
-        with pytest.raises(ArgumentError, match=says) as caught:
-            load_library(path)
-        assert "\n" not in str(caught.value)
-
-    rejects("^library must be a file, got .* `planner-jax library build .*a.lib` makes one$")
+    missing = "^library must be a file, got .* `planner-jax library build .*a.lib` makes one$"
+    assert_rejected(path, missing)
     path.write_bytes(b"PK\x03\x04 something else\n")
-    rejects("^library must be a file of a block library, got")
+    assert_rejected(path, "^library must be a file of a block library, got")
     save_library(path, make_library())
     whole = path.read_bytes()
     path.write_bytes(whole[:-1])
-    rejects(f"^library must be a whole file of {len(whole)} bytes, got {len(whole) - 1} in")
+    rule = f"^library must be a whole file of {len(whole)} bytes, got {len(whole) - 1} in"
+    assert_rejected(path, rule)
     path.write_bytes(whole[:100])
-    rejects("is cut off$")
-    path.write_bytes(whole.replace(b"library 2\n", b"library 9\n", 1))
-    rejects("^library must be of version 2, got version 9 in")
+    assert_rejected(path, "is cut off or damaged$")
+    path.write_bytes(whole.replace(b"library 3 ", b"library 9 ", 1))
+    assert_rejected(path, "^library must be of version 3, got version 9 in")
+    path.write_bytes(b"planner-jax block library 2\n" + whole)
+    assert_rejected(path, "^library must be of version 3, got version 2 in")
     at = whole.index(np.float32(0.806).tobytes())  # byte position of the pole's x coordinate
     path.write_bytes(whole[:at] + np.float32(0.7).tobytes() + whole[at + 4 :])
-    rejects("^library must have the setting [0-9a-f]{12}, got [0-9a-f]{12} in")
+    assert_rejected(path, "is cut off or damaged in scene")
+
+
+def test_every_flipped_bit_of_a_library_is_found(tmp_path):
+    path = tmp_path / "a.lib"
+    save_library(path, make_library())
+    whole, rng = path.read_bytes(), np.random.default_rng(0)
+    header = whole.index(b"\n", whole.index(b"\n") + 1)
+    places = {*range(40), header, len(whole) - 1, *rng.integers(0, len(whole), 400).tolist()}
+    for place in sorted({*places, *rng.integers(0, header, 200).tolist()}):
+        flipped = bytearray(whole)
+        flipped[place] ^= 1 << int(rng.integers(8))
+        path.write_bytes(flipped)
+        assert_rejected(path, "^library must")
+
+
+def forge(whole, change, *blocks):
+    """Return a library's bytes with a changed header, whose checksums fit, and blocks appended."""
+    first, second, rest = whole.split(b"\n", 2)
+    header = json.loads(second)
+    change(header)
+    second = json.dumps(header).encode() + b"\n"
+    first = first[:-8] + f"{zlib.crc32(second):08x}\n".encode()
+    return first + second + rest + b"".join(blocks)
+
+
+def edit(*places, to):
+    def change(header):
+        inner = header
+        for place in places[:-1]:
+            inner = inner[place]
+        inner[places[-1]] = to
+
+    return change
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        edit("arrays", "homes", 0, to="|O"),
+        edit("arrays", "homes", 0, to="<f8"),
+        edit("arrays", "rows", 0, to="<i4"),
+        edit("arrays", "rows", 0, to=">f4"),
+        edit("arrays", "rows", 0, to="<f2"),
+        edit("arrays", "homes", 1, to=[2, 3]),
+        edit("arrays", "homes", 1, to=[-1, -6]),
+        edit("arrays", "homes", 1, to=[10**40, 10**40]),
+        edit("arrays", "homes", 1, to="no shape"),
+        edit("arrays", "homes", 1, to=[1.5]),
+        edit("arrays", "homes", to=3),
+        edit("arrays", to=[]),
+        edit("arrays", "more", to=["|b1", [0], 0]),
+        edit("layout", "outer", 0, "axis", to=7),
+        edit("layout", "outer", 0, "side", to="x"),
+        edit("layout", "outer", 0, "cells", to=[2, -2]),
+        edit("layout", "outer", to=[]),
+        edit("layout", to=None),
+        edit("arm", to={}),
+        edit("fingerprint", to="0" * 12),
+        lambda header: header.pop("fingerprint"),
+        lambda header: header["arrays"].pop("homes"),
+    ],
+)
+def test_a_forged_header_is_rejected_before_its_arrays_are_used(tmp_path, change):
+    path = tmp_path / "a.lib"
+    save_library(path, make_library())
+    path.write_bytes(forge(path.read_bytes(), change))
+    assert_rejected(path, "^library must")
 
 
 @pytest.fixture

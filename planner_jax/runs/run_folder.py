@@ -7,11 +7,14 @@ be resumed. Only the process that holds a lock on the file `.lock` writes to the
 import contextlib
 import dataclasses
 import datetime
+import errno
 import fcntl
 import json
 import os
+import re
 import shutil
 import socket
+import stat
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -28,6 +31,7 @@ from planner_jax.runs.manifest import MANIFEST, Entries, Row, read_written, to_w
 LOCK = ".lock"
 # Greatest number of rejected plans, and number of all plans, that one figure of a run shows.
 FAILURES_SHOWN, _CASES_SHOWN = 12, 60
+_OWNER = re.compile(r"[0-9]+ on .*, since [0-9T:+-]+")  # text of the lock
 _TRIES, _BETWEEN = 20, 0.01  # number of attempts to take the lock, and [s] pause between attempts
 
 
@@ -49,8 +53,8 @@ class RunFolder:
     def require_new(self) -> None:
         """Raise `ArgumentError` unless a new run can be written to this path; write nothing."""
         try:
-            if (self.path / LOCK).exists():
-                with self._hold_lock():
+            if os.path.lexists(self.path / LOCK):
+                with self._hold_lock(os.O_RDONLY, fcntl.LOCK_SH):
                     pass
             if self.path.is_dir():
                 self._require_empty()
@@ -81,33 +85,49 @@ class RunFolder:
         except OSError as error:
             self._remove_made()
             raise self._unwritable(error) from None
-        with self._hold_lock():
-            self._remove_scratch()
-            yield
-
-    @contextlib.contextmanager
-    def _hold_lock(self) -> Iterator[None]:
-        with contextlib.ExitStack() as opened:
+        with self._hold_lock(os.O_RDWR | os.O_CREAT, fcntl.LOCK_EX) as handle:
+            for folder in self._folders():
+                rule = f"a folder whose {folder.name} is no link to another folder"
+                self.require(not folder.is_symlink(), rule, repr(str(self.path)))
+            since = datetime.datetime.now().astimezone().isoformat(timespec="seconds")
+            owner = f"{os.getpid()} on {socket.gethostname()}, since {since}"
             try:
-                handle = os.open(self.path / LOCK, os.O_RDWR | os.O_CREAT | os.O_NONBLOCK, 0o644)
-                opened.callback(os.close, handle)
-                self._acquire(handle)
-                since = datetime.datetime.now().astimezone().isoformat(timespec="seconds")
-                owner = f"{os.getpid()} on {socket.gethostname()}, since {since}"
                 os.ftruncate(handle, 0)
                 os.pwrite(handle, owner.encode(), 0)
             except OSError as error:
                 raise self._unwritable(error) from None
+            self._remove_scratch()
             yield
 
-    def _acquire(self, handle: int) -> None:
+    @contextlib.contextmanager
+    def _hold_lock(self, flags: int, kind: int) -> Iterator[int]:
+        """Hold a lock of the kind `fcntl.LOCK_*` on the file `.lock`; provide the open file."""
+        lock = self.path / LOCK
+        with contextlib.ExitStack() as opened:
+            try:
+                if os.path.lexists(lock) and not stat.S_ISREG(lock.lstat().st_mode):
+                    raise OSError(errno.EINVAL, f"its {LOCK} is no plain file")
+                handle = os.open(lock, flags | os.O_NONBLOCK | os.O_NOFOLLOW, 0o644)
+                opened.callback(os.close, handle)
+                self._acquire(handle, kind)
+            except OSError as error:
+                raise self._unwritable(error) from None
+            yield handle
+
+    def _acquire(self, handle: int, kind: int) -> None:
+        """Lock an open file; raise if another process holds it or another program wrote it."""
+        is_locked = False
         for _ in range(_TRIES):
             with contextlib.suppress(BlockingIOError):
-                return fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                fcntl.flock(handle, kind | fcntl.LOCK_NB)
+                is_locked = True
+                break
             time.sleep(_BETWEEN)
-        owner = os.pread(handle, 200, 0).decode(errors="replace")
+        owner = os.pread(handle, 1000, 0).decode(errors="replace")
+        rule = f"a folder without the {LOCK} of another program"
+        self.require(not owner or bool(_OWNER.fullmatch(owner)), rule, repr(str(self.path)))
         shown = f"{str(self.path)!r}, owned by process {owner}"
-        raise ArgumentError(self.name, "a folder that no other process writes", shown=shown)
+        self.require(is_locked, "a folder that no other process writes", shown)
 
     def _unwritable(self, error: OSError | None = None) -> ArgumentError:
         why = f" ({error.strerror})" if error else ""
@@ -135,8 +155,11 @@ class RunFolder:
             for folder in self._made:
                 folder.rmdir()
 
+    def _folders(self) -> tuple[Path, ...]:
+        return self.plans.folder, self.baselines.folder, self.figures
+
     def _remove_scratch(self) -> None:
-        for folder in (self.path, self.plans.folder, self.baselines.folder, self.figures):
+        for folder in (self.path, *self._folders()):
             for path in folder.iterdir() if folder.is_dir() else ():
                 if is_scratch(path):
                     path.unlink(missing_ok=True)

@@ -82,7 +82,12 @@ def start_sweep(
             "sessions": [session],
         }
         with folder.create(manifest):
-            return _finish(folder, manifest, maker, {}, others, progress)
+            try:
+                return _finish(folder, manifest, maker, {}, others, progress)
+            except ArgumentError:
+                # A case is invalid, so the run can never be finished. Its folder is deleted.
+                folder.discard()
+                raise
 
 
 def resume_sweep(
@@ -151,14 +156,23 @@ def _maker_of(sweep: Sweep, settings: SweepSettings) -> Maker:
 
 
 def _sound_parts(folder: RunFolder, manifest: Entries) -> dict[int, Record]:
-    """Return the records of undamaged files of rows, by number, and delete every other file."""
-    files, found = folder.plans.files(), {}
-    for path in files:
+    """Return the records of undamaged files of rows, by number, and delete damaged ones.
+
+    If `plans` holds anything that is not named like a part, an error names it, and nothing is
+    deleted.
+    """
+    files, found = {}, {}
+    for path in folder.plans.files():
         shown = f"{str(path)!r}, which is not"
         folder.require(path.is_file(), "a run whose parts are regular files", shown)
-    for path in files:
         try:
-            number, record = number_of(path), check_part(path)
+            files[path] = number_of(path)
+        except DamagedPart as error:
+            shown = f"{str(path)!r}, which {error}; move it elsewhere"
+            folder.require(False, "a run whose plans holds parts alone", shown)
+    for path, number in files.items():
+        try:
+            record = check_part(path)
             if (record.get("run"), record.get("number")) != (manifest["run"], number):
                 raise DamagedPart("is of another run or number")
             if number in found:
@@ -201,10 +215,6 @@ def _finish(
             folder.baselines.write_rows(plan_baselines(maker.sweep, source, others, tally.example))
         write_report(folder)
         return folder.write_manifest({**manifest, "state": "complete"})
-    except ArgumentError:
-        # A case is invalid, so the run can never be finished. Its folder is deleted.
-        folder.discard()
-        raise
     except (KeyboardInterrupt, WorkersFailed, OSError) as error:
         session.setdefault("seconds", watch.lap())
         # The disk may be full, in which case the manifest cannot be written either.

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from planner_jax.core.errors import ArgumentError
 from planner_jax.runs.manifest import parse_object
-from planner_jax.runs.run_folder import RunFolder
+from planner_jax.runs.run_folder import LOCK, RunFolder
 from planner_jax.sweep.hit.sweep import HitSweep
 from planner_jax.sweep.run import resume_sweep
 from tests.faults.commands import is_one_line, run
@@ -37,6 +37,12 @@ def test_damage_is_refused_in_one_line_or_mended_or_changes_nothing(runs, what, 
 
 def manifest_of(out):
     return parse_object((out / "manifest.json").read_text())
+
+
+def tree_of(folder):
+    """Return every path within a folder except its lock, with the bytes of files."""
+    paths = sorted(path for path in folder.rglob("*") if path.name != LOCK)
+    return [(path, path.read_bytes() if path.is_file() else None) for path in paths]
 
 
 def assert_resumed(runs, out, *told, planned=None):
@@ -162,11 +168,78 @@ def test_a_pipe_in_the_place_of_the_lock_is_not_waited_for(tmp_path):
         RunFolder(tmp_path).require_new()
 
 
-def test_what_is_no_part_of_the_run_is_removed_from_its_rows(runs, tmp_path):
+@pytest.mark.parametrize("make", ["symlink_to", "hardlink_to", "write_bytes"])
+def test_the_lock_is_not_written_into_a_file_of_another_program(runs, tmp_path, make):
+    thesis, content = tmp_path / "thesis.txt", b"all of it"
+    thesis.write_bytes(content)
+    for command in (("report",), ("sweep", "hit", "--num", "3", "--out")):
+        out = copy_run(runs, "whole", tmp_path) if command == ("report",) else tmp_path / "new"
+        out.mkdir(exist_ok=True)
+        (out / LOCK).unlink(missing_ok=True)
+        getattr(out / LOCK, make)(content if make == "write_bytes" else thesis)
+        ended = run(*command, out)
+        assert is_one_line(ended) and ended.code == 2 and LOCK in ended.err
+        assert {path.read_bytes() for path in (thesis, out / LOCK)} == {content}
+
+
+def test_a_folder_that_is_not_empty_is_refused_before_its_lock_is_written(tmp_path):
+    (tmp_path / "mine.txt").write_text("mine")
+    for text in (None, "", "12 on a.b, since 2026-01-01T10:00:00+01:00"):
+        if text is not None:
+            (tmp_path / ".lock").write_text(text)
+        kept = [(path, path.read_text()) for path in sorted(tmp_path.iterdir())]
+        with pytest.raises(ArgumentError, match="out must be a new or empty folder"):
+            RunFolder(tmp_path).require_new()
+        assert [(path, path.read_text()) for path in sorted(tmp_path.iterdir())] == kept
+
+
+def test_parts_that_are_not_of_the_run_are_planned_again(runs, tmp_path):
     out = copy_run(runs, "begun", tmp_path)
     part = sorted((out / "plans").iterdir())[0]
     crc = part.stem.rpartition("-")[2]
-    names = ("part-999999-00000000.parquet", f"part-{'9' * 200}-00000000.parquet", "notes.txt")
-    for name in (*names, f"part-0000000-{crc}.parquet"):
+    for name in ("part-999999-00000000.parquet", f"part-0000000-{crc}.parquet"):
         (out / "plans" / name).write_bytes(part.read_bytes())
-    assert_resumed(runs, out, "is not a part of a run", "is a duplicate", planned=4)
+    assert_resumed(runs, out, "checksum is not the one in its name", "is a duplicate", planned=2)
+
+
+@pytest.mark.parametrize("name", ["notes.txt", f"part-{'9' * 200}-00000000.parquet"])
+def test_a_file_that_no_run_writes_is_named_and_nothing_is_deleted(runs, tmp_path, name):
+    out = copy_run(runs, "begun", tmp_path)
+    part = sorted((out / "plans").iterdir())[0]
+    part.write_bytes(b"damaged")
+    (out / "plans" / name).write_text("mine")
+    kept = tree_of(out)
+    ended = run("sweep", "hit", "--resume", "--out", out)
+    assert is_one_line(ended) and ended.code == 2 and f"{name}', which is not a part" in ended.err
+    assert tree_of(out) == kept
+
+
+@pytest.mark.parametrize("name", ["plans", "baselines", "figures"])
+@pytest.mark.parametrize("command", [("sweep", "hit", "--resume", "--out"), ("report",)])
+def test_a_link_in_the_place_of_a_folder_of_a_run_is_not_followed(runs, tmp_path, name, command):
+    out = copy_run(runs, "whole", tmp_path)
+    victim = tmp_path / "victim"
+    (out / name).mkdir(exist_ok=True)
+    (out / name).rename(victim)
+    (out / name).symlink_to(victim)
+    (victim / "thesis.txt").write_text("mine")
+    (victim / ".1.tmp.draft").write_text("mine too")
+    kept = tree_of(victim)
+    ended = run(*command, out)
+    assert is_one_line(ended) and f"{name} is no link to another folder" in ended.err
+    assert tree_of(victim) == kept
+
+
+def test_an_invalid_argument_does_not_delete_the_rows_of_a_resumed_run(runs, tmp_path, monkeypatch):
+    out = copy_run(runs, "begun", tmp_path)
+    kept = tree_of(out / "plans")
+
+    def fail(*_):
+        raise ArgumentError("wind", "calm")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(HitSweep, "plan", fail)
+        with pytest.raises(ArgumentError, match="wind must be calm"):
+            resume_sweep(TASK, out, progress=False)
+    assert tree_of(out / "plans") == kept
+    assert_resumed(runs, out)

@@ -1,10 +1,12 @@
 """Build libraries of arm motions that block balls; repair them after an obstacle has moved."""
 
+import contextlib
 import dataclasses
 import functools
+import io
 import json
 import os
-import shutil
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -16,7 +18,7 @@ from numpy.typing import ArrayLike
 from tqdm import tqdm
 
 from planner_jax.baselines.block.library.cells import Layout, Tunnels, tunnels
-from planner_jax.baselines.block.library.file import BUILD_VERSION, save_library
+from planner_jax.baselines.block.library.file import BUILD_VERSION, LARGEST, save_library
 from planner_jax.baselines.block.library.pairs import (
     BentPair,
     PairCase,
@@ -37,8 +39,9 @@ from planner_jax.baselines.block.library.table import (
 )
 from planner_jax.core.arithmetic import host_leaf
 from planner_jax.core.choices import require
+from planner_jax.core.plan_files import UNREADABLE
 from planner_jax.core.protocol import are_solved
-from planner_jax.host.files import replacing
+from planner_jax.host.files import is_scratch, read_plain, replacing
 from planner_jax.planning.plan import plan
 from planner_jax.robot.arm import shield_pose
 from planner_jax.task.block.clearance import least_clearances
@@ -120,6 +123,8 @@ def build(
         for begin in range(0, len(feasible), size)
     ]
     rows = _empty_rows(len(homes), layout, StraightPair(setting, homes[0]))
+    rule = f"of stored motions of at most {LARGEST // 2} bytes"
+    require(rows.nbytes <= LARGEST // 2, "homes", rule, shown=f"{rows.nbytes} bytes")
     with _bar(len(homes) * len(feasible), "pairs", progress) as bar:
         for number, (k, pairs) in enumerate(work):
             found = parts.read(number)
@@ -356,15 +361,28 @@ class _Parts:
         }
         text = json.dumps(header, sort_keys=True)
         known = folder / "what.json"
+        found, is_own = "", not os.path.lexists(folder)
+        if folder.is_dir() and not folder.is_symlink():
+            is_own = not any(folder.iterdir())
+            with contextlib.suppress(OSError, ValueError, TypeError, RecursionError):
+                found = read_plain(known).decode(errors="replace")
+                is_own = set(header) <= set(json.loads(found))
+        rule = f"a path beside which {folder.name} holds parts of a library alone"
+        require(is_own, "library", rule, shown=f"another folder {str(folder)!r}")
         # Delete parts that an interrupted build of another library or code version has left.
-        if not known.exists() or known.read_text() != text:
+        if found != text:
             self.remove()
-            folder.mkdir(parents=True)
-            known.write_text(text)
+            folder.mkdir(parents=True, exist_ok=True)
+            with replacing(known) as scratch:
+                scratch.write_text(text)
 
     def read(self, number: int) -> np.ndarray | None:
+        """Return the rows of a part; None if there is no part that can be read."""
         path = self._folder / f"{number:05d}.npy"
-        return np.load(path, allow_pickle=False) if path.exists() else None
+        try:
+            return np.load(io.BytesIO(read_plain(path)), allow_pickle=False)
+        except UNREADABLE:
+            return None
 
     def write(self, number: int, rows: np.ndarray) -> None:
         path = self._folder / f"{number:05d}.npy"
@@ -372,5 +390,9 @@ class _Parts:
             np.save(file, rows, allow_pickle=False)
 
     def remove(self) -> None:
-        if self._folder.exists():
-            shutil.rmtree(self._folder)
+        """Remove the files of all parts, and the folder unless it holds other files."""
+        for path in self._folder.iterdir() if self._folder.exists() else ():
+            if is_scratch(path) or re.fullmatch(r"[0-9]{5,}\.npy|what\.json", path.name):
+                path.unlink()
+        with contextlib.suppress(OSError):
+            self._folder.rmdir()
