@@ -22,10 +22,14 @@ SOLVED = {
 
 
 def pieces(num, powers, axes, seed=0, duration=0.2):
-    """Return a `PiecewisePolynomial` of `num` random pieces, which are discontinuous at joints."""
+    """Return random pieces whose positions and velocities are continuous, up to rounding."""
     draw = np.random.default_rng(seed)
     coeffs = 6.0 * draw.normal(size=(num, powers, axes)) / 2.0 ** np.arange(powers)[:, None]
     durations = np.full(num, duration) + 0.01 * np.arange(num)
+    for k in range(1, num):
+        for axis in range(axes):
+            piece = np.polynomial.Polynomial(coeffs[k - 1, :, axis])
+            coeffs[k, :2, axis] = piece(durations[k - 1]), piece.deriv()(durations[k - 1])
     return pj.PiecewisePolynomial(coeffs=coeffs.astype(FLOAT), durations=durations.astype(FLOAT))
 
 

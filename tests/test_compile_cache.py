@@ -1,8 +1,12 @@
 import os
 import subprocess
 import sys
+import time
+import zlib
 
+import numpy as np
 import pytest
+import zstandard
 
 from planner_jax.cli import doctor
 from planner_jax.host import compile_cache
@@ -21,6 +25,14 @@ jax.monitoring.register_event_listener(lambda event, **_: hits.append(event))
 jax.jit(lambda x: x + 3)(1.0)
 print(pj.keep_compiled_programs(), "/jax/compilation_cache/cache_hits" in hits)
 """
+
+# Options of the compressor and contents: several blocks, one block, a run of equal bytes, nothing.
+FRAMES = (
+    ({}, np.random.default_rng(1).bytes(300_000)),
+    ({"write_checksum": True}, b"short"),
+    ({"write_content_size": False}, bytes(100_000)),
+    ({}, b""),
+)
 
 
 def run(**environment):
@@ -54,17 +66,43 @@ def test_without_a_cache_because_of_a_switch_or_its_folder_a_process_goes_on(tmp
     assert run(XDG_CACHE_HOME=str(tmp_path / "file")) == "None False"
 
 
-def test_programs_that_were_used_least_recently_are_deleted(tmp_path, monkeypatch):
-    monkeypatch.setattr(compile_cache, "LIMIT", 250)
+def test_programs_that_were_used_least_recently_are_deleted(tmp_path):
     for age, name in enumerate(("new", "middle", "old", "oldest")):
         (tmp_path / name).write_bytes(bytes(100))
         os.utime(tmp_path / name, times=(1e9 - age, 1e9 - age))
-    compile_cache._delete_oldest(tmp_path)
+    compile_cache._tidy(tmp_path, 250)
     assert {path.name for path in tmp_path.iterdir()} == {"new", "middle", "checked"}
-    (tmp_path / "more").write_bytes(bytes(200))
-    compile_cache._delete_oldest(tmp_path)  # The last check was less than an hour ago.
-    assert (tmp_path / "new").exists()
-    compile_cache._delete_oldest(tmp_path / "missing")
+    compile_cache._tidy(tmp_path / "missing", 250)
+
+
+def damage(path, content):
+    """Write other bytes to a stored program, some seconds ago."""
+    path.write_bytes(content)
+    os.utime(path, times=(time.time() - 10.0,) * 2)
+
+
+def test_programs_that_are_not_whole_are_deleted_and_no_other_files(tmp_path):
+    wholes = [zstandard.ZstdCompressor(**options).compress(data) for options, data in FRAMES]
+    cuts = [whole[:size] for whole in wholes for size in (0, 3, 4, 5, 8, len(whole) - 1)]
+    cuts += [wholes[0][: len(wholes[0]) // 2], wholes[0] + b"more"]
+    kept = [*wholes, zlib.compress(b"of JAX without Zstandard")]
+    for number, each in enumerate((*cuts, *kept)):
+        damage(tmp_path / f"jit_f-{number:02d}-cache", each)
+    (tmp_path / "jit_f-written-cache").write_bytes(b"")  # by another process, at this moment
+    damage(tmp_path / "mine.txt", b"")
+    compile_cache._tidy(tmp_path)
+    whole = {f"jit_f-{number:02d}-cache" for number in range(len(cuts), len(cuts) + len(kept))}
+    found = {path.name for path in tmp_path.iterdir()}
+    assert found == {*whole, "checked", "mine.txt", "jit_f-written-cache"}
+
+
+@pytest.mark.slow
+def test_a_program_that_is_cut_is_compiled_and_stored_again(tmp_path):
+    chosen = {"JAX_COMPILATION_CACHE_DIR": str(tmp_path)}
+    assert run(**chosen) == f"{tmp_path} False"
+    for path in tmp_path.glob("*-cache"):
+        damage(path, path.read_bytes()[:-9])
+    assert [run(**chosen) for _ in range(2)] == [f"{tmp_path} False", f"{tmp_path} True"]
 
 
 @pytest.mark.parametrize("switch", ["on", "off"])

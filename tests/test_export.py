@@ -1,12 +1,12 @@
 import re
 import sys
 import types
+from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
-from cflib.crazyflie.mem.trajectory_memory import Poly4D
-from flown_plans import PLANS, arm, bag, car, export_plan, matrices, quadrotor, table
+from flown_plans import PLANS, arm, bag, car, export_plan, matrices, pieces, quadrotor, table
 
 import planner_jax as pj
 from planner_jax.core.errors import ArgumentError, MissingExtra, install_line
@@ -16,6 +16,7 @@ from planner_jax.export.crazyflie import poly4d
 from planner_jax.export.setpoints import MOST, setpoints_of
 
 RATE = 50.0
+DATA = Path(__file__).parent / "data"
 
 
 def xyz(vector):
@@ -120,18 +121,40 @@ def test_where_ros_is_installed_a_plan_is_an_object_of_its_classes(monkeypatch, 
 
 
 @pytest.mark.parametrize("powers", [6, 8])
-def test_pieces_are_packed_as_by_the_crazyflies_own_library(tmp_path, powers):
+def test_the_table_for_a_crazyflie_and_its_packed_pieces_are_the_same(tmp_path, powers):
     plan = quadrotor(num=5, powers=powers)
     header, rows = table(export_plan(plan, to="crazyflie", out=tmp_path / "a.csv"))
     rows = rows.astype(np.float32)
     assert header[:3] == ["duration", "x^0", "x^1"] and header[9] == "y^0" and len(header) == 33
     np.testing.assert_array_equal(rows, poly4d(plan))
-    packed = b""
-    for duration, *coeffs in rows.tolist():
-        axes = [Poly4D.Poly(coeffs[8 * k : 8 * k + 8]) for k in range(4)]
-        packed += Poly4D(duration, *axes).pack()
     path = export_plan(plan, to="crazyflie", out=tmp_path / "a.bin")
-    assert path.read_bytes() == packed and len(packed) == 5 * 132
+    packed = np.fromfile(path, "<f4").reshape(5, 33)  # the duration comes last
+    np.testing.assert_array_equal(packed, np.roll(rows, -1, axis=1))
+
+
+def exact_quadrotor():
+    """Return a plan of two pieces whose coefficients are exact in float32, with a heading."""
+    first, powers = (np.arange(24.0).reshape(3, 8) - 11.0) / 8.0, np.arange(8)
+    then = first[:, ::-1].copy()
+    then[:, 0] = first @ 0.5**powers
+    then[:, 1] = first @ (powers * 0.5 ** np.maximum(powers - 1, 0))
+    coeffs = np.swapaxes([first, then], 1, 2).astype(np.float32)
+    durations = np.array([0.5, 1.25], np.float32)
+    path = pj.PiecewisePolynomial(coeffs=coeffs, durations=durations)
+    turn = np.array([[[0.25], [0.5]]], np.float32)
+    heading = pj.PiecewisePolynomial(coeffs=turn, durations=np.array([1.75], np.float32))
+    return quadrotor().replace(trajectory=path, heading=heading)
+
+
+def test_the_bytes_for_a_crazyflie_are_those_of_its_own_library(tmp_path):
+    lines = (DATA / "crazyflie.hex").read_text().splitlines()
+    stored = bytes.fromhex("".join(line for line in lines if not line.startswith("#")))
+    path = export_plan(exact_quadrotor(), to="crazyflie", out=tmp_path / "a.bin")
+    found, expected = (
+        np.frombuffer(each, "<f4").reshape(2, 33) for each in (path.read_bytes(), stored)
+    )
+    np.testing.assert_array_equal(found[:, [*range(24), 32]], expected[:, [*range(24), 32]])
+    np.testing.assert_allclose(found[:, 24:32], expected[:, 24:32], atol=1e-6)  # a fit of the yaw
 
 
 def test_pieces_are_the_trajectory_itself_without_those_that_take_no_time():
@@ -144,8 +167,10 @@ def test_pieces_are_the_trajectory_itself_without_those_that_take_no_time():
         expected = pj.evaluate(plan.trajectory, start + 0.5 * row[0])
         np.testing.assert_allclose(position, [*expected, 0.0], rtol=1e-5, atol=1e-6)
     assert not rows[:, 25:].any(), "yaw"
-    still = plan.trajectory.replace(durations=plan.trajectory.durations * np.float32([1, 0, 1]))
-    np.testing.assert_array_equal(poly4d(plan.replace(trajectory=still)), poly4d(plan)[[0, 2]])
+    path = plan.trajectory
+    coeffs, durations = (np.insert(each, 1, 0.0, axis=0) for each in (path.coeffs, path.durations))
+    still = path.replace(coeffs=coeffs, durations=durations)
+    np.testing.assert_array_equal(poly4d(plan.replace(trajectory=still)), poly4d(plan))
 
 
 def test_a_higher_degree_and_more_pieces_than_fit_are_refused():
@@ -192,6 +217,73 @@ def test_only_a_solved_finite_and_whole_plan_that_takes_time_is_exported(tmp_pat
     with pytest.raises(ArgumentError, match=f"^plan must {rule}"):
         export_file(tmp_path, plan, to=to)
     assert not list(tmp_path.iterdir())
+
+
+def recovered():
+    """Return a plan of a quadrotor with a recovery, cut from one continuous trajectory."""
+    path = pieces(3, 8, 3)
+    first, last = (jax.tree.map(lambda leaf: leaf[part], path) for part in (slice(2), slice(2, 3)))
+    return quadrotor().replace(trajectory=first, recovery=last)
+
+
+def edited(plan, field, change):
+    """Return a plan with one changed array, which a dotted name selects."""
+    *outer, name = field.split(".")
+    inner = getattr(plan, outer[0]) if outer else plan
+    new = inner.replace(**{name: change(np.asarray(getattr(inner, name)))})
+    return plan.replace(**{outer[0]: new}) if outer else new
+
+
+def negate(array):
+    return -array
+
+
+def double(array):
+    return 2.0 * array
+
+
+@pytest.mark.parametrize(
+    ("plan", "field", "change", "rule"),
+    [
+        (recovered(), "gravity", negate, r"have gravity from 0.1 to 100 m/s\^2, got -9.81"),
+        (recovered(), "gravity", lambda g: 1e-4 * g, "have gravity from 0.1 to 100"),
+        (recovered(), "gravity", lambda g: np.float32(np.nan), "have gravity from 0.1 to 100"),
+        (
+            recovered(),
+            "recovery.coeffs",
+            negate,
+            r"be continuous to 0.001, got a jump of .* in pos",
+        ),
+        (recovered(), "recovery.durations", negate, "be of durations >= 0, got -0.22 s"),
+        (recovered(), "trajectory.durations", negate, "take some time, got -0.19 s"),
+        (recovered(), "trajectory.durations", double, "be continuous to 0.001"),
+        (recovered(), "trajectory.coeffs", np.int32, "have floating-point numbers in trajectory"),
+        (
+            recovered(),
+            "recovery.durations",
+            np.int32,
+            "have floating-point numbers in recovery.dur",
+        ),
+        (recovered(), "gravity", np.int32, "have floating-point numbers in gravity, got int32"),
+        (car(), "time", negate, "take some time, got -0.4 s"),
+        (car(), "speed", np.int32, "have floating-point numbers in speed"),
+        (arm(), "motion.durations", negate, "take some time|be of durations"),
+        (arm(), "motion.durations", double, "be continuous to 0.001, got a jump"),
+        (arm(), "motion.coeffs", np.int64, "have floating-point numbers in motion.coeffs"),
+    ],
+)
+def test_a_plan_that_was_edited_to_be_impossible_is_not_exported(plan, field, change, rule):
+    setpoints_of(plan, RATE)
+    with pytest.raises(ArgumentError, match=f"^plan must {rule}"):
+        setpoints_of(edited(plan, field, change), RATE)
+
+
+def test_a_jump_of_the_velocity_alone_is_named():
+    coeffs = recovered().recovery.coeffs.copy()
+    coeffs[0, 1, 2] += 0.002
+    broken = recovered().replace(recovery=recovered().recovery.replace(coeffs=coeffs))
+    with pytest.raises(ArgumentError, match="a jump of 0.002 in velocities between two pieces$"):
+        setpoints_of(broken, RATE)
 
 
 @pytest.mark.parametrize("rate", [0.0, -5.0, np.nan, np.inf, 1.0, 1e7, "fast", [100.0], True])

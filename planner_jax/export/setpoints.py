@@ -22,6 +22,9 @@ from planner_jax.robot.quadrotor import QuadrotorPlan
 from planner_jax.trajectory.polynomial import PiecewisePolynomial
 
 MOST = 100_000  # greatest number of setpoints of a plan
+# [m, m/s], for arms [rad, rad/s], greatest jump of positions and velocities between two pieces.
+_GAP = 1e-3
+_GRAVITY = (0.1, 100.0)  # [m/s^2], least and greatest gravity of a plan that is exported
 DEFAULT_RATE = 100.0  # [Hz], setpoints per second
 
 Setpoints = QuadrotorSetpoints | CarSetpoints | ArmSetpoints
@@ -108,8 +111,16 @@ def robot_of(plan: Plan) -> Robot:
     solved = bool(is_solved(plan.status))
     require(solved, "plan", "solved", shown=f"the status {(*shown, plan.status)[0]}")
     _require_shapes(plan, robot)
+    _require_floats(plan, robot)
     if not 0.0 < robot.end(plan) < np.inf:
         raise ArgumentError("plan", "some time", verb="take", shown=f"{robot.end(plan):g} s")
+    if isinstance(plan, QuadrotorPlan):
+        low, high = _GRAVITY
+        rule = f"gravity from {low:g} to {high:g} m/s^2"
+        if not low <= float(plan.gravity) <= high:
+            raise ArgumentError("plan", rule, float(plan.gravity), verb="have")
+    if isinstance(plan, QuadrotorPlan | ArmPlan):
+        _require_continuous(plan.whole if isinstance(plan, QuadrotorPlan) else plan.motion)
     return robot
 
 
@@ -131,6 +142,30 @@ def _require_shapes(plan: Plan, robot: Robot) -> None:
         if not fits or 0 in shape:
             text = ", ".join(str(sizes.get(axis, axis)) for axis in expected)
             raise ArgumentError("plan", f"{name} of the shape ({text})", shape, verb="have")
+
+
+def _require_floats(plan: Plan, robot: Robot) -> None:
+    names = {field.name for field in dataclasses.fields(robot.plan)} - {"status", "iterations"}
+    for name, leaf in leaves_by_name(plan).items():
+        kind = np.asarray(leaf).dtype
+        if name.partition(".")[0] in names and kind not in (np.float32, np.float64):
+            rule = f"floating-point numbers in {name}"
+            raise ArgumentError("plan", rule, verb="have", shown=str(kind))
+
+
+def _require_continuous(path: PiecewisePolynomial) -> None:
+    """Raise unless pieces take time, and positions and velocities agree where pieces meet."""
+    coeffs, durations = (np.asarray(each, float) for each in (path.coeffs, path.durations))
+    least = float(durations.min())
+    require(least >= 0.0, "plan", "of durations >= 0", shown=f"{least:g} s")
+    taken = durations > 0.0
+    coeffs, durations = coeffs[taken], durations[taken][:-1, None]
+    powers = np.arange(coeffs.shape[1])
+    for order, quantity in enumerate(("positions", "velocities")):
+        slopes = powers**order * durations ** np.maximum(powers - order, 0)
+        gaps = np.abs(np.einsum("mk,mki->mi", slopes, coeffs[:-1]) - coeffs[1:, order])
+        shown = f"a jump of {np.max(gaps, initial=0.0):.3g} in {quantity} between two pieces"
+        require(not np.any(gaps > _GAP), "plan", f"continuous to {_GAP:g}", shown=shown)
 
 
 def setpoints_of(plan: Plan, rate: float) -> Setpoints:
