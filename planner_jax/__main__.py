@@ -5,10 +5,12 @@ import os
 import sys
 
 from planner_jax.host import signals as stopping
+from planner_jax.host.terminal import prepare_streams
 
 
 def run() -> None:
     """Run the subcommand that `sys.argv` names, and end the process with its exit code."""
+    prepare_streams()
     stopping.listen()
     if sys.argv[1:2] == ["sweep"] and _is_on_cpu():
         # Give every computation one thread: a sweep runs several computations at once. With JAX's

@@ -12,11 +12,12 @@ import os
 from importlib import resources
 from typing import Any
 
+import jax
 import numpy as np
 from flax import traverse_util
 
 from planner_jax.core.checks import require_path_name
-from planner_jax.core.errors import ArgumentError
+from planner_jax.core.errors import ArgumentError, format_value
 from planner_jax.core.plan_files import UNREADABLE, name_damage, read_archive
 from planner_jax.host.files import LARGEST, replacing
 from planner_jax.policies.networks import NETWORKS
@@ -26,6 +27,7 @@ FORMAT = 2  # version number of the format of checkpoints
 # Names of the trained policies in the package: "catch" is trained on eight suites (families of
 # generated cases), and "rush6" on the suite `rush6` alone, whose six targets have deadlines.
 SHIPPED = ("catch", "rush6")
+_MOST, _MOST_LAYERS = 1024, 32  # greatest width and other sizes of a network; most layers
 _OF_FLAX = ("parent", "name")  # fields of every Flax module, which are not sizes of the network
 
 
@@ -68,39 +70,62 @@ def load_checkpoint(path: str | os.PathLike) -> Checkpoint:
     """Read a trained policy from a checkpoint file.
 
     Raises:
-        ArgumentError: the file is missing, is not a checkpoint, or has another format.
+        ArgumentError: the file is missing, is not a checkpoint, has another format, or has weights
+            that are not finite or do not fit its network.
     """
     require_path_name("checkpoint", path)
     name = os.fspath(path)
     try:
         text, arrays = read_archive(path, "about", LARGEST)
         about = json.loads(text)
-        found, network = about["format"], about["network"]
+        found, features, network = about["format"], about["features"], about["network"]
+        sizes = dict(about.get("sizes", {}))
     except UNREADABLE as error:
         raise ArgumentError(
             "checkpoint",
             "one that `planner-jax train` wrote",
             shown=f"{name!r} ({name_damage(error)})",
         ) from error
-    if found != FORMAT or about["features"] != FEATURES:
-        raise ArgumentError(
-            "checkpoint",
-            f"of format {FORMAT} with {FEATURES} features of a target",
-            shown=f"format {found} with {about['features']} in {name!r}",
-        )
-    if network not in NETWORKS:
-        known = ", ".join(NETWORKS)
-        raise ArgumentError("network", f"one of {known}", shown=f"{network!r} in {name!r}")
-    kind, sizes = NETWORKS[network], about.get("sizes", {})
+    if (found, features) != (FORMAT, FEATURES):
+        rule = f"of format {FORMAT} with {FEATURES} features of a target"
+        shown = format_value(f"format {found} with {features} in {name}")
+        raise ArgumentError("checkpoint", rule, shown=shown)
+    if not isinstance(network, str) or network not in NETWORKS:
+        shown = f"{network!r:.60} in {name!r}"
+        raise ArgumentError("network", f"one of {', '.join(NETWORKS)}", shown=shown)
+    kind = NETWORKS[network]
     known = [field.name for field in dataclasses.fields(kind) if field.name not in _OF_FLAX]
-    if not set(sizes) <= set(known):
-        raise ArgumentError(
-            f"sizes of network {network!r}",
-            f"among {', '.join(known)}",
-            shown=f"{', '.join(sizes)} in {name!r}",
-        )
+    for size, value in sizes.items():
+        most = _MOST_LAYERS if size == "layers" else _MOST
+        if size not in known or type(value) is not int or not 0 < value <= most:
+            rule = f"among {', '.join(known)}, whole numbers from 1 to {_MOST}"
+            rule += f" and at most {_MOST_LAYERS} layers" if "layers" in known else ""
+            shown = f"{size:.40} {value!r:.40} in {name!r}"
+            raise ArgumentError(f"sizes of network {network!r}", rule, shown=shown)
+    made = kind(**sizes)
+    _require_weights(arrays, made, name)
     params = traverse_util.unflatten_dict(arrays, sep="/")
-    return Checkpoint(params=params, network=kind(**sizes), about=about)
+    return Checkpoint(params=params, network=made, about=about)
+
+
+def _require_weights(arrays: dict[str, np.ndarray], network: Any, name: str) -> None:
+    """Raise unless there is one array of finite numbers for each weight of a network."""
+    seen = jax.ShapeDtypeStruct((1, FEATURES), np.float32)
+    try:
+        shapes = jax.eval_shape(lambda seen: network.init(jax.random.key(0), seen), seen)
+    except (TypeError, ValueError) as error:
+        shown = f"{' '.join(str(error).split())[:100]} in {name!r}"
+        raise ArgumentError("checkpoint", "of a network that exists", shown=shown) from None
+    expected = traverse_util.flatten_dict(shapes, sep="/")
+    for key in sorted(expected.keys() ^ arrays.keys()):
+        verb = "hold" if key in expected else "not hold"
+        raise ArgumentError("checkpoint", f"the weight {key:.60}", name, verb=verb)
+    for key, array in arrays.items():
+        fits = array.shape == expected[key].shape and array.dtype.kind == "f"
+        if not fits or not np.isfinite(array).all():
+            rule = f"{expected[key].shape} finite numbers in the weight {key}"
+            shown = f"{array.dtype} {array.shape}{' that are not' * fits} in {name!r}"
+            raise ArgumentError("checkpoint", rule, verb="have", shown=shown)
 
 
 def checkpoint_of(file: str | os.PathLike) -> Checkpoint:

@@ -13,7 +13,7 @@ from planner_jax.core.errors import ArgumentError, MissingExtra, install_line
 from planner_jax.export import csv_rows, ros2
 from planner_jax.export.api import stream
 from planner_jax.export.crazyflie import poly4d
-from planner_jax.export.setpoints import MOST, setpoints_of
+from planner_jax.export.setpoints import MOST, robot_of, setpoints_of
 
 RATE = 50.0
 DATA = Path(__file__).parent / "data"
@@ -275,9 +275,9 @@ def double(array):
     ],
 )
 def test_a_plan_that_was_edited_to_be_impossible_is_not_exported(plan, field, change, rule):
-    setpoints_of(plan, RATE)
+    assert robot_of(plan).plan is type(plan)
     with pytest.raises(ArgumentError, match=f"^plan must {rule}"):
-        setpoints_of(edited(plan, field, change), RATE)
+        robot_of(edited(plan, field, change))
 
 
 def test_a_jump_of_the_velocity_alone_is_named():
@@ -285,7 +285,7 @@ def test_a_jump_of_the_velocity_alone_is_named():
     coeffs[0, 1, 2] += 0.002
     broken = recovered().replace(recovery=recovered().recovery.replace(coeffs=coeffs))
     with pytest.raises(ArgumentError, match="a jump of 0.002 in velocities between two pieces$"):
-        setpoints_of(broken, RATE)
+        robot_of(broken)
 
 
 @pytest.mark.parametrize("rate", [0.0, -5.0, np.nan, np.inf, 1.0, 1e7, "fast", [100.0], True])

@@ -23,6 +23,7 @@ from planner_jax.task.catch.estimate import INSTANT, timetable
 from planner_jax.task.catch.suites import draw_by_key
 
 NUM = 16
+BIAS = "params/Dense_0/bias"
 
 
 def cases_of(suite: str = "triangle3", **how: Any) -> Any:
@@ -158,6 +159,69 @@ def test_a_file_that_is_no_checkpoint_is_named(tmp_path, fresh):
     for path, words in says.items():
         with pytest.raises(pj.ArgumentError, match=words):
             load_checkpoint(path)
+
+
+@pytest.mark.parametrize(
+    ("entries", "rule"),
+    [
+        ({"features": None}, "be of format 2 with 38 features"),
+        ({"sizes": 3}, "be one that .* wrote, got .*TypeError"),
+        ({"sizes": [1]}, "be one that .* wrote, got .*TypeError"),
+        ({"sizes": None}, "be one that .* wrote, got .*TypeError"),
+        ({"sizes": {"width": "64"}}, "be among size, width, .* got width '64'"),
+        ({"sizes": {"width": True}}, "be among size, width, .* got width True"),
+        ({"sizes": {"width": 10**9}}, "be among size, width, whole numbers from 1 to 1024"),
+        ({"sizes": {"width": 32}}, r"have \(228, 32\) finite numbers in the weight"),
+        ({"network": ["mlp"]}, r"be one of attention, mlp, got \['mlp'\]"),
+        ({"network": "attention"}, "be among width, heads, layers, .* got size 6"),
+        ({"network": "attention", "sizes": {}}, "hold the weight"),
+        ({"network": "attention", "sizes": {"heads": 5}}, "be of a network that exists"),
+        ({"network": "attention", "sizes": {"layers": 33}}, "be among .* at most 32 layers"),
+    ],
+)
+def test_entries_that_do_not_fit_a_network_are_refused(tmp_path, fresh, entries, rule):
+    path = tmp_path / "policy"
+    save_checkpoint(path, fresh["mlp"], NETWORKS["mlp"](), {})
+    about = edit_checkpoint(path)
+    assert_refused(path, rule, about=np.array(json.dumps(about | entries)))
+    del about["features"]
+    assert_refused(path, "be one that .* wrote, got .*KeyError", about=np.array(json.dumps(about)))
+
+
+def edit_checkpoint(path, **arrays):
+    """Replace arrays of a checkpoint, or remove those that are None; return its `about`."""
+    with np.load(path) as file:
+        found = {**file, **arrays}
+    with path.open("wb") as file:
+        np.savez(file, **{name: each for name, each in found.items() if each is not None})
+    return json.loads(str(found["about"])) if "about" not in arrays else {}
+
+
+def assert_refused(path, rule, **arrays):
+    edit_checkpoint(path, **arrays)
+    with pytest.raises(pj.ArgumentError, match=f"must {rule}") as caught:
+        load_checkpoint(path)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("arrays", "rule"),
+    [
+        ({BIAS: None}, f"hold the weight {BIAS}, got"),
+        ({f"{BIAS}/more": np.ones(3)}, f"not hold the weight {BIAS}/more, got"),
+        ({BIAS: np.full(64, np.nan)}, r"have \(64,\) finite numbers in .* that are not in"),
+        ({BIAS: np.ones(64, int)}, r"have \(64,\) finite numbers in .* got int64"),
+        ({BIAS: np.ones(63)}, r"have \(64,\) finite numbers in .* got float64 \(63,\)"),
+        ({"about": np.ones(3)}, "be one that .* wrote, got .*ValueError"),
+        ({"about": np.array("[" * 9999)}, "be one that .* wrote, got .*RecursionError"),
+        ({"about": None}, "be one that .* wrote, got .*KeyError"),
+    ],
+)
+def test_weights_that_are_not_finite_or_not_of_the_network_are_refused(
+    tmp_path, fresh, arrays, rule
+):
+    save_checkpoint(tmp_path / "policy", fresh["mlp"], NETWORKS["mlp"](), {})
+    assert_refused(tmp_path / "policy", rule, **arrays)
 
 
 def test_more_targets_than_a_network_takes_are_refused(fresh):

@@ -225,6 +225,8 @@ def _tell_how_to_continue(
         raise Unfinished(f"--{error}; {remainder()}") from None
     except OSError as error:
         shown = f"{error.filename!r} ({error.strerror or error})"
+        if error.filename is None:  # files that cannot be written are named
+            rule, shown = "the standard output must be writable", str(error.strerror or error)
         raise Unfinished(f"{rule}, got {shown}; {remainder()}") from None
 
 

@@ -41,6 +41,10 @@ class RunFolder:
     def __init__(self, path: str | os.PathLike, name: str = "out"):
         self.name = name
         self.path = Path(path)
+        try:
+            str(self.path).encode()
+        except UnicodeEncodeError:  # Parquet files are opened by names in UTF-8
+            raise ArgumentError(name, "a path in UTF-8", shown=ascii(str(path))) from None
         self.plans = Dataset(self.path / "plans")
         self.baselines = Dataset(self.path / "baselines")
         self.figures = self.path / "figures"
