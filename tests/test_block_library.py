@@ -353,6 +353,28 @@ def counted(monkeypatch):
     return calls
 
 
+@pytest.mark.parametrize("kind", ["folder", "link", "own"])
+def test_a_build_deletes_no_files_of_others_beside_the_library(tmp_path, counted, kind):
+    parts, victim = tmp_path / "v.lib.parts", tmp_path / "victim"
+    given = (setting(), np.array([irb1600().home]), TINY)
+    (parts if kind != "link" else victim).mkdir()
+    if kind == "link":
+        parts.symlink_to(victim)
+    (parts / "thesis.txt").write_text("mine")
+    (parts / "sub").mkdir()
+    if kind == "own":  # the parts of an interrupted build, to which the user has added files
+        header = dict.fromkeys(("version", "fingerprint", "homes", "layout", "device"))
+        (parts / "what.json").write_text(json.dumps(header))
+        (parts / "00000.npy").write_bytes(b"of another build")
+        building.build(tmp_path / "v.lib", *given, progress=False)
+        assert load_library(tmp_path / "v.lib").found.any()
+    else:
+        with pytest.raises(ArgumentError, match="^library must be a path beside which v.lib.parts"):
+            building.build(tmp_path / "v.lib", *given, progress=False)
+    assert sorted(path.name for path in parts.iterdir()) == ["sub", "thesis.txt"]
+    assert (parts / "thesis.txt").read_text() == "mine"
+
+
 def test_a_resumed_build_gives_the_same_library(tmp_path, counted, monkeypatch):
     homes = np.stack([irb1600().home, irb1600().home])
     homes[1, 0] += 0.1
