@@ -18,10 +18,10 @@ computed by inverse dynamics with the masses of the links and a massless shield.
 torques are averaged over the throws that the planner blocks, and over the throws that all planners
 block.
 
-The paper's rows are quoted as printed. They are for 200 throws that are not published, on a
-Threadripper Pro 5995WX. The paper does not state its limits, poses and definition of torques, and
-its percentages are multiples of 1/209. Its numbers are therefore not comparable with numbers
-measured here. Compare the ratios between the planners of each table instead.
+The paper's rows are quoted as printed. They are for throws that are not published: 200 by the text,
+209 by the percentages, which are multiples of 1/209. The paper used a Threadripper Pro 5995WX. It
+does not state its limits, poses and definition of torques. Its numbers are therefore not comparable
+with numbers measured here. Compare the ratios between the planners of each table instead.
 """
 
 import dataclasses
@@ -36,6 +36,7 @@ from flax import struct
 from jax import Array
 
 import planner_jax as pj
+from planner_jax.baselines.protocols import BY_ROW
 from planner_jax.benchmarks.run import Bench, argument_parser, begin, parse_names
 from planner_jax.core import GRAVITY
 from planner_jax.referee.block import BlockVerdict
@@ -69,19 +70,7 @@ LASTS_UNTIL_CONTACT = ("online", "brisk")
 # by the quantile, so that their motions are in time although planning takes time.
 RESERVE = 90.0
 WARM = 2  # Number of throws, drawn with another seed, that are planned before the measurement.
-# Tables I and II of [Natarajan2024] as printed. Columns of Table I: motion found [%], blocked if
-# planning time counts [%], blocked if it does not count [%], planning time [ms] and execution time
-# [s], both as (mean, standard deviation). Table II: RMS torques of joints 1 to 6 [N m].
-TABLE_I = {
-    "paper: theirs": (70.33, 68.9, 68.9, (0.109, 0.033), (0.31, 0.2)),
-    "paper: RRT-Connect": (59.81, 27.27, 27.27, (17.5, 31.7), (1.3, 0.97)),
-    "paper: ePA*SE": (50.71, 9.57, 11.0, (231.0, 377.0), (1.8, 0.87)),
-}
-TABLE_II = {
-    "paper: theirs": (11.0, 24.5, 16.2, 0.031, 0.036, 0.0003),
-    "paper: RRT-Connect": (102.0, 130.2, 43.6, 0.35, 0.13, 0.015),
-    "paper: ePA*SE": (61.4, 131.0, 39.5, 0.34, 0.11, 0.012),
-}
+PAPERS = ("theirs", "RRT-Connect", "ePA*SE")  # planners in the tables of [Natarajan2024]
 
 
 @struct.dataclass
@@ -198,10 +187,14 @@ def table_of_rates(bench: Bench, outcomes: dict[str, Outcome], common: np.ndarra
         f"| execution on the {common.sum()} common |",
         "|---|---|---|---|---|---|---|---|---|",
     )
-    for name, (found, counted, blocked, query, execution) in TABLE_I.items():
+    for name in PAPERS:
+        found, counted, query, motion = (
+            BY_ROW["Natarajan2024", "Table I", f"{quantity} {name}"]
+            for quantity in ("found", "in time", "query", "motion")
+        )
+        blocked = BY_ROW.get(("Natarajan2024", "Table I", f"blocked {name}"), counted)
         bench.say(
-            f"| {name} | {found} % | {blocked} % | {counted} % | {query[0]} ± {query[1]} | - | - "
-            f"| {execution[0]} ± {execution[1]} | - |"
+            f"| paper: {name} | {found} | {blocked} | {counted} | {query} | - | - | {motion} | - |"
         )
     for name, one in outcomes.items():
         good = one.verdict.success
@@ -235,8 +228,9 @@ def table_of_torques(bench: Bench, outcomes: dict[str, Outcome], common: np.ndar
         "| Table II, RMS [N m] | throws | 1 | 2 | 3 | 4 | 5 | 6 | peak 1 | peak 2 | peak 3 |",
         "|---|---|---|---|---|---|---|---|---|---|---|",
     )
-    for name, row in TABLE_II.items():
-        bench.say(f"| {name} | own | {' | '.join(map(str, row))} | - | - | - |")
+    for name in PAPERS:
+        row = [BY_ROW["Natarajan2024", "Table II", f"{name} joint {k}"] for k in range(1, 7)]
+        bench.say(f"| paper: {name} | own | {' | '.join(map(str, row))} | - | - | - |")
     for name, one in outcomes.items():
         for kind, torques in (("", one.with_gravity), (", no gravity", one.without)):
             for throws, which_ones in (("own", one.verdict.success), ("common", common)):

@@ -33,6 +33,7 @@ import numpy as np
 import planner_jax as pj
 from planner_jax.baselines.intercept.paper import PaperIntercept, paper_speed_step
 from planner_jax.baselines.intercept.path_then_speed import PathThenSpeed
+from planner_jax.baselines.protocols import BY_ROW
 from planner_jax.benchmarks.run import Bench, argument_parser, at_least, begin
 from planner_jax.referee.intercept import InterceptVerdict
 from planner_jax.task.intercept.spec import SUITES
@@ -50,14 +51,7 @@ PAIRS = (
     ("lattice", "em"),
     ("paper", "em"),
 )
-# Table II of [Qu2022] as printed, for EM and for the paper's own planner ("theirs"): "Max Acc." and
-# "Ave. Acc." [m/s^2], and the mean planning time [ms].
-TABLE_II = {"EM": (0.327, 1.653, 2.883), "theirs": (0.296, 1.559, 2.175)}
-TABLE_III = {
-    "path": 150.0,
-    "speed": 3.0,
-    "total": 154.0,
-}  # [ms] Mean times of Table III of [Qu2022]. The time of "speed" is an upper bound.
+PARTS = ("path", "speed", "total")  # parts of a plan in Table III of [Qu2022]
 
 
 def planners() -> dict[str, Any]:
@@ -187,7 +181,10 @@ def table_of_accelerations(bench: Bench, outcomes: dict[str, Outcome]) -> None:
         "| reference | less |",
         "|---|---|---|---|---|---|---|---|",
     )
-    (rms, peak, _), (rms_em, peak_em, _) = TABLE_II["theirs"], TABLE_II["EM"]
+    rms, peak, rms_em, peak_em = (
+        BY_ROW["Qu2022", "Table II", row].value
+        for row in ("theirs max", "theirs ave", "EM max", "EM ave")
+    )
     bench.say(
         f"| theirs beside EM, as printed, columns swapped | - | {rms:.3f} | {rms_em:.3f} | "
         f"{100 * (1 - rms / rms_em):.1f} % | {peak:.3f} | {peak_em:.3f} | "
@@ -219,15 +216,15 @@ def table_of_times(bench: Bench, named: dict[str, Any], lanes: list) -> None:
         "",
         "| Table III, p50 / p95 / p99 [ms] | path | speed | total |",
         "|---|---|---|---|",
-        f"| theirs, as printed, mean | {TABLE_III['path']:.0f} | up to {TABLE_III['speed']:.0f} | "
-        f"{TABLE_III['total']:.0f} |",
+        f"| theirs, as printed, mean | "
+        f"{' | '.join(str(BY_ROW['Qu2022', 'Table III', part]) for part in PARTS)} |",
     )
     for name, planner in named.items():
         seconds = time_parts(planner, lanes)
         times = {part: 1e3 * np.percentile(each, [50, 95, 99]) for part, each in seconds.items()}
         cells = [
             " / ".join(f"{value:.1f}" for value in times[part]) if part in times else "-"
-            for part in TABLE_III
+            for part in PARTS
         ]
         bench.say(f"| {name} | {' | '.join(cells)} |")
         bench.row(table="III", planner=name, ms=times)

@@ -30,6 +30,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from planner_jax.baselines.protocols import BY_ROW
 from planner_jax.benchmarks.prediction_bounds import cramer_rao, mean_distance, share_within
 from planner_jax.benchmarks.run import Bench, argument_parser, begin
 from planner_jax.plane.target import PolynomialPath, TurningPath
@@ -48,8 +49,6 @@ MODES = {
     "turning": "targets with a constant turn rate",
     "gaining": "targets that accelerate by 0.4 m/s every second, the paper's curve",
 }
-# [%] Relative errors 0, 5, 10 and 15 s ahead as printed in Table I of [Qu2022].
-PUBLISHED = {"straight": (0.23, 0.56, 1.28, 2.04), "gaining": (0.58, 2.13, 3.94, 5.88)}
 DEGREES = (1, 2, 3)
 METHODS = (*(f"degree {degree}" for degree in DEGREES), "turn", "selected")
 
@@ -137,11 +136,12 @@ def report(bench: Bench, mode: str, num: int, seed: int) -> None:
         row(name, one.mean(axis=0), [(one[:, MEETING] <= radius).mean() for radius in RADII])
     if mode != "gaining":
         row("Cramer-Rao", *(np.asarray(each).mean(axis=0) for each in bounds(paths)))
-    if mode in PUBLISHED:
-        cells = [f"{value} %" for value in PUBLISHED[mode]] + [""] * len(RADII)
+    rows = (BY_ROW.get(("Qu2022", "Table I", f"{mode} {ahead:.0f} s")) for ahead in AHEAD)
+    if published := [each for each in rows if each]:
+        cells = [*map(str, published), *[""] * len(RADII)]
         lines.append(f"| [Qu2022] | {' | '.join(cells)} |")
         grown = {
-            "[Qu2022]": np.array(PUBLISHED[mode]),
+            "[Qu2022]": np.array([each.value for each in published]),
             **{name: off[:, METHODS.index(name)].mean(axis=0) for name in ("degree 2", "selected")},
         }
         ratios = {name: " : ".join(f"{g:.1f}" for g in e / e[0]) for name, e in grown.items()}

@@ -1,14 +1,16 @@
-"""Make docs/equations.md, which lists the files that implement or cite equations of four papers.
+"""Make docs/equations.md, which lists the equations of four papers and the files with each.
 
     python -m tests.citations            # fails if the page differs from the code
     python -m tests.citations --write    # writes the page
 
 A citation is `[KEY, eq. N]`. In a file that cites a single paper, `eq. N` alone is a citation of
-this paper. `tests/data/equations.toml` states what each equation computes and, if several files
-cite the equation, which file implements it.
+this paper, and so is `Algorithm N`. `tests/data/equations.toml` lists all equations of the papers.
+It states what each equation computes, how the code differs from the printed equation and, if
+several files cite the equation, which file implements it.
 """
 
 import ast
+import itertools
 import re
 import sys
 import tomllib
@@ -28,16 +30,30 @@ PAPERS = {
 KEYED = re.compile(rf"\[[^\[\]]*?({'|'.join(PAPERS)})([^\[\]]*)\]")
 NUMBER = r"\d+[a-z]?"
 EQUATIONS = re.compile(rf"\b[Ee]qs?\.?\s+({NUMBER}(?:\s*(?:,|-|and|to)\s*{NUMBER})*)")
+PARTS = re.compile(r"\b(Algorithm \d|Tables? [IVX]+(?: and [IVX]+)?)")
+STATUSES = ("as printed", "corrected", "different", "not used", "text not available")
+IN_CODE = STATUSES[:3]  # statuses of equations that the code computes
 HEAD = """# Where each equation is
 
-This page lists the equations of four papers of [references](references.md) that the code cites. The
-column "computes" says in a few words what an equation computes. The column "implemented in" has the
-file that computes it, and the functions or classes there whose docstrings cite it. The files in the
-last column use, check or discuss the equation.
+This page lists all equations of four papers of [references](references.md). The column "computes"
+says in a few words what an equation computes. The column "implemented in" has the file that
+computes it, and the functions or classes there whose docstrings cite it. The files in the last
+column use, check or discuss the equation. The column "as printed?" has one of these words:
+
+- as printed: the code computes the printed equation, perhaps in other variables.
+- corrected: the printed equation has a misprint, which the code does not have.
+- different: the code computes something else for the same purpose.
+- not used: the code does not need the equation, or lacks it.
+- text not available: the text of the paper that this project has lacks the equation, for example
+  Section III of Yu2023catch.
+
+JAX computes gradients by automatic differentiation. The last table has algorithms and tables;
+[the page of results](results.md#published-numbers) lists the numbers of the tables.
 
 `python -m tests.citations --write` generates this page from the citations in the code and the words
 in `tests/data/equations.toml`.
 """
+AUTODIFF = "automatic differentiation"
 
 
 def expand(text: str) -> list[str]:
@@ -76,55 +92,101 @@ def name_at(tree: ast.Module, line: int) -> str:
     return names
 
 
+def parts_of(text: str) -> Iterator[tuple[int, str, str]]:
+    """Yield, for each algorithm or table that a text cites, its position, paper and name."""
+    keyed = list(KEYED.finditer(text))
+    papers = {match[1] for match in keyed}
+    for match in PARTS.finditer(text):
+        inside = [key[1] for key in keyed if key.start() < match.start() < key.end()]
+        after = re.match(rf" of \[({'|'.join(PAPERS)})", text[match.end() :])
+        paper = inside[0] if inside else after[1] if after else None
+        if paper is None and len(papers) == 1:
+            paper = next(iter(papers))
+        if paper is not None:
+            kind, *names = match[1].replace(" and", "").split(" ")
+            for name in names:
+                yield match.start(), paper, f"{kind.removesuffix('s')} {name}"
+
+
 def find_places() -> dict[tuple[str, str], dict[str, set[str]]]:
     """Return, by (paper, equation), the files that cite it, with their functions and classes."""
     places: dict[tuple[str, str], dict[str, set[str]]] = defaultdict(lambda: defaultdict(set))
-    for file in tracked_files("planner_jax/*.py", "sims/*.py", "policies/*.py"):
+    for file in tracked_files("planner_jax/*.py", "sims/*.py", "policies/*.py", "benchmarks/*.py"):
         path = ROOT / file
         if path.is_file() and not path.is_symlink():
             text = path.read_text()
             tree = ast.parse(text)
-            for position, paper, number in equations_of(text):
+            cited = [] if file.startswith("benchmarks") else equations_of(text)
+            for position, paper, number in (*cited, *parts_of(text)):
                 name = name_at(tree, text.count("\n", 0, position) + 1)
                 places[paper, number][file].add(name)
     return places
 
 
-def make_page() -> str:
-    """Return the text of docs/equations.md, with one table for each paper.
+def read_words() -> tuple[dict[str, list[str]], dict[tuple[str, str], dict[str, str]]]:
+    """Return the numbers of all equations by paper, and the entries of equations and parts."""
+    words = tomllib.loads(WORDS.read_text())
+    numbers = {paper: expand(text) for paper, text in words.pop("all").items()}
+    parts = {tuple(name.split(", ")): row for name, row in words.pop("parts").items()}
+    rows = {(paper, number): row for paper in words for number, row in words[paper].items()}
+    return numbers, rows | parts
+
+
+def make_page(numbers: dict[str, list[str]], words: dict[tuple[str, str], dict[str, str]]) -> str:
+    """Return the text of docs/equations.md, with a table for each paper and one for other parts.
+
+    Args:
+        numbers: the numbers of all equations of each paper.
+        words: the entry of each equation, algorithm and table, by (paper, number or name).
 
     Raises:
-        LookupError: `equations.toml` lacks a cited equation or its implementing file, or has an
-            equation that the code does not cite.
+        LookupError: an entry is missing, or contradicts the citations in the code.
     """
-    places = find_places()
-    words = {
-        (paper, number): row
-        for paper, rows in tomllib.loads(WORDS.read_text()).items()
-        for number, row in rows.items()
-    }
-    if wrong := words.keys() ^ places.keys():
-        raise LookupError(
-            f"{WORDS.name} and the citations in the code differ: add or remove {sorted(wrong)}"
-        )
+    listed = {(paper, number) for paper in numbers for number in numbers[paper]}
+    parts = {key for key in words if " " in key[1]}
+    if wrong := listed ^ (words.keys() - parts):
+        raise LookupError(f"{WORDS.name} must have one entry for each equation: {sorted(wrong)}")
+    places: dict[tuple[str, str], dict[str, set[str]]] = defaultdict(lambda: defaultdict(set))
+    for (paper, number), files in find_places().items():
+        keys = [key for key in words if key[0] == paper and key[1].rstrip("abcdefg") == number]
+        keys = [(paper, number)] if (paper, number) in words else keys
+        if not keys:
+            raise LookupError(f"{paper} has no equation {number}, cited in {sorted(files)}")
+        for key, (file, names) in itertools.product(keys, files.items()):
+            places[key][file] |= names
     lines = [HEAD]
+    head = "computes | as printed? | implemented in | also cited in |\n|---|---|---|---|---|"
     for paper, title in PAPERS.items():
         lines.append(f"## {title}, {paper}\n")
-        lines.append("| equation | computes | implemented in | also cited in |\n|---|---|---|---|")
-        rows = sorted(
-            (key for key in places if key[0] == paper),
-            key=lambda key: (int(re.sub(r"\D", "", key[1])), key[1]),
-        )
-        for key in rows:
-            files = sorted(places[key])
-            first = words[key].get("place", files[0])
-            if first not in files or len(files) > 1 and "place" not in words[key]:
-                raise LookupError(f"{WORDS.name} needs the `place` of {key}, one of {files}")
-            cited = {file: _write_place(file, places[key][file]) for file in files}
-            others = "; ".join(cited[file] for file in files if file != first)
-            lines.append(f"| {key[1]} | {words[key]['computes']} | {cited[first]} | {others} |")
+        lines.append(f"| equation | {head}")
+        keys = ((paper, number) for number in numbers[paper])
+        lines += [f"| {key[1]} {_write_row(key, words[key], places[key])}" for key in keys]
         lines.append("")
-    return "\n".join(lines)
+    lines += ["## Algorithms and tables\n", f"| paper and part | {head}"]
+    for key in words:
+        if key in parts:
+            lines.append(f"| {', '.join(key)} {_write_row(key, words[key], places[key])}")
+    return "\n".join([*lines, ""])
+
+
+def _write_row(key: tuple[str, str], row: dict[str, str], files: dict[str, set[str]]) -> str:
+    status, place = row.get("status", STATUSES[0]), row.get("place")
+    if status not in STATUSES or (status in ("corrected", "different")) > ("note" in row):
+        raise LookupError(f"{WORDS.name} needs the `status` of {key}, and a `note` on changes")
+    if "by" in row and row["by"] != "autodiff":
+        raise LookupError(f"{key} has by = {row['by']!r}, known is 'autodiff'")
+    is_table = key[1].startswith("Table")
+    is_code = status in IN_CODE and "by" not in row and not is_table
+    if place is None and len(files) == 1 and is_code:
+        place = next(iter(files))
+    if is_code != (place in files) and not (status == STATUSES[-1] and place in files):
+        raise LookupError(f"{key} is {status}; it needs a `place` of {sorted(files)}, has {place}")
+    cited = {file: _write_place(file, files[file]) for file in sorted(files)}
+    others = "; ".join(cited[file] for file in cited if file != place)
+    first = AUTODIFF if "by" in row else cited[place] if place else ""
+    printed = f"{status}: {row['note']}" if "note" in row else status
+    printed = "" if is_table else printed
+    return f"| {row['computes']} | {printed} | {first} | {others} |"
 
 
 def _write_place(file: str, names: set[str]) -> str:
@@ -134,8 +196,8 @@ def _write_place(file: str, names: set[str]) -> str:
 
 def main() -> int:
     if "--write" in sys.argv:
-        PAGE.write_text(make_page())
-    stale = not PAGE.exists() or PAGE.read_text() != make_page()
+        PAGE.write_text(make_page(*read_words()))
+    stale = not PAGE.exists() or PAGE.read_text() != make_page(*read_words())
     if stale:
         print("docs/equations.md is stale: run python -m tests.citations --write")
     return int(stale)

@@ -10,7 +10,7 @@ from closed_forms import region_of
 import planner_jax as pj
 from planner_jax import core
 from planner_jax.ball import flight
-from planner_jax.baselines.hit.published import read_published_rates
+from planner_jax.baselines.protocols import BY_ROW
 from planner_jax.core.errors import ArgumentError, CaseError
 from planner_jax.task.hit import court, suites
 from planner_jax.task.hit.court import check_cases, fly, landing
@@ -63,11 +63,15 @@ def test_the_court_has_36_scenarios_without_mirror_images():
     assert court.SCENARIOS[:4] == ("NNN", "NNF", "NNL", "NFN") and court.SCENARIOS[-1] == "LRR"
 
 
+def published_rates(table, scenario=""):
+    """Return the published success rates [%] of the three planners: of a scenario, or the means."""
+    return [BY_ROW["Yu2023bat", table, planner + scenario].value for planner in court.PLANNERS]
+
+
 def test_published_rates_have_the_known_means():
-    rates = read_published_rates()
-    np.testing.assert_allclose(rates.paper.mean(axis=0), [12.66, 47.86, 77.91], atol=5e-3)
-    np.testing.assert_allclose(rates.trials.mean(axis=0), [9.42, 46.57, 85.38], atol=5e-3)
-    np.testing.assert_allclose(rates.paper[court.SCENARIOS.index("FLR")], [0.3, 60.6, 85.4])
+    assert published_rates("Table I") == [12.7, 47.9, 77.9]
+    assert published_rates("trial files") == [9.4, 46.6, 85.4]
+    assert published_rates("Table I", " FLR") == [0.3, 60.6, 85.4]
 
 
 def test_each_target_lies_in_the_region_that_its_scenario_names():
@@ -161,7 +165,7 @@ def test_the_published_serves_are_read_with_their_rates():
     np.testing.assert_array_equal(np.bincount(serves.scenario), np.full(36, 250))
     np.testing.assert_allclose(serves.target, court.target_of(serves.scenario))
     rates = 100.0 * serves.published.mean(axis=0)
-    np.testing.assert_allclose(rates, read_published_rates().trials.mean(axis=0), atol=1.0)
+    np.testing.assert_allclose(rates, published_rates("trial files"), atol=1.0)
 
 
 def test_the_host_flies_a_ball_as_the_library_does(float64):

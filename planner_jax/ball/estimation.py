@@ -101,10 +101,10 @@ def ekf_predict(
 def ekf_update(state: EkfState, observation: Float[Array, "3"], model: EkfModel) -> EkfState:
     """Update the belief with an observed position Z (3,) [m] [Yu2023bat, eq. 5].
 
-    The mean s becomes s + K_a (Z - H s), where H = [I 0] selects the position and K_a is the Kalman
-    gain. The covariance is updated in Joseph's form, which stays positive definite in float32. Only
-    `observation_std` of the model is used. If a coordinate of the observation is not finite, the
-    belief is returned unchanged.
+    [Yu2023catch, eq. 11] is the same equation. The mean s becomes s + K_a (Z - H s), where H = [I
+    0] selects the position and K_a is the Kalman gain. The covariance is updated in Joseph's form,
+    which stays positive definite in float32. Only `observation_std` of the model is used. If a
+    coordinate of the observation is not finite, the belief is returned unchanged.
     """
     observed = jnp.all(jnp.isfinite(observation))
     dtype = state.mean.dtype

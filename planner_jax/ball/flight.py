@@ -123,8 +123,8 @@ def linear_drag_flight(ball: BallState, duration: Array, drag: Array, gravity: A
     """Return the ball after a flight with drag acceleration -K_i v_i on each axis i.
 
     On each axis, with K = K_i, s(t) = s_0 + (v_0 - g/K)(1 - exp(-K t))/K + g t/K is the position,
-    and g the component of the gravitational acceleration. [Yu2023bat, eq. 4a] omits the constant of
-    integration. The result is exact to rounding for any K >= 0.
+    and g the component of the gravitational acceleration. [Yu2023bat, eq. 4a] and [Yu2023catch,
+    eq. 9a] omit the constant of integration. The result is exact to rounding for any K >= 0.
     """
     x = drag * duration
     phi_1, phi_2 = _phi(x)

@@ -36,7 +36,7 @@ def state_at(path: TargetPath, time: Array) -> BallState:
 
 @struct.dataclass
 class BallPath:
-    """Path of a ball with drag acceleration -K_i v_i on each axis i [Yu2023catch, eq. 9]."""
+    """Path of a ball with drag acceleration -K_i v_i on each axis i [Yu2023catch, eq. 9a]."""
 
     rules: ClassVar[Table] = (
         Field("ball.pos", (3,)),

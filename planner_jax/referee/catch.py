@@ -4,7 +4,7 @@ A catch is a quadrotor's meeting with a moving target in the hoop of its net. `r
 checks the flight, this module the plan's order of targets, catch times and targets' positions. Of
 the planners' code it runs only limits that a user adds. World frame, z up, SI units.
 
-Equations of [Yu2023catch]: a ball with linear drag (eq. 9); the net's centre p + l z_d at the
+Equations of [Yu2023catch]: a ball with linear drag (eq. 9a); the net's centre p + l z_d at the
 height l above the quadrotor's position p (eq. 22); and the angle between z_d and minus the ball's
 velocity (eq. 25). The unit vector z_d points along the thrust.
 """
@@ -211,7 +211,7 @@ def _ball_states(start, vel, drag, gravity, times) -> tuple[np.ndarray, np.ndarr
     """Return positions and velocities (B, N, 3) of N balls of B cases, with linear drag.
 
     For position s_0 and velocity v_0 at time 0, drag K [1/s], gravity g and x = K t it is at
-    s_0 + (v_0 - g / K) (1 - e^-x) / K + g t / K [Yu2023catch, eq. 9]. This is computed as
+    s_0 + (v_0 - g / K) (1 - e^-x) / K + g t / K [Yu2023catch, eq. 9a]. This is computed as
     s_0 + v_0 t f(x) + g t^2 h(x) with f = (1 - e^-x) / x and h = (1 - f) / x, which allows K = 0.
     For small x, the series h = 1/2! - x/3! + x^2/4! - ... is summed to rounding.
     """

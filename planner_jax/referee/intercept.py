@@ -1,10 +1,11 @@
 """Float64 NumPy referee of interceptions: decides by kinematics whether a plan succeeds.
 
 An interception is a car's drive to a moving target. The referee integrates the car's equations of
-motion [Qu2022, eq. 1] with the plan's speed and curvature. It ignores the plan's status, cost and
-meeting point. Only targets of a user's own class are code that planners run too. World frame in the
-plane, SI units, headings counter-clockwise from the x axis. Positions of a case and its plan are
-relative to the case's origin.
+motion [Qu2022, eq. 1] with the plan's speed and curvature, and tests that the car touches nothing
+[Qu2022, eqs 7 and 8c]. It ignores the plan's status, cost and meeting point. Only targets of a
+user's own class are code that planners run too. World frame in the plane, SI units, headings
+counter-clockwise from the x axis. Positions of a case and its plan are relative to the case's
+origin.
 """
 
 import dataclasses

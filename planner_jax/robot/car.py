@@ -19,7 +19,7 @@ from planner_jax.robot.setpoints import sample_at_rate
 
 @struct.dataclass
 class CarLimits:
-    """Limits of a car; infinity means no limit."""
+    """Limits of a car [Qu2022, eq. 8b]; infinity means no limit."""
 
     speed: Array  # () [m/s], greatest speed
     acceleration: Array  # () [m/s^2], greatest magnitude of the acceleration along the path

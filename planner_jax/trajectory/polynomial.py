@@ -14,7 +14,10 @@ from planner_jax.core.arithmetic import numpy_of
 
 @struct.dataclass
 class PiecewisePolynomial:
-    """The trajectory p(t) = sum_k coeffs[i, k] (t - t_i)^k on piece i, which starts at t_i."""
+    """The trajectory p(t) = sum_k coeffs[i, k] (t - t_i)^k on piece i [Yu2023catch, eq. 13].
+
+    Piece i starts at the time t_i.
+    """
 
     coeffs: Array  # (M, D + 1, 3), M pieces of degree D; ascending powers of the time since t_i
     durations: Array  # (M,) [s], > 0

@@ -1,8 +1,8 @@
 """MINCO splines with piece durations in fixed proportion, computed by constant matrices.
 
 MINCO is the piecewise polynomial p(t) of least energy, the integral of |p^(s)|^2 with the s-th
-derivative p^(s), through waypoints [Wang2022; Yu2023bat, eq. 19]. It has degree 2s - 1 on every
-piece and is 2s - 2 times differentiable.
+derivative p^(s), through waypoints [Wang2022], [Yu2023bat, eq. 19], [Yu2023catch, eq. 17]. It has
+degree 2s - 1 on every piece and is 2s - 2 times differentiable.
 
 Piece i of M lasts r_i h seconds. The proportions r_i are constant with mean one, so that h = T / M
 for the duration T. With times in units of h, one constant matrix maps the boundary rows b and the

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from planner_jax.ball.flight import BallState
+from planner_jax.baselines.protocols import BY_ROW
 from planner_jax.core import GRAVITY
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.planner import Planner
@@ -234,7 +235,8 @@ class CatchFlight(BallFlightTask):
 
     CONTACT = "caught"
     SUCCESS = "caught all balls"
-    PUBLISHED = "Catch Planner, 50 real throws: 64 % caught"  # [Yu2023catch, Table I]
+    _caught = BY_ROW["Yu2023catch", "Table I", "caught throws"]
+    PUBLISHED = f"[Yu2023catch], {_caught.num} throws, {_caught.what_counts}: {_caught}"
     COLUMNS = (Column("caught", "", "each ball", list_of(BOOL), lambda b: b.verdict.caught),)
 
     def world(self) -> World:

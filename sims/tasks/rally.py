@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from planner_jax.baselines.protocols import BY_ROW
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.plan_files import LARGEST, UNREADABLE, read_archive
 from planner_jax.host.files import replacing
@@ -224,9 +225,8 @@ class RallyFlight(BallTask):
     settings: RallyFly
 
     CONTACT = "hit"
-    PUBLISHED = (
-        "JuggleRL (arXiv 2509.24892), real: 311 hits in a row on average over 10 trials, 462 at "
-        "best; its model-based baseline 3.1"
+    PUBLISHED = "[Ji2025], {0.num} trials, {0.what_counts}: {0} on average, {1} at best".format(
+        *(BY_ROW["Ji2025", "abstract", row] for row in ("mean", "best"))
     )
     COLUMNS = (
         *leaves_of(

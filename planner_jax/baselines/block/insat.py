@@ -13,11 +13,13 @@ points these bounds would double the duration of a motion between standstills. T
 
     w_1 t_f + w_2 int_0^{t_f} |q'(t)|_2 dt,    w_1 = 1, w_2 = 0.1,
 
-is minimised over the control points and t_f. The arm stands still at the start, and at the goal if
-the case requires it. For given control points the least t_f within the bounds is a maximum in
-closed form, so that every iterate keeps the bounds. The maximum is smoothed for the gradient. The
-optimisation ignores obstacles: every iterate is checked afterwards, and the last collision-free
-iterate is used.
+is minimised over the control points and t_f, between given positions (eq. 4f). The splines are
+twice continuously differentiable (eq. 4b). The arm stands still at the start, and at the goal if
+the case requires it (eq. 4g). Velocities have bounds (eq. 4d), and t_f is at least 0.1 s (eq. 4e).
+For given control points the least t_f within the bounds is a maximum in closed form, so that every
+iterate keeps the bounds. The maximum is smoothed for the gradient. The optimisation ignores
+obstacles (eq. 4c): every iterate is checked afterwards, and the last collision-free iterate is
+used.
 
 Two parts of the authors' code that the paper does not mention are left out: bounds on jerk, and a
 cost that attracts the last control points. The authors' code computes a state's spline when the

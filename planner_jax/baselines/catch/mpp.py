@@ -44,7 +44,7 @@ class Candidates:
     """K candidate trajectories of one segment, which leads from one catch to the next."""
 
     trajectory: PiecewisePolynomial  # leaves (K, 2, ...): candidate, polynomial piece
-    cost: Array  # (K,) [m^2/s^6], mean squared jerk
+    cost: Array  # (K,) [m^2/s^6], mean squared jerk [Yu2023catch, eq. 14]
 
 
 def falling_time(target, height: Array, horizon: Array, nodes: int) -> tuple[Array, Array]:

@@ -110,7 +110,8 @@ class BatHit(OptimisedPlanner):
     - Eqs 11-14 derive the complete state at the impact (`solve_decoupled_hit`).
     - The initial guess has the values of Section VI-A. It consists of two minimum-jerk primitives
       (eqs 15-17, Section IV-C), to the transition point of Section IV-A and from there to the hit.
-    - The trajectory has the least snap, with pieces of equal duration (MINCO, eq. 19). The cost is
+    - The trajectory has the least snap, with pieces of equal duration (MINCO, eq. 19), from the
+      start to the hit (eqs 18c and 18d). The variable log T keeps T positive (eq. 18b). The cost is
       a weighted sum of the squared snap, T and smooth penalties (eqs 18a, 20-22 and 24a).
     - L-BFGS runs from one start. Its last iterate is returned even if this iterate breaks limits.
 
@@ -264,6 +265,7 @@ class BatHit(OptimisedPlanner):
         return offsets, rows, duration, impact, defect
 
     def _terminal_penalty(self, impact: Impact, defect: Array, case: HitCase) -> Array:
+        """Return the penalty of apex and hitting velocity [Yu2023bat, eqs 21 and 24a]."""
         limits = case.hit_limits
         excess = jnp.concatenate(
             [

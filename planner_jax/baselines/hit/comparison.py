@@ -7,7 +7,7 @@ from typing import cast
 import numpy as np
 import pyarrow as pa
 
-from planner_jax.baselines.hit.published import read_published_rates
+from planner_jax.baselines.protocols import BY_ROW
 from planner_jax.runs.columns import BOOL, Column, RefereedBatch
 from planner_jax.runs.manifest import Entries
 from planner_jax.runs.summary import COUNTED, Tally
@@ -90,8 +90,10 @@ def make_table(manifest: Entries) -> RateTable:
     """Return the run's success in each court scenario [%], beside a published planner's rates."""
     planner, summary = manifest["parameters"]["planner"], manifest["summary"]
     other = choose_reference(planner)
-    published, column = read_published_rates(), court.PLANNERS.index(other)
-    beside = [rates[:, column] for rates in (published.paper, published.trials)]
+    beside = [
+        [BY_ROW["Yu2023bat", table, f"{other} {name}"].value for name in court.SCENARIOS]
+        for table in ("Table I", "trial files")
+    ]
     header = ["scenario", "cases", f"{planner} %", "95 % interval"]
     header += [f"{other}, paper %", f"{other}, trial files %"]
     same = _knows_same_serves(summary, other)
@@ -108,7 +110,7 @@ def make_table(manifest: Entries) -> RateTable:
                 known, solved = known + counts["num"], solved + counts["num"] * rate
         rows.append(row)
     total = ["all", *rate_cells(summary["successes"], summary["num"])]
-    total += [f"{rates.mean():.2f}" for rates in beside]
+    total += [f"{np.mean(rates):.2f}" for rates in beside]
     total += [f"{100.0 * solved / known:.2f}"] if same else []
     return RateTable("Success per scenario", header, [*rows, total], strong=len(rows))
 

@@ -1,11 +1,8 @@
-"""Data of [Yu2023bat] on hits by a quadrotor: files of serves and outcomes, and success rates."""
+"""Files of serves for hits by a quadrotor, and of their outcomes, published with [Yu2023bat]."""
 
-import csv
-import dataclasses
 import math
 import os
 import re
-from importlib import resources
 from pathlib import Path
 from typing import NamedTuple, TypeAlias
 
@@ -177,31 +174,3 @@ def _list_out_of_play(trials: list[Trial]) -> list[str]:
         elif not x < 0.0:
             problems.append(f"{where}: serve must land in the hitting half, x < 0, got x = {x:.3g}")
     return problems
-
-
-@dataclasses.dataclass(frozen=True)
-class PublishedRates:
-    """Published success rates in percent, one row per court scenario, one column per planner.
-
-    The rates in the paper's table and in its trial files differ by up to 20 percentage points.
-    """
-
-    paper: np.ndarray  # (36, 3) [%], Table I of the paper
-    trials: np.ndarray  # (36, 3) [%], counted from the published trial files, 1,000 rows each
-
-
-def read_published_rates() -> PublishedRates:
-    """Read the success rates [Yu2023bat] of `juggle`, `bat-lite` and `bat`, one column each."""
-    text = (resources.files("planner_jax.baselines.hit") / "published_rates.csv").read_text(
-        encoding="utf-8"
-    )
-    table = csv.DictReader(line for line in text.splitlines() if not line.startswith("#"))
-    rows = {row["scenario"]: row for row in table}
-
-    def columns(source: str) -> np.ndarray:
-        names = [f"{source}_{planner.replace('-', '_')}" for planner in court.PLANNERS]
-        return np.array(
-            [[float(rows[scenario][name]) for name in names] for scenario in court.SCENARIOS]
-        )
-
-    return PublishedRates(paper=columns("paper"), trials=columns("data"))

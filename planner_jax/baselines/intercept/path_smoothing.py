@@ -42,7 +42,7 @@ _CURVATURE_TOLERANCE = 1e-3
 
 @dataclasses.dataclass(frozen=True)
 class Smoothing:
-    """Weights, step size and number of iterations of gradient descent [Qu2022, Section V-C]."""
+    """Weights, step size and number of iterations of gradient descent [Qu2022, Section V-B]."""
 
     obstacle: float = 0.1  # weight of the cost of obstacles
     curvature: float = 0.1  # weight of the cost of curvature above the limit

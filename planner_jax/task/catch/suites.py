@@ -179,7 +179,7 @@ def earliest_throw(name: str) -> tuple[BallState, float]:
 
 
 def _fly(pos, vel, time, drag: float, gravity: float = GRAVITY) -> tuple[PyTree, PyTree]:
-    """Return balls' positions and velocities after a time; drag is linear [Yu2023catch, eq. 9]."""
+    """Return balls' positions and velocities after a time; drag is linear [Yu2023catch, eq. 9a]."""
     xp, t = _module(vel), time[:, None]
     pull = np.array([0.0, 0.0, -gravity])
     if drag == 0.0:

@@ -91,5 +91,5 @@ def apex_excess(apex: Array, min_apex: Array, max_apex: Array) -> Array:
 
 
 def hitting_speed_excess(vel: Array, limit: Array) -> Array:
-    """Return v_j^2 / v_max,j^2 - 1, (3,), of velocity v and limit v_max [Yu2023bat, eq. 24]."""
+    """Return v_j^2 / v_max,j^2 - 1, (3,), of velocity v and limit v_max [Yu2023bat, eq. 24a]."""
     return (vel * reciprocal(limit)) ** 2 - 1.0

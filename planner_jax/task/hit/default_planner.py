@@ -135,7 +135,7 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
 
     The cost is energy_weight * integral |snap|^2, plus the integral of smooth one-sided penalties
     on the limits [Yu2023bat, eq. 18a] and of the user's extra terms, plus impact_weight * penalties
-    on apex and hitting speed [Yu2023bat, eqs 21 and 24].
+    on apex and hitting speed [Yu2023bat, eqs 21 and 24a].
     """
 
     case_type = HitCase

@@ -165,7 +165,7 @@ def case(
     jerk: ArrayLike = np.inf,
     dtype: DTypeLike = jnp.float32,
 ) -> InterceptCase:
-    """Make one case of an interception, or a batch, by default with the numbers of [Qu2022].
+    """Make one case of an interception [Qu2022, eq. 6], or a batch.
 
     The paper states a map of 80 x 80 pixels, a meeting after 10 s, and 0.5 m/s at the start
     (Section V). This library assumes that the map is 8 m x 8 m and the car a model of scale 1:10.
