@@ -93,19 +93,21 @@ def name_at(tree: ast.Module, line: int) -> str:
 
 
 def parts_of(text: str) -> Iterator[tuple[int, str, str]]:
-    """Yield, for each algorithm or table that a text cites, its position, paper and name."""
+    """Yield, for each algorithm or table that a text cites, its position, paper and name.
+
+    A table is cited as `[KEY, Table N]`, `Table N of [KEY]` or, in code, `"KEY", "Table N"`.
+    """
     keyed = list(KEYED.finditer(text))
     papers = {match[1] for match in keyed}
     for match in PARTS.finditer(text):
-        inside = [key[1] for key in keyed if key.start() < match.start() < key.end()]
-        after = re.match(rf" of \[({'|'.join(PAPERS)})", text[match.end() :])
-        paper = inside[0] if inside else after[1] if after else None
-        if paper is None and len(papers) == 1:
-            paper = next(iter(papers))
-        if paper is not None:
-            kind, *names = match[1].replace(" and", "").split(" ")
-            for name in names:
-                yield match.start(), paper, f"{kind.removesuffix('s')} {name}"
+        found = [key[1] for key in keyed if key.start() < match.start() < key.end()]
+        found += re.findall(rf"^ of \[({'|'.join(PAPERS)})", text[match.end() :])
+        found += re.findall(rf'"({"|".join(PAPERS)})",\s+"$', text[: match.start()][-40:])
+        if match[1].startswith("Algorithm") and len(papers) == 1:
+            found += papers
+        kind, *names = match[1].replace(" and", "").split(" ")
+        for paper, name in itertools.product(found[:1], names):
+            yield match.start(), paper, f"{kind.removesuffix('s')} {name}"
 
 
 def find_places() -> dict[tuple[str, str], dict[str, set[str]]]:

@@ -8,10 +8,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.optimize import linprog
 
 import planner_jax as pj
+from planner_jax.baselines.block.b_spline import hodograph
+from planner_jax.baselines.block.epase import State
 from planner_jax.baselines.block.free_space import FreeSpace
 from planner_jax.baselines.block.path_timing import PIECES, time_path
+from planner_jax.baselines.block.pose_by_pose import Goal
 from planner_jax.baselines.parts.bang_bang import bang_bang
 from planner_jax.benchmarks.block_peers import motion_torques
 from planner_jax.core.errors import MissingExtra, install_line
@@ -234,6 +238,30 @@ def test_splines_are_confirmed_by_the_referee(regime):
     if not rests.any():
         np.testing.assert_allclose(verdict.execution_time, plans.contact_time, rtol=1e-5)
         assert (plans.cost < 0.9 * verdict.execution_time).all()
+
+
+def test_the_best_spline_of_one_joint_takes_nearly_the_least_time_of_its_control_points():
+    case = pj.take(jax.tree.map(np.array, pj.block.draw(5, "open", seed=8)), 0)
+    turn, limit = 0.2, float(case.limits.acceleration[5])
+    # At the least time T the turn is as great as accelerations up to limit * T^2 at the control
+    # points allow. Two control points at each end are equal, so that the joint rests there.
+    bends = np.concatenate([hodograph(3, 2, 7), -hodograph(3, 2, 7)])
+    ends = np.eye(7)[[0, 1, 6]] - np.eye(7)[[6, 0, 5]]
+    far = linprog(ends[0], bends, np.ones(len(bends)), ends[1:], [0, 0], bounds=(None, None))
+    least = np.sqrt(turn / (limit * -far.fun))
+    goal = np.array(case.angles) + turn * np.eye(6)[5]
+    planner, free = pj.block.planner("insat", **QUICK), FreeSpace(case, 0.0)
+    first = State(np.asarray(case.angles, float), 0.0, spline=np.asarray(case.angles)[None])
+
+    def spline_within(available):
+        end = State(goal, np.inf, first)
+        return planner.best_spline(case, free, Goal(goal, available), end, True)
+
+    points, time, length, _ = spline_within(1.0)
+    np.testing.assert_allclose(points[[0, 1, -2, -1]], [case.angles] * 2 + [goal] * 2, atol=1e-6)
+    assert 0.999 * least <= time <= 1.1 * least
+    assert length == pytest.approx(turn, rel=1e-3)
+    assert spline_within(0.99 * least) is None
 
 
 @pytest.mark.parametrize("name", ["direct", "insat", "epase"])

@@ -1,3 +1,5 @@
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -5,7 +7,8 @@ import pytest
 from derivatives import assert_gradient_matches_differences
 
 from planner_jax.ball.flight import solve_impact
-from planner_jax.sims.scoring import racket_impact
+from planner_jax.sims.scoring import no_contact, racket_impact
+from planner_jax.sims.tasks.hit import reflect_ball
 
 RESTITUTION = 0.7
 BALL_VEL = np.array([-5.0, -0.4, -5.5])
@@ -32,6 +35,22 @@ def test_a_still_racket_sends_a_ball_back_at_the_restitution_times_its_normal_sp
     before, after = split(BALL_VEL), split(bounce(BALL_VEL, STILL, NORMAL, restitution))
     np.testing.assert_allclose(after[0], -restitution * before[0], atol=1e-14)
     np.testing.assert_allclose(after[1], before[1], atol=1e-14)
+
+
+@float64
+def test_a_simulated_hit_reverses_the_normal_speed_relative_to_the_racket_alone():
+    one = jax.tree.map(lambda leaf: leaf[0], no_contact(1, float))
+    contact = dataclasses.replace(
+        one,
+        ball_pos=np.array([0.1, 0.2, 1.3]),
+        ball_vel=np.array([4.0, 5.0, -6.0]),
+        tool_vel=np.array([1.0, 2.0, 3.0]),
+        normal=np.array([0.0, 0.0, 1.0]),
+    )
+    after = reflect_ball(contact, np.float64(0.5))
+    np.testing.assert_array_equal(after.pos, contact.ball_pos)
+    # The ball approaches the racket at 9 m/s, and leaves it at half of this speed.
+    np.testing.assert_allclose(after.vel, [4.0, 5.0, 3.0 + 0.5 * 9.0], atol=1e-15)
 
 
 @float64

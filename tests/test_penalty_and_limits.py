@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import planner_jax as pj
-from planner_jax.baselines.catch.paper import steep_hinge
+from planner_jax.baselines.catch.paper import steep_hinge, thrust_band_excess
 from planner_jax.cost import quadrotor
 from planner_jax.cost.penalty import join_trapezoid_weights, smooth_hinge, trapezoid_weights
 from planner_jax.task.hit.context import apex_excess, hitting_speed_excess
@@ -59,6 +59,15 @@ def test_the_steep_hinge_is_as_printed_and_loses_its_slope_at_the_joint():
     value, slope, _ = value_slope_bend("steep", WIDTH + np.array([-1e-12, 1e-12]))
     np.testing.assert_allclose(value, WIDTH**3, atol=1e-12)
     np.testing.assert_allclose(slope, [3.0 * WIDTH**2, 0.0], atol=1e-8)
+
+
+@float64
+def test_thrust_exceeds_its_band_by_the_products_of_its_distances_from_both_limits():
+    thrust = np.array([2.0, 4.0, GRAVITY, 20.0, 25.0])  # the limits are 4 and 20 m/s^2
+    direction = np.array([0.6, 0.0, 0.8])
+    acc = thrust[:, None] * direction - np.array([0.0, 0.0, GRAVITY])
+    excess = thrust_band_excess(acc, GRAVITY, 4.0, 20.0)
+    np.testing.assert_allclose(excess, (thrust - 4.0) * (thrust - 20.0), rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.parametrize("name", SHAPES)

@@ -264,6 +264,20 @@ def test_a_reward_pays_early_catches_only_where_they_are_made():
     np.testing.assert_allclose(reward, [1.0 + 0.5 - 0.25, -0.5])
 
 
+def test_actions_are_evaluated_relative_to_the_greedy_decision():
+    environment = pytest.importorskip("planner_jax.policies.environment", exc_type=ImportError)
+    cases = jax.tree.map(jnp.asarray, pj.catch.draw(4, "parabola1", 5))
+    stretch = np.array([0.0, -0.1, -0.2, -0.4], np.float32)  # times factors exp(stretch / 2)
+    actions = jnp.stack([jnp.zeros(4), stretch], axis=-1)[:, None]
+    terms = environment.evaluate_actions(cases, actions, iterations=0)
+    np.testing.assert_allclose(terms["last"], 1.0 - np.exp(0.5 * stretch), atol=1e-6)
+    for name in ("ratio", "caught"):
+        np.testing.assert_array_equal(terms[name], 0.0)
+    # The estimate misses a target that must be caught before the robot can be there.
+    assert terms["solved"][0] and terms["violation"][0] == 0.0
+    assert not terms["solved"][3] and terms["violation"][3] > 0.0
+
+
 def test_a_sweep_says_which_policy_decided(tmp_path):
     path = tmp_path / "mine.npz"
     save_checkpoint(path, policy().params, policy().network, {})

@@ -3,7 +3,11 @@
 import re
 import subprocess
 import sys
+from collections import defaultdict
 
+import pytest
+
+from tests.citations import make_page, read_words
 from tests.tracked import ROOT, tracked_files
 
 REFERENCES = ROOT / "docs" / "references.md"
@@ -41,3 +45,19 @@ def test_no_text_cites_a_paper_by_a_private_number() -> None:
 def test_the_page_of_equations_follows_the_citations_in_the_code() -> None:
     stale = subprocess.run([sys.executable, "-m", "tests.citations"], cwd=ROOT, check=False)
     assert not stale.returncode, "run python -m tests.citations --write"
+
+
+@pytest.mark.parametrize(
+    "paper, last", [("Yu2023catch", 29), ("Yu2023bat", 24), ("Qu2022", 24), ("Natarajan2024", 8)]
+)
+def test_every_equation_of_the_four_papers_has_an_entry(paper: str, last: int) -> None:
+    numbers, words = read_words()
+    letters: dict[int, str] = defaultdict(str)
+    for number in numbers[paper]:
+        letters[int(number.rstrip("abcdefg"))] += number.lstrip("0123456789") or "-"
+    assert list(letters) == [*range(1, last + 1)]
+    assert {each for each in letters.values() if not "abcdefg".startswith(each)} <= {"-"}
+    for number in numbers[paper]:
+        fewer = {key: row for key, row in words.items() if key != (paper, number)}
+        with pytest.raises(LookupError, match="must have one entry for each equation"):
+            make_page(numbers, fewer)

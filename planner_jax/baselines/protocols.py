@@ -68,7 +68,7 @@ _CATCH = "limits, weights, ranges of the cases"
 _CAR = "map, limits, obstacles, processor"
 _ARM = "joint limits, poses, boxes, shield; the text states 200 trials in simulation"
 _REAL, _SIM = "ball falls into the net, real robot", "all targets caught in simulation"
-_OTR = "mean of |T_o - T_p| / T_o, decided time T_p, optimised time T_o"
+_OTR = "mean relative change of the decided times by the optimiser"
 _SPEED = "column of acceleration; one of the two headings must be wrong"
 
 PUBLISHED: tuple[Published, ...] = (
