@@ -21,7 +21,7 @@ from typing import Any
 import jax
 
 import planner_jax as pj
-from planner_jax.baselines.catch.published import published
+from planner_jax.baselines.catch.published import find_number
 from planner_jax.benchmarks.cost_gap import cost_gaps, gap_figures
 from planner_jax.benchmarks.run import Bench, argument_parser, begin, parse_names
 from planner_jax.runs.summary import wilson_interval
@@ -93,7 +93,7 @@ def main() -> None:
             bench.say(
                 f"| {suite} | {name} | {100 * row['success']:.2f} % | "
                 f"{100 * low:.2f}..{100 * high:.2f} | {100 * row['success_protocol']:.2f} % | "
-                f"{published('success', suite) or '-'} | {ratio} | {last} s | "
+                f"{find_number('success', suite) or '-'} | {ratio} | {last} s | "
                 f"{row['warm_seconds']:.2f} s |"
             )
             bench.row(**row)

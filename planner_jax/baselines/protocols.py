@@ -6,7 +6,7 @@ module stands in the lowest package that prints one, and imports only the standa
 
 import csv
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from importlib import resources
 from statistics import fmean
 from typing import Any
@@ -55,9 +55,13 @@ def _rows_of_court() -> Iterator[Published]:
                 yield from _rows("Yu2023bat", table, *protocol, num, "-", _BAT, rows=rows)
 
 
+def _label(quantity: str, cases: Iterable[object], values: Iterable[Any]) -> dict[str, Any]:
+    return {f"{quantity} {name}": value for name, value in zip(cases, values, strict=True)}
+
+
 def _torques(name: str, text: str) -> Iterator[Published]:
     pairs = (tuple(map(float, pair.split("±"))) for pair in text.split())
-    rows = {f"{name} joint {k}": pair for k, pair in enumerate(pairs, 1)}
+    rows = _label(f"{name} joint", range(1, 7), pairs)
     unknown = f"{_ARM}, gravity included?"
     return _rows("Natarajan2024", "Table II", "RMS torque", "N m", 209, "-", unknown, rows=rows)
 
@@ -67,9 +71,12 @@ _BAT = "start position, weights, iterations, limit of computing time"
 _CATCH = "limits, weights, ranges of the cases"
 _CAR = "map, limits, obstacles, processor"
 _ARM = "joint limits, poses, boxes, shield; the text states 200 trials in simulation"
-_REAL, _SIM = "ball falls into the net, real robot", "all targets caught in simulation"
+_REAL = "ball falls into the net, real robot"
 _OTR = "mean relative change of the decided times by the optimiser"
 _SPEED = "column of acceleration; one of the two headings must be wrong"
+_SUITES = ("parabola1", "parabola2", "harmonic2", "triangle3", "hexagon6")
+_AHEAD = ("0 s", "5 s", "10 s", "15 s")
+_ARMS = ("theirs", "RRT-Connect", "ePA*SE")
 
 PUBLISHED: tuple[Published, ...] = (
     *_rows_of_court(),
@@ -84,17 +91,14 @@ PUBLISHED: tuple[Published, ...] = (
            rows={"plan": 9, "MPP plan": 0.149}),
     *_rows("Yu2023catch", "Section VII-A", "computing time of a new plan", "ms", None, _NUC,
            "decision included?", rows={"re-plan": 2}),
-    *_rows("Yu2023catch", "Table III", _SIM, "%", 1000, "-", _CATCH,
-           rows={"success parabola1": 99.3, "success parabola2": 98.2, "success harmonic2": 84.7,
-            "success triangle3": 99.7, "success hexagon6": 76.3}),
+    *_rows("Yu2023catch", "Table III", "all targets caught in simulation", "%", 1000, "-", _CATCH,
+           rows=_label("success", _SUITES, (99.3, 98.2, 84.7, 99.7, 76.3))),
     *_rows("Yu2023catch", "Table III", _OTR, "", 1000, "-", _CATCH,
-           rows={"OTR parabola1": 0.052, "OTR parabola2": 0.119, "OTR harmonic2": 0.234,
-            "OTR triangle3": 0.126, "OTR hexagon6": 0.458}),
+           rows=_label("OTR", _SUITES, (0.052, 0.119, 0.234, 0.126, 0.458))),
     *_rows("Qu2022", "Table I", "relative error of the predicted position", "%", None, "-",
            "degree, divisor of the error",
-           rows={"straight 0 s": 0.23, "straight 5 s": 0.56, "straight 10 s": 1.28,
-            "straight 15 s": 2.04, "gaining 0 s": 0.58, "gaining 5 s": 2.13,
-            "gaining 10 s": 3.94, "gaining 15 s": 5.88}),
+           rows=_label("straight", _AHEAD, (0.23, 0.56, 1.28, 2.04))
+           | _label("gaining", _AHEAD, (0.58, 2.13, 3.94, 5.88))),
     *_rows("Qu2022", "Table II", _SPEED, "m/s²", None, "-", _CAR,
            rows={"EM max": 0.327, "EM ave": 1.653, "theirs max": 0.296, "theirs ave": 1.559}),
     *_rows("Qu2022", "Table II", "mean time of the speed planner", "ms", None, "-", _CAR,
@@ -104,18 +108,15 @@ PUBLISHED: tuple[Published, ...] = (
     *_rows("Qu2022", "Table III", "mean time of a module", "ms", None, "-", _CAR,
            rows={"prediction": 1, "speed": 3}, bound="<="),
     *_rows("Natarajan2024", "Table I", "planner returns a motion", "%", 209, _DESKTOP, _ARM,
-           rows={"found theirs": 70.33, "found RRT-Connect": 59.81, "found ePA*SE": 50.71}),
+           rows=_label("found", _ARMS, (70.33, 59.81, 50.71))),
     *_rows("Natarajan2024", "Table I", "query and motion end before the ball arrives", "%", 209,
-           _DESKTOP, _ARM,
-           rows={"in time theirs": 68.9, "in time RRT-Connect": 27.27, "in time ePA*SE": 9.57}),
+           _DESKTOP, _ARM, rows=_label("in time", _ARMS, (68.9, 27.27, 9.57))),
     *_rows("Natarajan2024", "Table I", "motion ends before the ball arrives", "%", 209, _DESKTOP,
            _ARM, rows={"blocked RRT-Connect": 27.27, "blocked ePA*SE": 11}),
     *_rows("Natarajan2024", "Table I", "computing time of a query", "ms", 209, _DESKTOP, _ARM,
-           rows={"query theirs": (0.109, 0.033), "query RRT-Connect": (17.5, 31.7),
-            "query ePA*SE": (231, 377)}),
+           rows=_label("query", _ARMS, ((0.109, 0.033), (17.5, 31.7), (231, 377)))),
     *_rows("Natarajan2024", "Table I", "duration of the motion", "s", 209, _DESKTOP, _ARM,
-           rows={"motion theirs": (0.31, 0.2), "motion RRT-Connect": (1.3, 0.97),
-            "motion ePA*SE": (1.8, 0.87)}),
+           rows=_label("motion", _ARMS, ((0.31, 0.2), (1.3, 0.97), (1.8, 0.87)))),
     *_torques("theirs", "11±11 24.5±21 16.2±16 0.031±0.02 0.036±0.03 0.0003±0.0003"),
     *_torques("RRT-Connect", "102±40 130.2±49 43.6±24 0.35±1.3 0.13±0.35 0.015±0.12"),
     *_torques("ePA*SE", "61.4±38 131±52 39.5±14 0.34±1.3 0.11±0.25 0.012±0.09"),

@@ -12,7 +12,7 @@ SOURCE = (
 )
 
 
-def published(quantity: str, suite: str) -> Published | None:
+def find_number(quantity: str, suite: str) -> Published | None:
     """Return a number of [Yu2023catch] for a suite: "success", "OTR" or "MPP success"."""
     table = "Table I" if suite == "throws" else "Table III"
     return BY_ROW.get(("Yu2023catch", table, f"{quantity} {suite}"))
@@ -36,6 +36,6 @@ def make_table(manifest: Entries) -> RateTable:
                 *rate_cells(summary["successes"], summary["num"]),
                 "" if ratio is None else f"{ratio:.3f}",
             ]
-        paper = (published(quantity, name) for quantity in ("success", "OTR", "MPP success"))
+        paper = (find_number(quantity, name) for quantity in ("success", "OTR", "MPP success"))
         rows.append([name, *own, *(f"{each.value:g}" if each else "" for each in paper)])
     return RateTable("Success beside the paper", header, rows, strong)

@@ -128,18 +128,8 @@ class BatHit(OptimisedPlanner):
     - Bat-Lite's initial guess is one primitive straight to the impact, of duration T_0.
     - Weights, numbers of pieces and nodes, and the stopping rule are usual values.
 
-    The number of L-BFGS iterations is fitted to the mean success rates of the published trials,
-    85.4 % for `bat` and 46.6 % for `bat-lite`. With 80 iterations both rates are within two points,
-    although the published planners succeed on other serves. Success on 1,800 published serves in %,
-    where T_0 and T_1 are the durations before and after the transition in the initial guess:
-
-        iterations                 0   20   40   60   80  100  150  200  300
-        bat                        0   45   58   77   85   92   94   94   94
-        bat-lite                   0    8    5   23   48   63   79   82   82
-        bat-lite from T_0 + T_1   24   53   72   85   91   94   94   94   94
-
-    In the last row Bat-Lite starts with the longer impact time of `bat`, and nearly reaches the
-    success of `bat`. The transition therefore helps mainly by a better initial impact time.
+    The number of L-BFGS iterations, 80, is fitted to the mean success rates of the published
+    trials, but the published planners succeed on other serves (docs/lab/hit.md).
 
     This planner ignores the additional limits of a case (`extras`); the referee checks them.
     """
