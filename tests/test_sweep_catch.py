@@ -112,7 +112,7 @@ def test_the_table_has_the_papers_rates_beside_its_own_suite(finished):
     table = CatchSweep(TASK).table(finished[1])
     assert [row[0] for row in table.rows] == list(SUITES)
     rows = {row[0]: row for row in table.rows}
-    assert rows["throws"] == ["throws", "", "", "", "", "96.0", "0.092", "14.0"]
+    assert rows["throws"] == ["throws", "", "", "", "", "96", "0.092", "14"]
     assert rows["hexagon6"][-3:] == ["76.3", "0.458", ""]
     assert rows["parabola2"][1] == str(NUM) and rows["parabola2"][-3:] == ["98.2", "0.119", ""]
     assert table.rows[table.strong][0] == "parabola2"

@@ -124,7 +124,8 @@ def explain_table(manifest: Entries) -> str:
         f'"{other}, paper" is Table I of the paper, "{other}, trial files" what its published '
         "trial files count over 1,000 rows a scenario. The two differ by up to 20 points; "
         f"their totals are means over the scenarios. {same}"
-        "All of these hold for the paper's own setting: full limits, planning from the serve."
+        "All of these hold for the paper's own setting: full limits, planning from the serve. Here "
+        "the numbers of iterations of bat and bat-lite are fitted to the rates of the trial files."
     )
 
 

@@ -64,8 +64,8 @@ class BlockSettings(ArmSettings, SweepSettings):
     regime: str = option(
         "R2",
         "NAME",
-        "limits of the joints: R1, limits of the paper, free end velocity; R2, limits of the data "
-        "sheet, from rest to rest; R3, limits of the paper, from rest to rest",
+        "limits of the joints: R1, of the code of the paper's authors, free end velocity; R2, "
+        "speeds of the data sheet, from rest to rest; R3, as R1, from rest to rest",
     )
     wide: bool = option(
         False, "", "accept a ball 0.1 m from the shield's middle and 30 degrees from its normal"
