@@ -73,7 +73,7 @@ def measure(bench: Bench, settings: ThroughputSettings) -> None:
     card, local = task_named(settings.task), jax.local_devices()
     used = local[: devices or len(local)]
     effort = {} if settings.effort is None else {"effort": settings.effort}
-    made = card.planner(settings.planner or next(iter(card.planners)), **card.bench, **effort)
+    made = card.planner(str(settings.planner), **card.bench, **effort)
     solver = made.planner if isinstance(made, DecidedPlanner) else made
     has_rounds = isinstance(solver, OptimisedPlanner)
     if iterations is not None:

@@ -7,7 +7,7 @@ import dataclasses
 import pkgutil
 from typing import ClassVar
 
-from planner_jax.core.choices import EFFORTS, require, require_one_of
+from planner_jax.core.choices import EFFORTS, require
 from planner_jax.core.registry import task_named
 from planner_jax.core.room import require_memory
 from planner_jax.runs.settings import SweepSettings, option
@@ -32,9 +32,7 @@ class ThroughputSettings:
     iterations: int | None = option(
         None, "K", "iterations of the first round (default: the planner's own)"
     )
-    effort: str | None = option(
-        None, "NAME", f"effort of the planner of hits or catches: {', '.join(EFFORTS)}"
-    )
+    effort: str | None = option(None, "NAME", f"effort of the planner: {', '.join(EFFORTS)}")
     repeat: int = option(5, "R", "number of timed calls")
     seed: int = option(0, "K", "seed of the cases")
     agree: bool = option(False, "", "also compare the first plans with plans of a CPU")
@@ -49,13 +47,15 @@ class ThroughputSettings:
             value = getattr(self, name)
             require(value is None or value >= 1, name, ">= 1", value)
             require(value is None or value <= _MOST, name, f"<= {_MOST}", value)
-        if self.effort is not None:
-            require_one_of(EFFORTS, "effort", self.effort)
-            has_effort = self.task in ("hit", "catch")
-            require(has_effort, "effort", f"left out for the task {self.task}", self.effort)
         require(len(self.batch) > 0, "batch", "one or more sizes", shown="none")
         require(min(self.batch) >= 1, "batch", ">= 1", min(self.batch))
         task = task_named(self.task)
         kind: type[SweepSettings] = pkgutil.resolve_name(task.sweep)
-        sweep = kind(planner=self.planner, suite=self.suite, seed=self.seed).of(task)
+        has_effort = "effort" in {field.name for field in dataclasses.fields(kind)}
+        rule = f"left out for the task {self.task}"
+        require(has_effort or self.effort is None, "effort", rule, self.effort)
+        effort = {} if self.effort is None else {"effort": self.effort}
+        sweep = kind(planner=self.planner, suite=self.suite, seed=self.seed, **effort).of(task)
+        object.__setattr__(self, "planner", sweep.planner)
+        object.__setattr__(self, "suite", sweep.suite)
         require_memory("batch", max(self.batch), sweep.case_bytes)

@@ -2,10 +2,13 @@
 
 import functools
 import inspect
+import typing
+from collections.abc import Sequence
 
 import jax
 import jaxtyping
 import numpy as np
+import numpy.typing as npt
 from beartype import BeartypeConf, FrozenDict, beartype
 from beartype.roar import BeartypeDecorHintException
 
@@ -19,6 +22,10 @@ is_on = True  # False for tests of the library's own checks, which take argument
 # `ShapeDtypeStruct` of `jax.eval_shape`. Arguments annotated as numbers may be NumPy's.
 _LEAF = jax.typing.ArrayLike | jax.ShapeDtypeStruct
 _HINTS = {jax.Array: _LEAF, int: int | np.integer, float: float | int | np.floating}
+# NumPy's protocol of sequences in `ArrayLike` has a method that tuples lack, `__reversed__`.
+_PARTS = [each for each in typing.get_args(npt.ArrayLike) if typing.get_origin(each)]
+_SEQUENCES = [each for each in _PARTS if hasattr(each, "count")]
+_HINTS |= dict.fromkeys(_SEQUENCES, Sequence)
 _check = beartype(conf=BeartypeConf(hint_overrides=FrozenDict(_HINTS)))
 _subscript = type(jaxtyping.Float).__getitem__
 

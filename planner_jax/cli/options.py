@@ -72,11 +72,18 @@ class Parser(argparse.ArgumentParser):
         self._negative_number_matcher = re.compile(r"-\.?[0-9]")
 
     def parse_known_args(self, *arguments: Any, **how: Any) -> Any:
-        """Add the options, then parse; the entry `flags` of the result maps "num" to "--num"."""
+        """Add the options, then parse; the entry `flags` of the result maps "num" to "--num".
+
+        An unknown word ends the process with a line that names the command's help.
+        """
         if self._fill is not None:
             self._fill(self)
         self.set_defaults(flags=self._flags)
-        return super().parse_known_args(*arguments, **how)
+        found, unknown = super().parse_known_args(*arguments, **how)
+        if unknown:
+            known = f"`{self.prog} --help` lists all options"
+            self.error(f"unrecognized arguments: {' '.join(unknown)}; {known}")
+        return found, unknown
 
     def add(self, flag: str, *, type: type | None = None, **how: Any) -> None:
         """Add the option `flag`, whose value is converted to `type` if this is int or float."""

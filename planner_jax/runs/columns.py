@@ -1,6 +1,7 @@
 """Columns of a run's stored table, which has a row for each case, its plan and its verdict."""
 
 import dataclasses
+import operator
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import NamedTuple, TypeAlias
 
@@ -111,23 +112,32 @@ def leaf_columns(batch: RefereedBatch) -> list[Column]:
     """
     known = {f"plan.{c.name}" for c in SOLVER} | {f"verdict.{c.name}" for c in OUTCOME}
     found = [INDEX]
-    for name, path in (("case", "cases"), ("plan", "plans"), ("verdict", "verdict")):
-        columns = _columns_of(getattr(batch, path), name, path, {})
-        found += [column for column in columns if column.name not in known]
+    for name, part in (("case", "cases"), ("plan", "plans"), ("verdict", "verdict")):
+        read = operator.attrgetter(part)
+        found += [c for c in _columns_of(read(batch), name, read, {}) if c.name not in known]
     return [*found, *SOLVER, *OUTCOME]
 
 
-def _columns_of(tree: PyTree, name: str, path: str, words: Mapping[str, str]) -> Iterator[Column]:
+def _columns_of(
+    tree: PyTree,
+    name: str,
+    read: Callable[[RefereedBatch], PyTree],
+    words: Mapping[str, str],
+) -> Iterator[Column]:
+    """Yield a column for every array (B, ...) in `tree`, a part of a batch, which `read` returns."""
     if dataclasses.is_dataclass(tree):
         for f in dataclasses.fields(tree):
             if f.metadata.get("pytree_node", True):  # a static field has one value for all rows
-                leaf = vars(tree)[f.name]
-                yield from _columns_of(leaf, f"{name}.{f.name}", f"{path}.{f.name}", f.metadata)
-        return
-    values, unit, meaning = np.asarray(tree), words.get("unit", ""), words.get("meaning", "")
-    kind = _KINDS.get(values.dtype.kind, NUMBER)
-    kind = kind if values.ndim == 1 else list_of(kind)
-    yield Column(name, unit, meaning, kind, lambda batch: _leaf(batch, path))
+                inner = lambda batch, f=f: vars(read(batch))[f.name]  # noqa: E731
+                yield from _columns_of(vars(tree)[f.name], f"{name}.{f.name}", inner, f.metadata)
+    elif isinstance(tree, tuple | list | dict):
+        for key in tree if isinstance(tree, dict) else range(len(tree)):
+            inner = lambda batch, key=key: read(batch)[key]  # noqa: E731
+            yield from _columns_of(tree[key], f"{name}.{key}", inner, words)
+    elif tree is not None:  # an optional part that no case has fills no column
+        values, unit, meaning = np.asarray(tree), words.get("unit", ""), words.get("meaning", "")
+        kind = _KINDS.get(values.dtype.kind, NUMBER)
+        yield Column(name, unit, meaning, kind if values.ndim == 1 else list_of(kind), read)
 
 
 def rows_of(columns: Sequence[Column], batch: RefereedBatch, frame: str) -> pa.Table:

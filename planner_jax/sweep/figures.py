@@ -18,6 +18,7 @@ from planner_jax.sweep.quadrotor import SampledMotion
 DASHED: Look = {"color": style.RED, "linewidth": 1.2, "linestyle": "--", "zorder": 1}
 FORBIDDEN: Look = {"color": style.RED, "alpha": 0.08, "linewidth": 0.0}
 _SAMPLES = 800  # number of times at which a plan is sampled for its curves
+_FEWEST_BARS, _MOST_BARS = 10, 60  # of the histogram of iterations
 CAPTION = (
     "Plans of several planners for one case over time, with the limits. Thin lines: the recovery "
     "trajectory after the last contact, if there is one."
@@ -154,5 +155,9 @@ def outcomes_figure(figure: Figure, run: RunRows) -> None:
     axes, rows = figure.subplots(), run.folder.plans.read(["iterations"])
     iterations = np.asarray(rows["iterations"])
     style.label(axes, "iterations of the attempt that gave the plan", "plans", "Effort")
-    axes.hist(iterations, bins=np.arange(iterations.min(), iterations.max() + 2) - 0.5)
-    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    first = int(iterations.min())
+    num = max(int(iterations.max()) - first + 1, _FEWEST_BARS)
+    width = -(-num // _MOST_BARS)  # number of values that share a bar
+    axes.hist(iterations, bins=np.arange(first, first + num + width, width) - 0.5)
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_locator(MaxNLocator(integer=True))

@@ -363,8 +363,8 @@ class RallyFlight(BallTask):
             f"{summary['hits']:,} hits in all, at least {summary['fewest_hits']:,} in a trial, "
             f"{100 * summary['mean_offset']:.1f} cm from the racket's centre on average."
         ]
-        if np.isfinite(self.course.circle):
-            inside, aimed = summary["inside"], summary["aimed"]
+        inside, aimed = summary["inside"], summary["aimed"]
+        if np.isfinite(self.course.circle) and aimed:
             lines.append(
                 f"{percent(inside, aimed)} % of {aimed:,} hits to the circle of "
                 f"{self.course.circle:g} m sent the ball into it."

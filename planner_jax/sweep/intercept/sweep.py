@@ -103,6 +103,10 @@ class InterceptSweep(Sweep[InterceptSettings]):
 class GroupSweep(Sweep[GroupSettings]):
     """Sweeps that plan and judge many cases of a car that meets several targets in turn."""
 
+    def other_planners(self, settings: GroupSettings) -> Entries:
+        """Return the task's other planner, unless it would have to meet many targets."""
+        return {} if settings.has_many else super().other_planners(settings)
+
     def pictures(self, case: PyTree, plan: PyTree, verdict: PyTree, planner: str) -> list[Picture]:
         """Return one picture from above, of the drives up to the first that the referee rejects."""
         num = int(verdict.leg) + 1

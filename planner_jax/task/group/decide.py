@@ -20,6 +20,7 @@ from planner_jax.core.protocol import Decision, require_settings
 from planner_jax.task.arguments import require_orders
 from planner_jax.task.group.case import GroupChoice, InterceptGroup
 from planner_jax.task.group.order import Departure, improve, make_table
+from planner_jax.task.group.spec import MOST_PERMUTED
 
 _GRID = 128  # number of times at which the position of every target is evaluated
 _PACE = 0.8  # assumed mean speed of the car, divided by its greatest speed
@@ -79,9 +80,6 @@ def _rank(group: InterceptGroup, table: tuple[Array, Array], order: Array) -> Ar
 
 def _select(condition: Array, meeting: _Meeting, other: _Meeting) -> _Meeting:
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), meeting, other)
-
-
-MOST_PERMUTED = 8  # greatest number N of targets for which all N! orders are estimated
 
 
 @jax.tree_util.register_static

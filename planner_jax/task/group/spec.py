@@ -22,6 +22,8 @@ SUITES = {
     ),
 }
 
+MOST_PERMUTED = 8  # greatest number N of targets for which all N! orders are estimated
+
 DECISIONS = {
     "best": "planner_jax.task.group.decide:Best",
     "greedy": "planner_jax.task.group.decide:Greedy",
