@@ -179,9 +179,9 @@ def main(words: list[str]) -> int:
                 print("    " + ended.err.strip().replace("\n", "\n    "), flush=True)
         os.chdir("/")
     print(
-        f"{len(chosen):,} combinations: {counts['ran']:,} ran, {counts['refused']:,} were refused"
+        f"{len(chosen):,} combinations: {counts['ran']:,} ran, {counts['refused']:,} were refused "
+        f"in one line, {counts['FAULT']:,} did neither"
     )
-    print(f"in one line, {counts['FAULT']:,} did neither")
     return 1 if counts["FAULT"] else 0
 
 

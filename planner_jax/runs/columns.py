@@ -124,7 +124,7 @@ def _columns_of(
     read: Callable[[RefereedBatch], PyTree],
     words: Mapping[str, str],
 ) -> Iterator[Column]:
-    """Yield a column for every array (B, ...) in `tree`, a part of a batch, which `read` returns."""
+    """Yield a column for every array (B, ...) of `tree`, which `read` returns from a batch."""
     if dataclasses.is_dataclass(tree):
         for f in dataclasses.fields(tree):
             if f.metadata.get("pytree_node", True):  # a static field has one value for all rows
