@@ -141,7 +141,7 @@ def target_at(table: PathTable, time: Array) -> BallState:
     the last time of the table, the target keeps its velocity at that time.
     """
     require_kind("table", table, PathTable)
-    require_scalar("time", time)
+    time = jnp.asarray(require_scalar("time", time), jnp.result_type(table.resolution))
     inside = jax.lax.clamp(jnp.zeros_like(time), time, horizon_of(table))
     position = inside * reciprocal(table.resolution)
     index = jnp.clip(jnp.floor(position), 0, table.pos.shape[0] - 4)

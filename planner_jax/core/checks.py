@@ -99,7 +99,7 @@ def numbers_of(
     The argument has this shape, or the shape `shape` for numbers that all cases share. Other shapes
     raise, so that no axis is broadcast by accident. `batch` is () for one case, (B,) for B cases.
     """
-    array, whole = np.asarray(_require_numeric(name, value)), (*batch, *shape)
+    array, whole = np.asarray(require_numeric(name, value)), (*batch, *shape)
     if array.shape not in (shape, whole):
         rule = f"{shape}" if whole == shape else f"{shape} or {whole}"
         raise ArgumentError(name, f"the shape {rule}", array.shape, verb="have")
@@ -108,10 +108,11 @@ def numbers_of(
 
 def shape_of(name: str, value: object) -> tuple[int, ...]:
     """Return the shape of an argument; raise `ArgumentTypeError` unless it holds numbers."""
-    return _require_numeric(name, value).shape
+    return require_numeric(name, value).shape
 
 
-def _require_numeric(name: str, value: object) -> Numbers:
+def require_numeric(name: str, value: object) -> Numbers:
+    """Return numbers as an array; raise `ArgumentTypeError` for all else."""
     array = numeric(value)
     if array is None:
         raise ArgumentTypeError(name, "numbers", value)

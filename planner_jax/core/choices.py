@@ -23,7 +23,7 @@ def require(
 def require_one_of(names: Iterable[str], name: str, value: object) -> None:
     """Raise `ArgumentError` unless a value is one of the allowed names."""
     names = tuple(names)
-    require(value in names, name, f"one of {', '.join(names)}", value)
+    require(isinstance(value, str) and value in names, name, f"one of {', '.join(names)}", value)
 
 
 def require_size(name: str, value: object, least: int = 1) -> None:

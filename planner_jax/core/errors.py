@@ -78,6 +78,10 @@ class UnknownName(ArgumentError):
     """The name of a task, planner, suite or robot is unknown; the rule lists the known names."""
 
 
+class NotOffered(PlannerJaxError, TypeError):
+    """A planner does not offer what is requested, such as a gradient; the text says what does."""
+
+
 class MissingExtra(PlannerJaxError, ModuleNotFoundError):
     """A feature needs a package that is not installed; the text says how to install it.
 

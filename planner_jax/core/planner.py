@@ -18,7 +18,7 @@ from jaxtyping import PyTree
 
 from planner_jax.core.choices import EFFORTS, require_one_of
 from planner_jax.core.compiled import Fixed, has_only_cpu, traced_platform
-from planner_jax.core.errors import ArgumentError, ArgumentTypeError
+from planner_jax.core.errors import ArgumentError, ArgumentTypeError, NotOffered
 from planner_jax.core.protocol import Attempt, Plan
 from planner_jax.core.rules import Case
 
@@ -183,7 +183,7 @@ class Planner(Generic[CaseT, PlanT]):
         Raises:
             TypeError: the planner cannot continue from existing plans.
         """
-        raise TypeError(
+        raise NotOffered(
             f"{type(self).__name__} cannot plan again: use hits' and catches' exact, intercepts' "
             "spacetime, or blocks' online"
         )
@@ -200,7 +200,7 @@ class Planner(Generic[CaseT, PlanT]):
         Raises:
             TypeError: the planner does not minimise a cost.
         """
-        raise TypeError(
+        raise NotOffered(
             f"{type(self).__name__} minimises nothing, so that its plans have no gradient: use "
             "a planner that does, such as hits' and catches' exact or intercepts' spacetime"
         )
@@ -258,10 +258,8 @@ def require_fit(planner: Planner, cases: object) -> None:
         rule += "a flax.struct.dataclass if it holds arrays"
         raise ArgumentTypeError(type(planner).__name__, rule, shown="")
     if not isinstance(cases, planner.case_type):
-        raise TypeError(
-            f"{type(planner).__name__} plans cases of the class {planner.case_type.__name__}, got "
-            f"{type(cases).__name__}"
-        )
+        rule = f"of the class {planner.case_type.__name__}, which {type(planner).__name__} plans"
+        raise ArgumentTypeError("cases", rule, shown=f"a {type(cases).__name__}")
     if not planner.attempts:
         raise ArgumentError(
             type(planner).__name__, "at least one attempt", verb="have", shown="none"

@@ -14,7 +14,13 @@ from jax import Array, lax
 from jaxtyping import PyTree
 
 from planner_jax.core.arithmetic import Numbers, numpy_of
-from planner_jax.core.checks import require_kind, require_number, require_numbers, require_switch
+from planner_jax.core.checks import (
+    require_kind,
+    require_number,
+    require_numbers,
+    require_switch,
+    shape_of,
+)
 from planner_jax.core.choices import require_size
 from planner_jax.core.errors import ArgumentError, ArgumentTypeError
 from planner_jax.core.rules import FINITE, NOT_NEGATIVE, POSITIVE, fields_of, has_rules, is_sound
@@ -103,10 +109,14 @@ def outcome(cost: Array, violation: Array, *, stationary: Array | bool = True) -
         violation: (), largest relative excess over a limit that the planner checks.
         stationary: () bool, whether a further search would not change the plan.
     """
+    shape = shape_of("cost", cost)
+    for name, value in (("violation", violation), ("stationary", stationary)):
+        if shape_of(name, value) not in ((), shape):
+            raise ArgumentError(name, f"the shape of cost, {shape}", np.shape(value), verb="have")
     return {
         "cost": cost,
         "violation": violation,
-        "iterations": jnp.zeros_like(cost, jnp.int32),
+        "iterations": jnp.zeros(shape, jnp.int32),
         "status": status_of(cost, violation, stationary),
     }
 

@@ -7,6 +7,7 @@ import pkgutil
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
+from planner_jax.core.checks import require_path_name
 from planner_jax.core.choices import RECOVERIES, require, require_one_of
 from planner_jax.core.errors import (
     ArgumentError,
@@ -110,6 +111,7 @@ def export(
         OSError: the file cannot be written; the exception's `filename` is the path.
     """
     form = _require_format(to, plan)
+    require_path_name("out", out)
     path = Path(out)
     if path.suffix not in form.writers:
         rule = f"{' or '.join(form.writers)} for {to}"
@@ -186,7 +188,7 @@ def bring_to_rest(plan: Plan, recovery: str | None, case: Case | None = None) ->
     if case is None:
         rule = "given, whose limits the recovery trajectory keeps, or recovery=None to omit it"
         raise ArgumentError("case", rule, shown="neither")
-    is_robots = robot.case_field in vars(case)
+    is_robots = isinstance(case, Case) and robot.case_field in vars(case)
     require(is_robots, "case", f"the case of a {robot.name}", shown=type(case).__name__)
     require_one("case", "cases", case.batch_shape)
     try:
@@ -203,7 +205,7 @@ def lacks_recovery(plan: Plan) -> bool:
 
 
 def _require_name(to: str) -> str:
-    if to not in FORMATS:
+    if not isinstance(to, str) or to not in FORMATS:
         alike = difflib.get_close_matches(str(to).lower(), FORMATS, n=1)
         hint = f"; did you mean {alike[0]!r}?" if alike else ""
         raise UnknownName("to", f"one of {', '.join(FORMATS)}", shown=f"{format_value(to)}{hint}")

@@ -11,6 +11,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import PyTree
 
+from planner_jax.core.checks import require_numeric
 from planner_jax.core.choices import EFFORTS, require_one_of
 from planner_jax.core.planner import CaseT, Planner, PlanT
 from planner_jax.optimise.multistart import solve_batch, solve_divided, solve_round
@@ -51,7 +52,7 @@ def pending(violation: Array) -> dict[str, PyTree]:
     """Return the fields of a new `Plan`: its violation, and zeros that the solver overwrites."""
     zero = jnp.zeros((), jnp.int32)
     return {
-        "cost": jnp.zeros_like(violation),
+        "cost": jnp.zeros_like(require_numeric("violation", violation)),
         "violation": violation,
         "iterations": zero,
         "status": zero,

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import jax.numpy as jnp
 import numpy as np
 
-from planner_jax.core.checks import floating, numeric, shape_of
+from planner_jax.core.checks import floating, numbers_of, numeric, shape_of
 from planner_jax.core.choices import require
 from planner_jax.core.errors import ArgumentError, ArgumentTypeError
 from planner_jax.plane.obstacles import Obstacles, Track
@@ -65,7 +65,8 @@ def obstacles(
     dtype = floating(dtype)
     if isinstance(polygons, Geometry):
         polygons = [polygons]
-    if isinstance(polygons, str) or not isinstance(polygons, Sequence | np.ndarray):
+    is_bare = isinstance(polygons, str) or getattr(polygons, "shape", None) == ()
+    if is_bare or not isinstance(polygons, Sequence | np.ndarray):
         raise ArgumentTypeError("polygons", "a sequence of polygons", polygons)
     count = len(polygons)
     divided = [_read_polygon(k, polygon) for k, polygon in enumerate(polygons)]
@@ -83,7 +84,7 @@ def obstacles(
     require(bool((np.asarray(growth) >= 0.0).all()), "growth", ">= 0", growth)
     given = _check_paths(paths, count)
     tables = [given[k] for k in owner]
-    shift = np.asarray(origin, np.float64)
+    shift = numbers_of("origin", origin, (), (2,)).astype(np.float64)
     centre, velocity = np.zeros((num, 2)), np.zeros((num, 2))
     corners, radius, rates = np.zeros((num, size, 2)), np.zeros(num), np.zeros(num)
     velocity[: len(parts)] = np.broadcast_to(np.asarray(velocities, float), (count, 2))[owner]

@@ -12,9 +12,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import chndtr
 
-from planner_jax.core.checks import shape_of
+from planner_jax.core.checks import require_number, shape_of
 from planner_jax.core.choices import require
 from planner_jax.core.errors import ArgumentError
+from planner_jax.core.rules import POSITIVE
 from planner_jax.plane.filter_bank import (
     SETTLE,
     VOLATILITY,
@@ -111,9 +112,11 @@ def predict(
     require(clock.shape in (shape, shape[-1:]), "times", rule, clock.shape)
     for name, array in (("times", clock), ("positions", points)):
         require(not np.isinf(array).any(), name, "finite, or NaN if absent", np.inf)
-    require(noise is None or 0.0 < noise < np.inf, "noise", "> 0 and finite", noise)
-    require(speed is None or 0.0 < speed < np.inf, "speed", "> 0 and finite", speed)
-    require(now is None or bool(np.isfinite(now)), "now", "finite", now)
+    for name, value, rule in (("noise", noise, POSITIVE), ("speed", speed, POSITIVE)):
+        if value is not None:
+            require_number(name, value, rule)
+    if now is not None:
+        require_number("now", now)
     require(points.size > 0, "positions", "of at least one observation", shown="none")
     clock = np.broadcast_to(clock, shape).reshape(-1, shape[-1])
     places = (points[..., 0] + 1j * points[..., 1]).reshape(clock.shape)

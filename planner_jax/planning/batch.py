@@ -18,6 +18,7 @@ from jax import Array
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import PyTree
 
+from planner_jax.core.checks import require_scalar
 from planner_jax.core.errors import ArgumentError, ArgumentTypeError
 from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import (
@@ -84,9 +85,7 @@ class Watch:
         self, time_limit: float | None = None, progress: Callable[[Progress], object] | None = None
     ) -> None:
         if time_limit is not None:
-            if isinstance(time_limit, str | bool) or np.ndim(time_limit) != 0:
-                raise ArgumentTypeError("time_limit", "a number", time_limit)
-            if not time_limit >= 0.0:
+            if not require_scalar("time_limit", time_limit) >= 0.0:
                 raise ArgumentError("time_limit", ">= 0 s", time_limit)
         if progress is not None and not callable(progress):
             raise ArgumentTypeError("progress", "callable, such as print", progress)

@@ -13,7 +13,7 @@ from jax.core import Tracer
 from jaxtyping import PyTree
 
 from planner_jax.core.choices import require_size
-from planner_jax.core.errors import ArgumentError, ArgumentTypeError
+from planner_jax.core.errors import ArgumentError, ArgumentTypeError, NotOffered
 from planner_jax.core.origin import with_origin, without_origin
 from planner_jax.core.planner import CaseT, Kind, Planner, PlanT, require_fit
 from planner_jax.core.protocol import (
@@ -117,7 +117,7 @@ def _require_layout(chunk: object, devices: object) -> None:
         if not len(devices):
             raise ArgumentError("devices", "at least one", shown="none")
         if len(set(devices)) < len(devices):
-            raise ValueError(f"devices must differ, got {', '.join(map(str, devices))}")
+            raise ArgumentError("devices", "different", shown=", ".join(map(str, devices)))
 
 
 def _require_own_precision(leaves: list[PyTree]) -> None:
@@ -179,7 +179,7 @@ def _solve(planner: PyTree, cases: PyTree) -> PyTree:
 
 @_solve.defjvp
 def _raise(primals: tuple, tangents: tuple) -> tuple:
-    raise TypeError(
+    raise NotOffered(
         "plan and solve cannot be differentiated: for gradients of plans there are pj.gradient, "
         "and pj.optimal_plan inside a loss"
     )
@@ -300,6 +300,6 @@ def _solve_by(planner: Planner, cases: PyTree, loaded: Sequence[PyTree], k: Arra
 def require_pure(planner: Planner) -> None:
     """Raise `TypeError` for a planner that runs on the host, outside of compiled programs."""
     if planner.kind is Kind.HOST:
-        raise TypeError(
+        raise NotOffered(
             f"{type(planner).__name__} works on the host: call pj.plan outside compiled functions"
         )

@@ -11,6 +11,7 @@ from flax import struct
 from jaxtyping import PyTree
 
 from planner_jax.core.choices import RECOVERIES, require_one_of
+from planner_jax.core.errors import NotOffered
 from planner_jax.core.planner import CaseT, Drive, Planner, PlannerAround, PlanT
 from planner_jax.core.protocol import Status, is_solved
 from planner_jax.cost.moving import MovingKeepOut
@@ -36,7 +37,7 @@ class RecoveringPlanner(PlannerAround[CaseT, PlanT]):
 
         The plan and its recovery trajectory are results of two separate minimisations.
         """
-        raise TypeError(
+        raise NotOffered(
             "plans with a recovery have no gradient, as plan and recovery are minimised one after "
             "the other: leave `recovery` out"
         )

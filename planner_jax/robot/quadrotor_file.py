@@ -27,7 +27,7 @@ from typing import NamedTuple
 
 import yaml
 
-from planner_jax.core.errors import MissingExtra, PlannerJaxError
+from planner_jax.core.errors import ArgumentTypeError, MissingExtra, PlannerJaxError
 from planner_jax.host.files import open_plain
 from planner_jax.host.yaml_files import Value, read_fields
 from planner_jax.robot.quadrotor_model import (
@@ -150,6 +150,8 @@ def read_robot(path: str | os.PathLike, **given: Value) -> QuadrotorModel:
         MissingExtra: the file is MJCF, and MuJoCo is not installed.
         OSError: the file cannot be read.
     """
+    if not isinstance(path, str | os.PathLike):
+        raise ArgumentTypeError("path", "the path of a file", path)
     place = os.fspath(path)
     description = _read_description(Path(place), given)
     _require_units({k: v for k, v in given.items() if isinstance(v, str)}, place)

@@ -13,8 +13,8 @@ from collections.abc import Callable
 import numpy as np
 
 from planner_jax.core import GRAVITY
-from planner_jax.core.choices import require
-from planner_jax.core.errors import ArgumentError
+from planner_jax.core.choices import require, require_one_of
+from planner_jax.core.errors import ArgumentError, ArgumentTypeError
 
 RECOVERY_TILT = math.radians(40.0)  # [rad], default of `FlightLimits.recovery_tilt`
 # [rad], at least this much more than the tilt at its start is allowed to a recovery
@@ -41,7 +41,7 @@ class Tool:
     max_angle: float = math.pi / 6.0
 
     def __post_init__(self) -> None:
-        require(self.kind in (NET, RACKET), "tool.kind", f"{NET} or {RACKET}", self.kind)
+        require_one_of((NET, RACKET), "tool.kind", self.kind)
         _require("tool.radius", self.radius, *_POSITIVE)
         _require("tool.height", self.height, *_FINITE)
         _require("tool.restitution", self.restitution, "in [0, 1]", lambda x: 0.0 <= x <= 1.0)
@@ -60,10 +60,14 @@ class Rotors:
     radius: float = 0.06  # [m], of a propeller; used only for pictures
 
     def __post_init__(self) -> None:
-        is_shaped = len(self.places) in COUNTS and np.shape(self.places)[1:] == (2,)
         rule = "x and y of 4, 6 or 8 rotors"
-        require(is_shaped, "rotors.places", rule, shown=f"{len(self.places)} rotors")
-        require(bool(np.isfinite(self.places).all()), "rotors.places", "finite", self.places)
+        try:
+            places = np.asarray(self.places, float)
+        except (TypeError, ValueError):
+            raise ArgumentTypeError("rotors.places", rule, self.places) from None
+        is_shaped = places.shape in [(count, 2) for count in COUNTS]
+        require(is_shaped, "rotors.places", rule, shown=f"{len(np.atleast_1d(places))} rotors")
+        require(bool(np.isfinite(places).all()), "rotors.places", "finite", self.places)
         least = self.min_thrust
         _require("rotors.min_thrust", least, *_NOT_NEGATIVE)
         _require("rotors.max_thrust", self.max_thrust, f"> {least:g}", lambda x: x > least)
@@ -238,8 +242,8 @@ class QuadrotorModel:
 
 
 def _require(name: str, value: object, rule: str, holds: Callable[[float], bool]) -> None:
-    if isinstance(value, bool) or not isinstance(value, int | float | np.number):
-        raise ArgumentError(name, "a number", value)
+    if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
+        raise ArgumentTypeError(name, "a number", value)
     require(math.isfinite(value) and holds(float(value)), name, rule, value)
 
 

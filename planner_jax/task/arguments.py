@@ -62,6 +62,8 @@ def batch_of(name: str, vectors: object, *shape: int) -> tuple[int, ...]:
     if split < 0 or found[split:] != shape:
         ends = ", ".join(map(str, shape))
         raise ArgumentError(name, f"a shape that ends with ({ends},)", found, verb="have")
+    if 0 in found[:split]:
+        raise ArgumentError(name, "at least one case", verb="hold", shown=f"the shape {found}")
     return found[:split]
 
 

@@ -10,6 +10,8 @@ from jax import Array, lax
 from jaxtyping import PyTree
 
 from planner_jax.core.arithmetic import numpy_of
+from planner_jax.core.checks import require_kind, require_scalar
+from planner_jax.core.choices import require_size
 
 
 @struct.dataclass
@@ -55,6 +57,9 @@ def evaluate(trajectory: PiecewisePolynomial, time: Array, order: int = 0) -> Ar
     Returns:
         (3,) [m/s^order].
     """
+    require_kind("trajectory", trajectory, PiecewisePolynomial)
+    require_size("order", order, 0)
+    time = require_scalar("time", time)
     coeffs, durations = trajectory.coeffs, trajectory.durations
     starts = jnp.concatenate([jnp.zeros_like(durations[:1]), jnp.cumsum(durations)[:-1]])
     piece = jnp.clip(jnp.sum(time >= starts) - 1, 0, durations.shape[0] - 1)

@@ -97,8 +97,8 @@ pj.catch.planner(decide='policy:gone') | checkpoint must be
 pj.hit.planner(rounds=(pj.LbfgsConfig(),)) | rounds must
 pj.group.planner(decide='nobody') | decide must be one of
 pj.plan('exact', hits) | planner must be one, such as
-pj.plan(exact, catches) | ExactHit plans cases of the class HitCase
-pj.solve(catcher, hits) | DecidedPlanner plans cases of the class Catch
+pj.plan(exact, catches) | cases must be of the class HitCase, which ExactHit plans, got a CatchCase
+pj.solve(catcher, hits) | cases must be of the class CatchCase
 pj.plan(exact, having(hits, 'drag', np.zeros(3, np.float32))) | drag must have the shape (2,), got (3,)
 pj.plan(exact, fill(hits, 'target', nan)) | target must be finite, got nan in lane 0 (1 more such lane)
 pj.plan(exact, fill(hits, 'hit_limits.min_apex', 9.0)) | hit_limits.min_apex must be < hit_limits.max_apex

@@ -8,6 +8,7 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
+from planner_jax.core.checks import require_path_name
 from planner_jax.core.choices import require
 from planner_jax.core.errors import ArgumentError
 from planner_jax.host.files import read_plain
@@ -70,6 +71,7 @@ def read_serves(folder: str | os.PathLike) -> Serves:
 
 
 def _find_trial_files(folder) -> dict[int, dict[str, Path]]:
+    require_path_name("serves", folder)
     folder = Path(folder)
     require(folder.is_dir(), "serves", "an existing folder", str(folder))
     files: dict[int, dict[str, Path]] = {}

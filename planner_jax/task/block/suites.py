@@ -11,6 +11,7 @@ from jax.typing import DTypeLike
 from scipy.spatial.transform import Rotation
 
 from planner_jax.core import GRAVITY
+from planner_jax.core.checks import require_kind
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.registry import suite_named
 from planner_jax.referee import solids
@@ -65,6 +66,8 @@ def draw(
     suite = suite_named(suite, "pole")
     if suite not in SUITES:
         return TASK.other_suite(suite)(num, seed, first)
+    if arm is not None:
+        require_kind("arm", arm, Arm)
     own, randoms = SUITES[suite], make_generators(suite, num, seed, first)
     size = _size_for(arm)
     inner, outer = (

@@ -16,6 +16,7 @@ from flax import struct
 from jax import Array, lax
 from jax.typing import ArrayLike
 
+from planner_jax.core.checks import require_kind
 from planner_jax.core.choices import require
 from planner_jax.core.protocol import Status, is_unsolved, require_settings
 from planner_jax.task.arguments import require_orders
@@ -37,6 +38,7 @@ def closest_approach(cases: CatchCase) -> Array:
     reach. The quadrotor is assumed to fly at its greatest speed in any direction. The bound is
     evaluated at 64 times up to the target's horizon.
     """
+    require_kind("cases", cases, CatchCase)
     return _closest_approach(cases) if cases.batch_shape == () else _closest_approaches(cases)
 
 
@@ -191,6 +193,8 @@ def optimal_time_ratio(cases: CatchCase, plans: CatchPlan) -> np.ndarray:
 
     T_p is a catch's time estimated before planning, T_o its planned time [Yu2023catch, eq. 29].
     """
+    require_kind("cases", cases, CatchCase)
+    require_kind("plans", plans, CatchPlan)
     decided_times, optimised = np.asarray(plans.decided_times), np.asarray(plans.times)
     present = np.asarray(cases.present & plans.choice.taken)
     present = np.take_along_axis(present, np.asarray(plans.order), axis=1)

@@ -21,7 +21,7 @@ from planner_jax.ball.target import BallPath, HarmonicPath, TargetPath
 from planner_jax.core import GRAVITY
 from planner_jax.core.arithmetic import host_leaf
 from planner_jax.core.checks import floating, require_scalar
-from planner_jax.core.choices import require, require_scale
+from planner_jax.core.choices import require, require_scale, require_size
 from planner_jax.core.registry import suite_named
 from planner_jax.robot.quadrotor_model import PAPER_CATCHER, QuadrotorModel
 from planner_jax.task.arguments import require_draw
@@ -89,6 +89,7 @@ def draw(
         return TASK.other_suite(suite)(num, seed, first)
     own = SUITES[suite].num_targets
     size = own if num_targets is None else num_targets
+    require_size("num_targets", size)
     require(size >= own, "num_targets", f">= {own} for suite {suite!r}", size)
     random = np.random.default_rng([seed, zlib.crc32(suite.encode())])
     # Each case uses `columns` random numbers: skip the numbers of the cases before `first`.

@@ -10,7 +10,7 @@ from flax import struct
 from jax import Array
 from numpy.typing import ArrayLike
 
-from planner_jax.core.checks import require_path
+from planner_jax.core.checks import numeric, require_path, shape_of
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.rules import PERMUTATION, Field, Table
 from planner_jax.plane.obstacles import move_on
@@ -110,16 +110,18 @@ def case(
         ValueError: a number breaks a rule, a shape is wrong, or edges of an obstacle cross.
     """
     scalars = [settings.get(name, 0.0) for name in ("initial_speed", "tolerance")]
-    shapes = [np.shape(time), np.shape(settings.get("start", 0.0))[:-1], *map(np.shape, scalars)]
+    shapes = [shape_of("start", settings.get("start", 0.0))[:-1], shape_of("time", time)]
+    shapes += map(np.shape, scalars)
     axis, leaves = len(max(shapes, key=len)), jax.tree.leaves(targets)
-    if not leaves or any(np.ndim(leaf) <= axis for leaf in leaves):
+    if not leaves or any(np.ndim(leaf) <= axis or np.shape(leaf)[axis] == 0 for leaf in leaves):
         raise ArgumentError("targets", f"paths with {axis + 1} axes in front", targets)
     one = jax.tree.map(lambda leaf: np.asarray(leaf).take(0, axis), targets)
     shared = single_case(one, time, **settings)
     batch, num = shared.batch_shape, np.shape(leaves[0])[axis]
     require_path("targets", targets, (*batch, num), 2)
-    exists = np.asarray(present)
-    if exists.dtype != np.bool_ or exists.shape not in ((), (num,), (*batch, num)):
+    exists = numeric(present)
+    shapes = (), (num,), (*batch, num)
+    if exists is None or exists.dtype != np.bool_ or exists.shape not in shapes:
         raise ArgumentError("present", f"True or False of {num} targets", present)
     return InterceptGroup(
         shared=dataclasses.replace(shared, target=targets),

@@ -17,7 +17,7 @@ from planner_jax.ball.prediction import PathTable
 from planner_jax.ball.recording import BALLS, Ball
 from planner_jax.ball.spin import SpinningBall
 from planner_jax.core.arithmetic import at_least
-from planner_jax.core.checks import require_kind
+from planner_jax.core.checks import numbers_of, require_kind
 from planner_jax.core.choices import require
 from planner_jax.robot.quadrotor import tangent_basis
 
@@ -28,7 +28,7 @@ def with_spin(
     """Return the case with a ball of a radius [m] and a `spin` (3,) or (..., 3) [rad/s]."""
     ball = BALLS["table tennis"] if ball is None else ball
     require_kind("ball", ball, Ball)
-    turn = np.asarray(spin, float)
+    turn = numbers_of("spin", spin, case.batch_shape, (3,)).astype(float)
     require(bool((np.abs(turn) < 1e4).all()), "spin", "within 10,000 rad/s", spin)
 
     def full(x: PyTree, *shape: int) -> Array:

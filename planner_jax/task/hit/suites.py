@@ -10,9 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.interpolate import RectBivariateSpline
 
-from planner_jax.core.checks import numeric, require_scalar
+from planner_jax.core.checks import numeric, require_kind, require_scalar
 from planner_jax.core.choices import require, require_scale
-from planner_jax.core.errors import ArgumentError
+from planner_jax.core.errors import ArgumentError, ArgumentTypeError
 from planner_jax.robot.quadrotor_model import PAPER_HITTER, QuadrotorModel
 from planner_jax.task.arguments import require_draw
 from planner_jax.task.hit import court
@@ -73,8 +73,10 @@ def generate_serves(
 
     The `scenarios` are names in court.SCENARIOS, by default all.
     """
-    names = court.SCENARIOS if scenarios is None else tuple(scenarios)
     require_draw(num, seed, first)
+    if not isinstance(scenarios, Sequence | None):
+        raise ArgumentTypeError("scenarios", "a sequence of names", scenarios)
+    names = court.SCENARIOS if scenarios is None else tuple(scenarios)
     unknown = [name for name in names if name not in court.SCENARIOS]
     if unknown or not names:
         rule = f"names out of {' '.join(court.SCENARIOS)}"
@@ -216,6 +218,7 @@ def to_cases(
     for `delay` [s]. `limit_scale` multiplies the limits of speed, acceleration and body rate.
     `wind` (3,) [m/s] is the velocity of the air, for a robot with drag.
     """
+    require_kind("serves", serves, Serves)
     require_scalar("limit_scale", limit_scale)
     require_scalar("delay", delay)
     require_scale(limit_scale)

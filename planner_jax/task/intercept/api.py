@@ -10,10 +10,11 @@ from jax import Array
 from jax.typing import DTypeLike
 from jaxtyping import Float
 
-from planner_jax.core.checks import require_kind, require_path
-from planner_jax.core.choices import require
+from planner_jax.core.checks import require_kind, require_number, require_path
+from planner_jax.core.choices import require_size
 from planner_jax.core.planner import Planner
 from planner_jax.core.registry import suite_named
+from planner_jax.core.rules import NOT_NEGATIVE, POSITIVE
 from planner_jax.plane.maps import OccupancyMap as OccupancyMap
 from planner_jax.plane.maps import read_map as read_map
 from planner_jax.plane.maps import walls_of_grid as walls_of_grid
@@ -77,10 +78,12 @@ def observe(
     Raises:
         ValueError: an argument is out of its range.
     """
-    ranges = {"count": (count, 1), "noise": (noise, 0), "first": (first, 0), "until": (until, 0)}
-    for name, (value, least) in ranges.items():
-        require(value >= least, name, f">= {least}", value)
-    require(interval > 0.0, "interval", "> 0", interval)
+    require_kind("cases", cases, InterceptCase)
+    for name, size, least in (("seed", seed, 0), ("count", count, 1), ("first", first, 0)):
+        require_size(name, size, least)
+    for name, value in (("noise", noise), ("until", until)):
+        require_number(name, value, NOT_NEGATIVE)
+    require_number("interval", interval, POSITIVE)
     times = interval * np.arange(1.0 - count, 1.0 + np.floor(until / interval + 1e-9))
     positions = np.asarray(_positions_at(cases.target, times.astype(cases.time.dtype)))
     tag = zlib.crc32(b"observations")

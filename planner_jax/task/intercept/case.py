@@ -15,7 +15,13 @@ from numpy.typing import ArrayLike
 
 from planner_jax.ball.prediction import PathTable
 from planner_jax.core import rules
-from planner_jax.core.checks import floating, require_path, shape_of
+from planner_jax.core.checks import (
+    floating,
+    numbers_of,
+    require_numeric,
+    require_path,
+    shape_of,
+)
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.rules import Field, Table, require_sound
 from planner_jax.plane.make_obstacles import Circle, obstacles
@@ -226,17 +232,17 @@ def case(
         ValueError: the edges of a polygon cross, or an array has a wrong shape or an invalid value.
     """
     dtype, shapes = floating(dtype), [batch_of("start", start, 3)]
-    shift = _find_origin(start, tolerance, origin, dtype)
     scalars = {"time": time, "initial_speed": initial_speed, "tolerance": tolerance}
-    shapes += [shape_of(name, value) for name, value in scalars.items()]
+    shapes += [batch_of(name, value) for name, value in scalars.items()]
     batch = max(shapes, key=len)
+    shift = _find_origin(start, tolerance, origin, dtype)
 
     leaf = functools.partial(array_of, batch=batch, dtype=dtype)
     is_bare = require_path("target", target, batch, 2)
     is_free = end_heading is None
     around = leaf("heading_tolerance", heading_tolerance)
     body = (length, width, wheelbase, rear_overhang)
-    has_reverse = bool(np.any(np.asarray(reverse_speed) != 0.0))
+    has_reverse = bool(np.any(require_numeric("reverse_speed", reverse_speed) != 0.0))
     limits = {
         "speed": speed,
         "acceleration": acceleration,
@@ -244,7 +250,7 @@ def case(
         "curvature": curvature,
         "steering_rate": steering_rate,
         **({"reverse_speed": reverse_speed} if has_reverse else {}),
-        **({"jerk": jerk} if np.any(np.asarray(jerk) != np.inf) else {}),
+        **({"jerk": jerk} if np.any(require_numeric("jerk", jerk) != np.inf) else {}),
     }
     moved = functools.partial(_make_obstacles, origin=shift, batch=batch, dtype=dtype)
     movement = {"velocities": mover_velocities, "paths": mover_paths, "growth": mover_growth}
@@ -259,8 +265,8 @@ def case(
         heading_tolerance=jnp.full_like(around, np.pi) if is_free else around,
         walls=moved("walls", walls),
         movers=moved("movers", movers, **movement),
-        lower=leaf("lower", np.asarray(lower, np.float64) - shift, 2),
-        upper=leaf("upper", np.asarray(upper, np.float64) - shift, 2),
+        lower=leaf("lower", numbers_of("lower", lower, batch, (2,)) - shift, 2),
+        upper=leaf("upper", numbers_of("upper", upper, batch, (2,)) - shift, 2),
         body=CarBody(*map(leaf, _BODY, body)),
         limits=CarLimits(**{name: leaf(name, value) for name, value in limits.items()}),
         region=_make_region(region, batch, dtype),

@@ -84,7 +84,7 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
         protocol.require_settings(self)
         if self.searches is not None:
             protocol.require_attempts("searches", self.searches, Search)
-        is_known = self.meet in ("given", "early", "least")
+        is_known = isinstance(self.meet, str) and self.meet in ("given", "early", "least")
         require(is_known, "meet", "given, early or least", self.meet)
 
     @property

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from planner_jax.core import GRAVITY as STANDARD_GRAVITY
 from planner_jax.core.checks import floating, require_scalar
-from planner_jax.core.choices import require_scale
+from planner_jax.core.choices import require_scale, require_size
 from planner_jax.core.registry import suite_named
 from planner_jax.robot.quadrotor_model import PAPER_HITTER, QuadrotorModel
 from planner_jax.robot.quadrotor_models import IRIS
@@ -139,6 +139,8 @@ def draw(
     if suite not in SUITES:
         require_own_robot(robot or PAPER_HITTER, PAPER_HITTER, suite, wind)
         return TASK.other_suite(suite)(num, seed, first)
+    if hits is not None:
+        require_size("hits", hits)
     course = COURSES[suite]
     random = np.random.default_rng([seed, zlib.crc32(suite.encode())])
     random.bit_generator.advance(first * _COLUMNS)  # type: ignore[attr-defined]

@@ -14,6 +14,7 @@ from jax import Array
 from jaxtyping import PyTree
 
 from planner_jax.ball.prediction import PathTable
+from planner_jax.core.errors import NotOffered
 from planner_jax.core.origin import without_origin
 from planner_jax.core.planner import Drive, Planner
 from planner_jax.core.protocol import is_solved
@@ -64,7 +65,7 @@ class ExactTeam(Planner[TeamCase, TeamPlan]):
     def plan_by(self, drive: Drive, cases: TeamCase) -> TeamPlan:
         """Return plans of teams, by the loop over searches `drive`."""
         if drive.is_pure:
-            raise TypeError("ExactTeam works on the host: call pj.plan outside compiled functions")
+            raise NotOffered("ExactTeam works on the host: call pj.plan outside compiled functions")
         if cases.batch_shape == ():
             one = self.plan_by(drive, jax.tree.map(lambda leaf: np.asarray(leaf)[None], cases))
             return jax.tree.map(lambda leaf: leaf[0], one)
