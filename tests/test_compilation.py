@@ -1,11 +1,11 @@
-"""The table of compiled programs that `planner-jax doctor --compile` prints."""
+"""The table of compiled programs of default planners."""
 
 import jax
 import numpy as np
 import pytest
 
-from planner_jax.cli import compilation
-from planner_jax.cli.main import main
+from planner_jax.benchmarks import compilation
+from planner_jax.benchmarks.run import Bench
 
 
 def test_rows_show_slow_programs_and_sums_of_all():
@@ -40,15 +40,14 @@ def test_programs_are_recorded_with_their_equations():
 
 
 @pytest.mark.slow
-def test_the_doctor_lists_programs_of_planners(monkeypatch, capsys):
-    monkeypatch.setattr(compilation, "_EXAMINED", ("hit", "catch throws"))
-    monkeypatch.setattr(compilation, "BATCH", 2)
+def test_the_programs_of_planners_are_listed_with_their_sums(tmp_path):
     usual = jax.config.jax_enable_compilation_cache
     try:
-        assert main(["doctor", "--compile"]) == 0
+        with Bench("compilation", {}, tmp_path / "run") as bench:
+            compilation.measure(bench, ("hit", "catch throws"), 2)
     finally:
         jax.config.update("jax_enable_compilation_cache", usual)
-    lines = capsys.readouterr().out.splitlines()
+    lines = (tmp_path / "run" / "table.md").read_text().splitlines()
     sums = [line for line in lines if "| all |" in line]
     expected = [[f"| {name}", num] for name in ("hit", "catch throws") for num in "12"]
     assert [line.split(" | ")[:2] for line in sums] == expected

@@ -114,16 +114,11 @@ def _make_parser() -> Parser:
     kinds = bench.add_subparsers(title="benchmarks", required=True, metavar="benchmark")
     words = "plans a second, with success and cost"
     kinds.add_parser("throughput", help=words, fill=runs.add_throughput)
-    doctor = command("doctor", "versions, devices, precision, cache and a timed plan", _doctor)
-    words = "list the compiled programs of every default planner instead, in some minutes"
-    doctor.add("--compile", action="store_true", help=words)
+    command("doctor", "versions, devices, precision, cache and a timed plan", _doctor)
     return parser
 
 
 def _doctor(options: Options) -> int:
-    from planner_jax.cli import compilation, doctor
+    from planner_jax.cli import doctor
 
-    if options["compile"]:
-        compilation.report()
-        return 0
     return 0 if doctor.report() else FAILED

@@ -1,4 +1,4 @@
-"""`planner-jax doctor --compile`: the compiled programs of every default planner, as a table.
+"""The compiled programs of default planners: their equations and compile times.
 
 A program is a function that JAX compiles. The table shows the size of each program, and how long
 its compilation takes without the cache on the disk.
@@ -10,19 +10,28 @@ import dataclasses
 import re
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+
+import jax
+import numpy as np
+
+from planner_jax.benchmarks.run import Bench, argument_parser, begin
+from planner_jax.core.protocol import take
+from planner_jax.core.registry import task_named
+from planner_jax.planning.plan import plan
 
 BATCH = 64  # number of cases of the batch whose programs are listed
 # Tasks whose default planners are examined, as "TASK" or "TASK SUITE": the suite is the family of
 # random cases that are planned, by default the first of the task.
-_EXAMINED = ("hit", "catch throws", "catch triangle3", "intercept hard", "block")
+EXAMINED = ("hit", "catch throws", "catch triangle3", "intercept hard", "block")
 _SMALL = 0.05  # [s] programs that compile faster have no row, and only count in the sums
 # NAME of JAX's event /jax/core/compile/NAME_duration -> field of `Program` that sums its durations.
 _EVENTS = dict(jaxpr_trace="tracing", jaxpr_to_mlir_module="lowering", backend_compile="compiling")
 _HEAD = (
     "| planner | cases | program | versions | equations | tracing [s] | lowering [s] "
-    "| compiling [s] | first plan [s] |\n|---|---|---|---|---|---|---|---|---|"
+    "| compiling [s] | first plan [s] |",
+    "|---|---|---|---|---|---|---|---|---|",
 )
 
 
@@ -40,8 +49,6 @@ class Program:
 @contextlib.contextmanager
 def record_programs() -> Iterator[dict[str, Program]]:
     """Record the programs that JAX compiles in a `with` block; the record is complete after it."""
-    import jax
-
     programs: dict[str, Program] = collections.defaultdict(Program)
 
     def listen(event: str, duration_secs: float, **kwargs: str | int) -> None:
@@ -86,24 +93,31 @@ def format_rows(planner: str, num: int, seconds: float, programs: dict[str, Prog
     ]
 
 
-def report() -> None:
-    """Print the compiled programs of each task's default planner, for one case and for a batch."""
-    import jax
-    import numpy as np
+def main() -> None:
+    parser = argument_parser("compilation", __doc__, num=BATCH)
+    parser.add_argument(
+        "--tasks", default=",".join(EXAMINED), help="comma-separated: TASK or TASK SUITE"
+    )
+    options = parser.parse_args()
+    with begin(parser, options) as bench:
+        measure(bench, options.tasks.split(","), options.num)
 
-    from planner_jax.core.protocol import take
-    from planner_jax.core.registry import task_named
-    from planner_jax.planning.plan import plan
 
+def measure(bench: Bench, tasks: Sequence[str], size: int) -> None:
+    """Print the programs of each task's default planner, for one case and for a batch."""
     jax.config.update("jax_enable_compilation_cache", False)
-    print(f"Compiling the default planners, which takes minutes.\n{_HEAD}", flush=True)
-    for planner in _EXAMINED:
-        name, *suite = planner.split()
-        task = task_named(name)
-        batch = jax.tree.map(np.asarray, task.draw(BATCH, *suite))
-        for num, cases in ((1, take(batch, 0)), (BATCH, batch)):
+    bench.say(*_HEAD)
+    for name in tasks:
+        task, *suite = name.split()
+        batch = jax.tree.map(np.asarray, task_named(task).draw(size, *suite))
+        for num, cases in ((1, take(batch, 0)), (size, batch)):
             start = time.perf_counter()
             with record_programs() as programs:
-                jax.block_until_ready(plan(task.planner(), cases))
+                plans = jax.block_until_ready(plan(task_named(task).planner(), cases))
             seconds = time.perf_counter() - start
-            print("\n".join(format_rows(planner, num, seconds, programs)), flush=True)
+            bench.say(*format_rows(name, num, seconds, programs))
+            bench.count(np.atleast_1d(task_named(task).judge(cases, plans).success))
+
+
+if __name__ == "__main__":
+    main()
