@@ -1,5 +1,6 @@
-"""Conversions and comparisons of pytrees, leaf by leaf."""
+"""Conversions and comparisons of pytrees."""
 
+import chex
 import jax
 import numpy as np
 
@@ -9,7 +10,6 @@ def as_numpy(tree):
 
 
 def assert_same(ours, theirs, lanes=...):
-    """Assert that arrays of two pytrees have equal types, and equal values at indices `lanes`."""
-    for a, b in zip(jax.tree.leaves(ours), jax.tree.leaves(theirs), strict=True):
-        assert a.dtype == b.dtype
-        np.testing.assert_array_equal(np.asarray(a)[lanes], np.asarray(b)[lanes])
+    """Assert that pytrees have equal structures, shapes and types, and values at `lanes`."""
+    ours, theirs = (jax.tree.map(lambda leaf: np.asarray(leaf)[lanes], x) for x in (ours, theirs))
+    chex.assert_trees_all_equal(ours, theirs, strict=True)

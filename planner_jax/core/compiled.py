@@ -9,7 +9,7 @@ import contextvars
 import dataclasses
 import functools
 from collections.abc import Callable, Iterator
-from typing import Any, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 import jax
 import numpy as np
@@ -17,10 +17,13 @@ from jax.extend.backend import backends
 from jax.typing import ArrayLike
 
 Settings = TypeVar("Settings")
+Arguments = ParamSpec("Arguments")
+Result = TypeVar("Result")
 Options = dict[str, bool]  # options of XLA with which a program is compiled
 Treedef = Any  # a PyTreeDef, whose class JAX hides from type checkers
 
 _RUN_TIME: set[type] = set()
+_ARRAYS = (jax.Array, np.ndarray, np.generic)
 # Before version 0.11 of JAX, XLA also has an older code generator for CPUs. It needs 40 % less time
 # to compile. Its programs for a hit or catch are as fast, and steps of an arm in MJX far faster.
 _IS_OLD = jax.__version_info__ < (0, 11)
@@ -97,6 +100,29 @@ def cached_by_precision(load: Callable[..., Settings]) -> Callable[..., Settings
 def place_numbers(settings: Settings) -> Settings:
     """Return settings whose numbers are jax arrays, to be passed to a compiled program."""
     return settings
+
+
+def with_own_precision(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
+    """Let a function compute in float32 unless an argument holds numbers of double precision.
+
+    With `jax_enable_x64`, constants in NumPy arrays would otherwise promote parts of a program of
+    float32 cases to float64, and the branches of a `cond` would differ in type.
+    """
+
+    @functools.wraps(function)
+    def call(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
+        if not jax.config.jax_enable_x64 or _has_double((args, kwargs)):  # type: ignore[attr-defined]
+            return function(*args, **kwargs)
+        with jax.enable_x64(False):
+            return function(*args, **kwargs)
+
+    return call
+
+
+def _has_double(tree: object) -> bool:
+    arrays = [leaf for leaf in jax.tree.leaves(tree) if isinstance(leaf, _ARRAYS)]
+    on_devices = any(leaf.dtype.itemsize == 8 for leaf in arrays if isinstance(leaf, jax.Array))
+    return on_devices or any(leaf.dtype == np.float64 for leaf in arrays)
 
 
 _TRACED: contextvars.ContextVar[str | None] = contextvars.ContextVar("platform", default=None)

@@ -15,6 +15,7 @@ from jax import Array, lax
 from jaxtyping import PyTree
 
 from planner_jax.core.checks import require_kind
+from planner_jax.core.compiled import with_own_precision
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.origin import with_origin
 from planner_jax.core.planner import Planner, require_fit
@@ -90,6 +91,7 @@ def newton_refine(
     return state.point, state.slope
 
 
+@with_own_precision
 def optimal_plan(planner: Planner, case: PyTree, *, solver: LbfgsConfig | None = None) -> PyTree:
     """Return the plan at the local optimum near the planner's guess, differentiable by the case.
 

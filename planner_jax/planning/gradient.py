@@ -9,6 +9,7 @@ from flax import struct
 from jaxtyping import PyTree
 
 from planner_jax.core.checks import require_kind, require_switch
+from planner_jax.core.compiled import with_own_precision
 from planner_jax.core.errors import ArgumentTypeError
 from planner_jax.core.origin import with_origin
 from planner_jax.core.planner import PlanT
@@ -25,6 +26,7 @@ class PlanGradient(Gradient, Generic[PlanT]):
     plans: PlanT
 
 
+@with_own_precision
 def gradient(
     planner: PyTree,
     cases: PyTree,

@@ -13,6 +13,7 @@ from jax.core import Tracer
 from jaxtyping import PyTree
 
 from planner_jax.core.choices import require_size
+from planner_jax.core.compiled import with_own_precision
 from planner_jax.core.errors import ArgumentError, ArgumentTypeError, NotOffered
 from planner_jax.core.origin import with_origin, without_origin
 from planner_jax.core.planner import CaseT, Kind, Planner, PlanT, require_fit
@@ -199,6 +200,7 @@ class Driver:
         """True if the `time_limit` of `pj.plan` has passed."""
         return self.watch.is_over
 
+    @with_own_precision
     def __call__(
         self, planner: Planner, cases: PyTree, attempts: Sequence[Attempt] | None = None
     ) -> tuple[PyTree, PyTree]:

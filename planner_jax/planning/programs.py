@@ -243,7 +243,8 @@ def program_key(
     own = tuple((leaf.shape, leaf.dtype) for leaf in jax.tree.leaves(planner))
     lanes = tuple((leaf.shape[1:], leaf.dtype) for leaf in jax.tree.leaves(cases))
     loaded = planner.load_attempt(attempt, cases)
-    return jax.tree.structure((planner, loaded, cases)), own, lanes, num, compiles_quickly
+    tree = jax.tree.structure((planner, loaded, cases))
+    return tree, own, lanes, num, compiles_quickly, settings()
 
 
 def solve_one(planner: Planner, case: PyTree, attempt: Attempt) -> PyTree:

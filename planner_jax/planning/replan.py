@@ -9,6 +9,7 @@ from jax import Array
 from jaxtyping import PyTree
 
 from planner_jax.core.checks import numbers_of, require_kind
+from planner_jax.core.compiled import with_own_precision
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.origin import Located, move, with_origin, without_origin
 from planner_jax.core.planner import CaseT, PlanT, require_planner
@@ -78,6 +79,7 @@ def resolve_argument(name: str, given: PyTree, own: PyTree, elapsed: np.ndarray)
     return found
 
 
+@with_own_precision
 def replan(planner: PyTree, cases: PyTree, previous: PlanT, elapsed: PyTree, **news: Any) -> PlanT:
     """Plan again while a plan is executed, by a few iterations from the remainder of that plan.
 

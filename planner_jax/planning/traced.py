@@ -44,13 +44,17 @@ _PACKAGE = __name__.partition(".")[0]
 _FILES = Path(__file__).resolve().parents[1]
 _STARTED = time.time()  # [s], about the time when this process read the library's files
 Layout = Sequence[Any]  # shapes and types of arrays, as `jax.typeof` returns them
-# Settings of JAX that can change the program to which a function is traced.
+# Settings of JAX that can change the program to which a function is traced, or make its trace fail.
 _read_settings = operator.attrgetter(
     "jax_enable_x64",
     "jax_default_matmul_precision",
     "jax_default_prng_impl",
     "jax_threefry_partitionable",
+    "jax_random_seed_offset",
     "jax_numpy_dtype_promotion",
+    "jax_numpy_rank_promotion",
+    "jax_use_direct_linearize",
+    "jax_check_tracer_leaks",
     "jax_debug_nans",
 )
 # `jax.export` by default rejects Triton kernels of Pallas, since another version of JAX may not run

@@ -36,18 +36,19 @@ def centre(
     Raises:
         ValueError: the shapes do not match, or the arrays hold fewer than `least` observations.
     """
-    times, positions = jnp.asarray(times), jnp.asarray(positions)
+    # A NumPy array is converted by its type: JAX 0.10 would remember its float32 copy, also for calls
+    # with `jax_enable_x64`.
+    dtype = jnp.promote_types(jnp.result_type(times, positions), jnp.float32)
+    times, positions = jnp.asarray(times, dtype), jnp.asarray(positions, dtype)
     if times.ndim != 1 or positions.shape != (*times.shape, 2):
         raise ArgumentError(
             "times", "(L,) and positions (L, 2)", shown=f"{times.shape} and {positions.shape}"
         )
     if times.shape[0] < least:
         raise ArgumentError("times", f"of at least {least} observations", times.shape[0])
-    dtype = jnp.promote_types(jnp.result_type(times, positions), jnp.float32)
     given = jnp.ones(times.shape, dtype) if weights is None else jnp.asarray(weights, dtype)
     if given.shape != times.shape:
         raise ArgumentError("weights", f"(L,) as times {times.shape}", given.shape)
-    times, positions = times.astype(dtype), positions.astype(dtype)
     present = jnp.isfinite(times) & jnp.all(jnp.isfinite(positions), axis=-1) & (given > 0.0)
     weight = jnp.where(present, given, 0.0)
     total = jnp.where(jnp.any(present), jnp.sum(weight), 1.0)
