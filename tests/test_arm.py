@@ -1,6 +1,7 @@
 import dataclasses
 from pathlib import Path
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -237,8 +238,8 @@ def test_a_batch_is_a_loop():
     batch = everything(arm, *motion)
     for k in range(len(angles)):
         alone = one_at(without_capsules(arm), *(each[k] for each in motion))
-        for a, b in zip(jax.tree.leaves(alone), jax.tree.leaves(batch), strict=True):
-            np.testing.assert_allclose(a, b[k], atol=2e-4)
+        of_batch = jax.tree.map(lambda leaf, k=k: leaf[k], batch)
+        chex.assert_trees_all_close(alone, of_batch, rtol=1e-7, atol=2e-4)
 
 
 def test_every_product_asks_for_full_precision():

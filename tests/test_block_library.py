@@ -25,6 +25,7 @@ from planner_jax.robot.arm import REGIMES
 from planner_jax.robot.arm_file import irb1600
 from planner_jax.task.block.motion import profiles
 from planner_jax.task.block.scene import Box, paper_scene
+from tests.trees import assert_same
 
 TINY = Layout((Face(0, 1, (2, 2)), Face(2, 1, (1, 2))), (Face(0, 1, (2, 2)),))
 PIECES = 4
@@ -234,10 +235,7 @@ def test_a_file_holds_the_library_bit_for_bit(tmp_path):
     library, path = make_library(homes=2), tmp_path / "a.lib"
     save_library(path, library)
     again = load_library(path)
-    for a, b in zip(jax.tree.leaves(library), jax.tree.leaves(again), strict=True):
-        assert np.asarray(a).dtype == np.asarray(b).dtype
-        np.testing.assert_array_equal(a, b)
-    assert jax.tree.structure(library) == jax.tree.structure(again)
+    assert_same(library, again)
     LibraryBlock(again).check(pj.block.draw(1))
     assert not list(tmp_path.glob("*.tmp"))
 

@@ -1,5 +1,6 @@
 import dataclasses
 
+import chex
 import jax
 import numpy as np
 import pytest
@@ -76,8 +77,7 @@ def test_a_batch_is_its_cases(throws):
     for k in range(6):
         targets = take(task.case.targets, k)
         own = AGAIN.begin(take(cases, k), take(plans, k), elapsed[k], targets=targets)
-        for one, many in zip(*map(jax.tree.leaves, (own, take(task, k))), strict=True):
-            np.testing.assert_allclose(one, many, rtol=1e-4, atol=1e-4)
+        chex.assert_trees_all_close(own, take(task, k), rtol=1e-4, atol=1e-4)
         alone = plan(AGAIN, own)
         np.testing.assert_allclose(alone.times, together.times[k], atol=2e-3)
         np.testing.assert_allclose(alone.cost, together.cost[k], rtol=0.02, atol=1e-6)

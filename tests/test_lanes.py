@@ -2,6 +2,7 @@
 
 import functools
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -64,10 +65,8 @@ def by_vmap(name):
 @pytest.mark.parametrize("name", FUNCTIONS)
 def test_it_equals_vmap_with_the_lanes_last(name, float64):
     expected, found = by_vmap(name), jax.jit(over_lanes(FUNCTIONS[name]))(*lanes())
-    assert jax.tree.structure(found) == jax.tree.structure(expected)
-    for ours, theirs in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
-        assert ours.dtype == theirs.dtype
-        np.testing.assert_allclose(ours, theirs, rtol=1e-12, atol=1e-14)
+    chex.assert_trees_all_equal_shapes_and_dtypes(found, expected)
+    chex.assert_trees_all_close(found, expected, rtol=1e-12, atol=1e-14)
 
 
 def test_a_shared_matrix_makes_one_product_and_no_gather():

@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -63,8 +64,7 @@ def test_a_hit_far_away_has_the_numbers_of_the_same_hit_at_the_origin():
 @pytest.mark.parametrize("path", [ball_path, table, flight])
 def test_a_catch_far_away_has_the_numbers_of_the_same_catch_at_the_origin(path):
     near, far = catch(path()), catch(path(AWAY), AWAY)
-    for a, b in zip(*(jax.tree.leaves(x) for x in (far.replace(origin=None), near)), strict=True):
-        np.testing.assert_allclose(a, b, rtol=1e-6, atol=2e-6)
+    chex.assert_trees_all_close(far.replace(origin=None), near, rtol=1e-6, atol=2e-6)
 
 
 def test_the_origin_of_a_batch_is_near_its_first_start():

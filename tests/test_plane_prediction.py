@@ -1,5 +1,6 @@
 """Predicted target positions: fits, selection of a model, and Cramer-Rao bound."""
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -67,11 +68,6 @@ def at(polynomial, times):
     return np.stack([np.polyval(column, passed) for column in coeffs.T], -1)
 
 
-def assert_same(found, expected, rtol, atol=0.0):
-    for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
-        np.testing.assert_allclose(one, other, rtol=rtol, atol=atol)
-
-
 @float64
 def test_a_polynomial_minimises_the_weighted_squares():
     seen, weights = noisy(TURN), np.linspace(0.5, 2.0, 15)
@@ -105,7 +101,8 @@ def test_absent_observations_have_no_effect():
     wild, order = noisy(TURN), np.random.default_rng(3).permutation(15)
     wild[other == 0.0] = 9.0
     again = predict(TIMES[order], wild[order], NOISE, other[order])
-    assert_same(predict(times, seen, NOISE, weights), again, rtol=1e-7, atol=1e-9)
+    found = predict(times, seen, NOISE, weights)
+    chex.assert_trees_all_close(found, again, rtol=1e-7, atol=1e-9)
 
 
 @pytest.mark.parametrize("precision", ["single", "double"])
@@ -128,7 +125,8 @@ def test_a_turn_with_noise_minimises_the_squares():
         return np.ravel(positions_on(path(x[:2], x[2:4], x[4]), TIMES) - seen)
 
     best = least_squares(residuals, [3.0, 4.0, 0.3, -0.2, 0.06], xtol=1e-12, ftol=1e-12).x
-    assert_same(turn(TIMES, seen), path(best[:2], best[2:4], best[4]), rtol=1e-5)
+    expected = path(best[:2], best[2:4], best[4])
+    chex.assert_trees_all_close(turn(TIMES, seen), expected, rtol=1e-5)
 
 
 def test_few_straight_targets_count_as_turning_and_few_predictions_are_far_off():
@@ -155,7 +153,8 @@ def test_a_batch_in_single_precision_equals_its_targets_one_by_one_in_double():
     with jax.enable_x64(True):
         for k in range(len(seen)):
             one = predict(TIMES, seen[k], NOISE)
-            assert_same(jax.tree.map(lambda leaf, k=k: leaf[k], found), one, rtol=2e-3, atol=1e-3)
+            of_batch = jax.tree.map(lambda leaf, k=k: leaf[k], found)
+            chex.assert_trees_all_close(of_batch, one, rtol=2e-3, atol=1e-3)
 
 
 @float64

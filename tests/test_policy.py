@@ -4,6 +4,7 @@ import dataclasses
 import json
 from typing import Any
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -249,6 +250,7 @@ def test_bad_settings_of_a_training_are_a_line(given, says, capsys, tmp_path):
 def test_cases_drawn_by_a_key_are_of_the_suites_distribution(suite):
     by_key = jax.jit(draw_by_key, static_argnums=(1, 2))(jax.random.key(1), 4000, suite)
     drawn = pj.catch.draw(4000, suite, 3)
+    chex.assert_trees_all_equal_shapes_and_dtypes(by_key, drawn)
     for a, b in zip(jax.tree.leaves(by_key), jax.tree.leaves(drawn), strict=True):
         a, b = np.asarray(a, float), np.asarray(b, float)
         spread = b.std(axis=0) + 1e-6

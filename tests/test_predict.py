@@ -1,5 +1,6 @@
 """Predictions of targets from noisy observations, and how uncertain they are stated to be."""
 
+import chex
 import jax
 import numpy as np
 import pytest
@@ -102,8 +103,7 @@ def test_order_and_absent_observations_do_not_matter():
     more = np.append(times, [np.nan, -1.0])[order]
     seen = np.vstack([positions, [1.0, 1.0], [np.nan, 2.0]])[order]
     found = predict(more, seen)
-    for one, other in zip(*map(jax.tree.leaves, (found.path, expected.path)), strict=True):
-        np.testing.assert_array_equal(one, other)
+    chex.assert_trees_all_equal(found.path, expected.path)
     assert found.radius(3.0) == expected.radius(3.0)
 
 
@@ -117,8 +117,8 @@ def test_a_batch_equals_a_loop_over_its_targets():
         assert batch.has_changed[k] == one.has_changed and radii[k] == pytest.approx(
             one.radius(3.0)
         )
-        for leaf, other in zip(*map(jax.tree.leaves, (batch.path, one.path)), strict=True):
-            np.testing.assert_allclose(leaf[k], other, rtol=1e-9, atol=1e-12)
+        path = jax.tree.map(lambda leaf, k=k: leaf[k], batch.path)
+        chex.assert_trees_all_close(path, one.path, rtol=1e-9, atol=1e-12)
 
 
 def test_a_turn_is_expected_to_last_as_long_again():

@@ -49,8 +49,12 @@ def congruence(A: Array, P: Array) -> Array:
 
 def solve_definite(A: Array, B: Array) -> Array:
     """Solve A X = B for X (m, n) by unrolled elimination; A (m, m) must be positive definite."""
+    import chex  # only where a function is traced, as its import takes a tenth of a second
+
     U, X = list(A), list(B)
     size = len(U)
+    chex.assert_shape(A, (size, size))
+    chex.assert_shape(B, (size, ...))
     for i in range(size):
         for j in range(i + 1, size):
             factor = U[j][i] / U[i][i]
@@ -73,6 +77,9 @@ def ekf_init(
             float32 vel_std * (time between observations) should be below 1000 times the standard
             deviation of an observed position, as larger covariances have large rounding errors.
     """
+    import chex
+
+    chex.assert_shape([pos, vel], (3,))
     std = jnp.concatenate([jnp.ones_like(pos) * pos_std, jnp.ones_like(vel) * vel_std])
     return EkfState(mean=jnp.concatenate([pos, vel]), covariance=jnp.diag(std**2))
 
@@ -86,6 +93,9 @@ def ekf_predict(
     a white acceleration causes during `duration`. With `linear_drag_flight` this is [Yu2023catch,
     eq. 10], except that the paper neglects the acceleration when it predicts the position.
     """
+    import chex
+
+    chex.assert_shape([state.mean, state.covariance, duration], [(6,), (6, 6), ()])
 
     def transition(mean: Array) -> Array:
         after = flight(BallState(pos=mean[:3], vel=mean[3:]), duration, model.drag, model.gravity)
@@ -106,6 +116,9 @@ def ekf_update(state: EkfState, observation: Float[Array, "3"], model: EkfModel)
     which stays positive definite in float32. Only `observation_std` of the model is used. If a
     coordinate of the observation is not finite, the belief is returned unchanged.
     """
+    import chex
+
+    chex.assert_shape([observation, state.mean, state.covariance], [(3,), (6,), (6, 6)])
     observed = jnp.all(jnp.isfinite(observation))
     dtype = state.mean.dtype
     R = jnp.diag(jnp.ones(3, dtype) * model.observation_std**2)

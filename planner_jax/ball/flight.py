@@ -182,6 +182,9 @@ def solve_impact(ball_vel: Array, ball_vel_after: Array, restitution: Array) -> 
     The bounce changes the ball's velocity v- to v+. The normal has the direction of v+ - v-; in
     [Yu2023bat, eqs 11 and 12] normal and speed have the opposite sign.
     """
+    import chex  # only where a function is traced, as its import takes a tenth of a second
+
+    chex.assert_shape([ball_vel, ball_vel_after, restitution], [(3,), (3,), ()])
     change = ball_vel_after - ball_vel
     size_squared = jnp.sum(change**2)
     normal = change * inverse_sqrt(jnp.where(size_squared > 0.0, size_squared, 1.0))

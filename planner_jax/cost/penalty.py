@@ -48,9 +48,13 @@ def greatest_by_parabolas(values: Array, times: np.ndarray) -> Array:
 
     For a smooth quantity the error is of third order in the step. `times` (K,) are in any unit.
     """
+    import chex  # only where a function is traced, as its import takes a tenth of a second
+
+    chex.assert_equal_shape([values, times])
+    chex.assert_rank(values, 1)
     before, after = np.diff(times)[:-1], np.diff(times)[1:]
     rise = peak_above(values[:-2], values[1:-1], values[2:], before, after)
-    return jnp.max(values + jnp.pad(rise, 1))
+    return jnp.max(values + jnp.pad(rise.astype(values.dtype), 1))
 
 
 def peak_above(
@@ -75,6 +79,10 @@ def greatest_by_tangents(values: Array, slopes: Array, step: Array) -> Array:
     `slopes` (K,) are time derivatives, and samples are a time `step` apart. The result is never
     below the true peak if the quantity is concave between samples.
     """
+    import chex  # as above
+
+    chex.assert_equal_shape([values, slopes])
+    chex.assert_rank([values, step], [1, 0])
     first, second = values[:-1], values[1:]
     bend = slopes[:-1] - slopes[1:]
     # The tangents intersect at `place / bend` after the first sample.

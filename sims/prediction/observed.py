@@ -36,8 +36,7 @@ def centre(
     Raises:
         ValueError: the shapes do not match, or the arrays hold fewer than `least` observations.
     """
-    # A NumPy array is converted by its type: JAX 0.10 would remember its float32 copy, also for calls
-    # with `jax_enable_x64`.
+    # NumPy converts the types, since JAX 0.10 remembers the first precision of a NumPy array.
     dtype = jnp.promote_types(jnp.result_type(times, positions), jnp.float32)
     times, positions = jnp.asarray(times, dtype), jnp.asarray(positions, dtype)
     if times.ndim != 1 or positions.shape != (*times.shape, 2):

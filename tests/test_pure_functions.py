@@ -1,0 +1,170 @@
+"""One table of pure functions of balls, of targets in the plane and of costs.
+
+Each has a value in closed form, which it returns compiled or not, of arrays on the host or on the
+device. Its derivatives agree with finite differences, and its results have its arguments' types.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from absl.testing import parameterized
+
+from planner_jax.ball import flight
+from planner_jax.ball.estimation import (
+    EkfModel,
+    congruence,
+    ekf_init,
+    ekf_predict,
+    ekf_update,
+    solve_definite,
+)
+from planner_jax.ball.flight import BallState
+from planner_jax.cost import penalty
+from planner_jax.plane.target import PolynomialPath, TurningPath
+
+TIME, GRAVITY, DRAG, WIDTH = 0.7, 9.81, 0.3, 0.2
+POS, VEL = np.array([0.3, -0.2, 2.0]), np.array([3.0, -4.0, 12.0])  # a speed of 13 m/s
+DOWN = np.array([0.0, 0.0, -GRAVITY])
+ROOT = np.array([[2.0, 0.3, -0.4], [0.1, 1.5, 0.2], [0.0, -0.3, 1.2]])
+SPREAD = np.diag([1.0, 2.0, 3.0])
+NODES = np.linspace(0.0, 1.0, 6)
+MODEL = EkfModel(drag=0.0, gravity=GRAVITY, acceleration_density=0.0, observation_std=0.1)
+
+
+class Row(NamedTuple):
+    function: Callable
+    arguments: tuple
+    expected: Any
+    order: int = 2  # greatest order of the derivatives that are checked
+
+
+def turn(pos, vel, rate, time):
+    return TurningPath(pos, vel, rate).at(time)
+
+
+def of_polynomial(coeffs, time):
+    return PolynomialPath(coeffs, 0.0 * time).at(time).pos
+
+
+def after_parabola(a, b):  # of samples of a t - b t^2, which is greatest at t = a / (2 b)
+    nodes = jnp.asarray(NODES, a.dtype)
+    return penalty.greatest_by_parabolas(a * nodes - b * nodes**2, NODES)
+
+
+def after_lines(height, slope):  # of a roof whose sides rise and fall by `slope`
+    side = jnp.asarray(0.5 - NODES, slope.dtype)
+    values, slopes = height - slope * jnp.abs(side), slope * jnp.sign(side)
+    return penalty.greatest_by_tangents(values, slopes, jnp.asarray(NODES[1], slope.dtype))
+
+
+def observe(pos, vel, seen):
+    return ekf_update(ekf_init(pos, vel, pos_std=0.1, vel_std=1.0), seen, MODEL).mean
+
+
+DECAY = np.exp(-DRAG * TIME)
+FALLING = np.array([2.0, 1.0, -3.0])
+ROWS = {
+    "acceleration": Row(
+        lambda vel: flight.ball_acceleration(vel, DRAG, GRAVITY), (VEL,), DOWN - DRAG * 13.0 * VEL
+    ),
+    "linear drag": Row(
+        lambda pos, vel: flight.linear_drag_flight(BallState(pos, vel), TIME, DRAG, GRAVITY),
+        (POS, VEL),
+        BallState(
+            POS + (VEL - DOWN / DRAG) * (1.0 - DECAY) / DRAG + DOWN / DRAG * TIME,
+            DOWN / DRAG + (VEL - DOWN / DRAG) * DECAY,
+        ),
+    ),
+    "no drag": Row(
+        lambda pos, vel: flight.rk4_step(BallState(pos, vel), TIME, 0.0, GRAVITY),
+        (POS, VEL),
+        BallState(POS + VEL * TIME + 0.5 * DOWN * TIME**2, VEL + DOWN * TIME),
+    ),
+    "apex": Row(
+        lambda pos, vel: flight.drag_free_apex(BallState(pos, vel), GRAVITY),
+        (POS, VEL),
+        2.0 + 144.0 / (2.0 * GRAVITY),
+    ),
+    "impact": Row(
+        lambda before, after: flight.solve_impact(before, after, 0.5),
+        (FALLING, FALLING + [0.0, 0.0, 9.0]),
+        (np.array([0.0, 0.0, 1.0]), (0.5 * -3.0 + 6.0) / 1.5),
+    ),
+    "congruence": Row(congruence, (ROOT, SPREAD), ROOT @ SPREAD @ ROOT.T),
+    "definite": Row(solve_definite, (ROOT @ ROOT.T, ROOT), np.linalg.solve(ROOT @ ROOT.T, ROOT)),
+    # Observation and belief have the same deviation, so that the mean is the middle of both.
+    "update": Row(observe, (POS, VEL, POS + 0.2), np.append(POS + 0.1, VEL)),
+    "turn": Row(
+        lambda pos, vel, rate: turn(pos, vel, rate, 0.5 * np.pi / 0.4).pos,
+        (np.array([1.0, 2.0]), np.array([0.8, 0.0]), np.array(0.4)),
+        np.array([1.0 + 0.8 / 0.4, 2.0 + 0.8 / 0.4]),  # a quarter of a circle of the radius v / w
+    ),
+    "polynomial": Row(
+        of_polynomial,
+        (np.array([[1.0, 2.0], [3.0, 4.0], [0.5, 1.0]]), np.array(2.0)),
+        np.array([9.0, 14.0]),
+    ),
+    "below a limit": Row(lambda x: penalty.smooth_hinge(x, WIDTH), (np.array(-0.3),), 0.0),
+    "above a limit": Row(lambda x: penalty.smooth_hinge(x, WIDTH), (np.array(0.5),), 0.4),
+    "at a limit": Row(  # (mu - x / 2) (x / mu)^3 at x = mu / 2
+        lambda x: penalty.smooth_hinge(x, WIDTH), (np.array(0.1),), 0.75 * WIDTH / 8.0
+    ),
+    "parabola": Row(after_parabola, (np.array(2.6), np.array(2.0)), 2.6**2 / 8.0),
+    "roof": Row(after_lines, (np.array(1.4), np.array(3.0)), 1.4),
+}
+each = parameterized.named_parameters(*((name, name) for name in ROWS))
+
+
+def as_type(tree, dtype):
+    return jax.tree.map(lambda leaf: np.asarray(leaf, dtype), tree)
+
+
+class TestPureFunctions(chex.TestCase):
+    @chex.all_variants(with_pmap=False)
+    @each
+    def test_a_function_has_its_closed_form_in_every_variant(self, name):
+        row = ROWS[name]
+        found = self.variant(row.function)(*as_type(row.arguments, np.float32))
+        expected = as_type(row.expected, np.float32)
+        chex.assert_trees_all_equal_shapes_and_dtypes(found, expected)
+        chex.assert_trees_all_close(found, expected, rtol=1e-5, atol=1e-5)
+
+    @each
+    def test_results_have_the_types_of_arguments_under_x64(self, name):
+        function, arguments, expected, _ = ROWS[name]
+        with jax.enable_x64(True):
+            for dtype in (np.float32, np.float64):
+                found = jax.eval_shape(function, *as_type(arguments, dtype))
+                chex.assert_trees_all_equal_shapes_and_dtypes(found, as_type(expected, dtype))
+
+    @each
+    @pytest.mark.slow
+    def test_derivatives_agree_with_finite_differences(self, name):
+        function, arguments, _, order = ROWS[name]
+        with jax.enable_x64(True):
+            chex.assert_numerical_grads(
+                jax.jit(function), as_type(arguments, np.float64), order, atol=1e-5, rtol=1e-5
+            )
+
+
+THREE = np.zeros(3)
+
+
+@pytest.mark.parametrize(
+    ("function", "arguments"),
+    [
+        (solve_definite, (np.eye(2), np.ones((3, 1)))),
+        (ekf_predict, (ekf_init(THREE, THREE, pos_std=1.0, vel_std=1.0), np.ones(3), MODEL)),
+        (flight.solve_impact, (np.ones((2, 3)), np.zeros((2, 3)), 0.5)),
+        (lambda values: penalty.greatest_by_parabolas(values, NODES), (np.ones((6, 1)),)),
+        (penalty.greatest_by_tangents, (np.ones(6), np.ones((6, 1)), 0.1)),
+    ],
+)
+def test_shapes_that_would_broadcast_are_refused(function, arguments):
+    with pytest.raises(AssertionError, match="shape|rank"):
+        jax.eval_shape(function, *arguments)
