@@ -190,6 +190,8 @@ class Attempt:
     starts: int = 1  # number of starting points from which each case is solved
     # Greatest violation (relative excess over a limit) for a further search; None: no bound.
     within: float | None = dataclasses.field(default=None, kw_only=True)
+    # Whether solved cases are searched, too. The plan that costs less is selected.
+    improves: bool = dataclasses.field(default=False, kw_only=True)
 
     def __post_init__(self) -> None:
         require_size("starts", self.starts)
@@ -197,9 +199,14 @@ class Attempt:
             require_number("within", self.within, POSITIVE)
 
     def is_due(self, plans: "Plan") -> Array:
-        """Return which plans need this search, bool: unsolved, and violation <= `within`."""
-        unsolved = is_unsolved(plans.status)
-        return unsolved if self.within is None else unsolved & (plans.violation <= self.within)
+        """Return which plans need this search, bool: unsolved, and violation <= `within`.
+
+        If the search improves plans, solved plans need it, too.
+        """
+        due = is_unsolved(plans.status)
+        if self.within is not None:
+            due &= plans.violation <= self.within
+        return due | is_solved(plans.status) if self.improves else due
 
 
 PlanT = TypeVar("PlanT", bound=Plan)
@@ -233,7 +240,8 @@ Tree = TypeVar("Tree")
 
 
 def mark_out_of_time(plans: PlanT, left: Numbers | bool) -> PlanT:
-    """Return the plans with the status `OUT_OF_TIME` where `left` is true."""
+    """Return the plans with the status `OUT_OF_TIME` where `left` is true and none is solved."""
+    left = left & ~is_solved(plans.status)
     status = numpy_of(plans.status).where(left, Status.OUT_OF_TIME, plans.status).astype(np.int32)
     return dataclasses.replace(plans, status=status)  # type: ignore[type-var]
 

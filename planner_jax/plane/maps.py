@@ -3,17 +3,26 @@
 import dataclasses
 import math
 import os
+import re
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from planner_jax.core.checks import numbers_of, numeric, require_number
-from planner_jax.core.choices import require_size
-from planner_jax.core.errors import ArgumentTypeError, PlannerJaxError
-from planner_jax.core.rules import POSITIVE
+from planner_jax.core.choices import require, require_one_of, require_size
+from planner_jax.core.errors import ArgumentError, ArgumentTypeError, PlannerJaxError
+from planner_jax.core.rules import FINITE, POSITIVE, Rule, within
 from planner_jax.host.files import open_plain
 from planner_jax.host.yaml_files import read_fields
+
+
+_FIELDS = ("image", "resolution", "origin", "negate", "occupied_thresh", "free_thresh", "mode")
+_SHARE = within(0.0, 1.0, "from 0 to 1")
+_MOST_PIXELS = 1 << 24  # greatest number of pixels of a map, as 4096 x 4096
+_HEADER = 1 << 12  # [B] in which the header of a PGM file ends, with its comments
+MOST_WALLS = 10_000  # greatest number of rectangles that cover a grid
 
 
 class MapError(PlannerJaxError, ValueError):
@@ -29,8 +38,19 @@ class OccupancyMap:
     origin: tuple[float, float, float]  # x, y [m] of the map's corner of cell (0, 0), yaw [rad]
 
     def walls(self, coarsen: int = 1) -> list[np.ndarray]:
-        """Return few rectangles (4, 2) [m] that cover the occupied cells; see `walls_of_grid`."""
-        return walls_of_grid(self.occupied, self.resolution, self.origin, coarsen=coarsen)
+        """Return polygons (V, 2) [m] that cover the occupied cells, and what no cell covers.
+
+        The rectangles of `walls_of_grid` come first. If the grid is turned, four triangles follow.
+        They cover the area from `lower` to `upper` that lies outside of the grid.
+        """
+        walls = walls_of_grid(self.occupied, self.resolution, self.origin, coarsen=coarsen)
+        corners = self._corners()
+        for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+            along, across = b - a
+            if min(abs(along), abs(across)) > 1e-3 * self.resolution:
+                right = (b[0], a[1]) if along * across > 0.0 else (a[0], b[1])
+                walls.append(np.array([a, right, b]))
+        return walls
 
     @property
     def lower(self) -> np.ndarray:
@@ -72,7 +92,8 @@ def walls_of_grid(
 
     Raises:
         ArgumentTypeError: `occupied` is not a bool array with two axes.
-        ArgumentError: a number is out of its range, or `origin` has another shape.
+        ArgumentError: a number is out of its range, `origin` has another shape, or more than 10,000
+            rectangles would be needed.
     """
     cells = numeric(occupied)
     if cells is None or cells.dtype != np.bool_ or cells.ndim != 2:
@@ -112,17 +133,23 @@ def _cover(cells: np.ndarray) -> list[tuple[int, int, int, int]]:
     Each rectangle begins at the first cell that no rectangle covers. It is grown along its row and
     then across, or along its column and then across, whichever covers more new cells.
     """
+    # Numbers of occupied cells before each cell in its row, and in its column.
+    left = np.cumsum(np.pad(cells, [(0, 0), (1, 0)]), axis=1, dtype=np.int32)
+    below = np.cumsum(np.pad(cells, [(1, 0), (0, 0)]), axis=0, dtype=np.int32)
     free, found = cells.copy(), []
-    for row, column in np.argwhere(cells):
-        if not free[row, column]:
-            continue
-        low, high = _grow(cells[row], column)
-        one = (*_grow(np.asarray(cells[:, low:high].all(axis=1)), row), low, high)
-        low, high = _grow(cells[:, column], row)
-        two = (low, high, *_grow(np.asarray(cells[low:high].all(axis=0)), column))
-        best = max((one, two), key=lambda r: free[r[0] : r[1], r[2] : r[3]].sum())
-        free[best[0] : best[1], best[2] : best[3]] = False
-        found.append(best)
+    for row, line in enumerate(free):
+        while line.any():
+            column = int(line.argmax())
+            low, high = _grow(cells[row], column)
+            one = (*_grow(left[:, high] - left[:, low] == high - low, row), low, high)
+            low, high = _grow(cells[:, column], row)
+            two = (low, high, *_grow(below[high] - below[low] == high - low, column))
+            best = max((one, two), key=lambda r: free[r[0] : r[1], r[2] : r[3]].sum())
+            free[best[0] : best[1], best[2] : best[3]] = False
+            found.append(best)
+            if len(found) > MOST_WALLS:
+                rule = f"covered by at most {MOST_WALLS:,} rectangles (a greater coarsen needs fewer)"
+                raise ArgumentError("occupied", rule, shown=f"{cells.sum():,} occupied cells")
     return found
 
 
@@ -141,60 +168,76 @@ def read_map(path: str | os.PathLike, *, unknown_is_free: bool = False) -> Occup
     if the darkness is below `free_thresh`, and unknown otherwise, or if its pixel is transparent.
 
     Args:
-        path: path of the YAML file. The image is a PGM (P2, P5) or PNG file.
+        path: path of the YAML file. The image is a PGM (P2, P5) or PNG file of at most 2^24 pixels.
         unknown_is_free: whether unknown cells are free; by default they count as occupied.
 
     Raises:
-        MapError: a field is missing or invalid, or the image cannot be read.
+        MapError: a field is missing, unknown or invalid, or the image cannot be read.
         OSError: the YAML file cannot be read.
     """
     place = Path(path)
     try:
-        fields = read_fields(place)
+        return _read_map(place, read_fields(place), unknown_is_free)
     except ValueError as error:
         raise MapError(f"{place}: {error}") from None
-    resolution = _number(place, fields, "resolution")
-    if resolution <= 0.0:
-        raise MapError(f"{place}: resolution must be > 0, got {resolution:g}")
+
+
+def _read_map(place: Path, fields: Mapping, unknown_is_free: bool) -> OccupancyMap:
+    for name in fields:
+        require_one_of(_FIELDS, "field", name)
+    resolution = _number("resolution", fields.get("resolution"), POSITIVE)
     origin = fields.get("origin")
     if not isinstance(origin, list) or len(origin) != 3:
-        raise MapError(f"{place}: origin must be a list of x, y and yaw, got {origin!r:.60}")
-    x, y, yaw = (_number(place, dict(enumerate(origin)), k, "origin") for k in range(3))
-    if (mode := fields.get("mode", "trinary")) != "trinary":
-        raise MapError(f"{place}: mode must be trinary, got {mode!r:.60}")
-    image = fields.get("image")
-    if not isinstance(image, str):
-        raise MapError(f"{place}: image must name a file, got {image!r:.60}")
-    lightness, is_opaque = _read_image(place, place.parent / image)
-    darkness = lightness if _number(place, fields, "negate", usual=0.0) else 1.0 - lightness
-    occupied = darkness > _number(place, fields, "occupied_thresh", usual=0.65)
+        raise ArgumentError("origin", "a list of x, y and yaw", origin)
+    x, y, yaw = (_number("origin", value) for value in origin)
+    require_one_of(("trinary",), "mode", fields.get("mode", "trinary"))
+    if not isinstance(image := fields.get("image"), str):
+        raise ArgumentError("image", "the name of a file", image)
+    require((negate := fields.get("negate", 0)) in (0, 1), "negate", "0 or 1", negate)
+    occupied_thresh = _number("occupied_thresh", fields.get("occupied_thresh", 0.65), _SHARE)
+    free_thresh = _number("free_thresh", fields.get("free_thresh", 0.196), _SHARE)
+    rule = f"below occupied_thresh, {occupied_thresh:g}"
+    require(free_thresh < occupied_thresh, "free_thresh", rule, free_thresh)
+    level, lightness, is_opaque = _read_image(place.parent / image)
+    darkness = lightness if negate else 1.0 - lightness
+    occupied = (darkness > occupied_thresh)[level]
     if not unknown_is_free:
-        occupied |= ~(darkness < _number(place, fields, "free_thresh", usual=0.196))
+        occupied |= (darkness >= free_thresh)[level]
         occupied |= ~is_opaque
     return OccupancyMap(occupied[::-1], resolution, (x, y, yaw))  # the image's first row is on top
 
 
-def _number(
-    place: Path, fields: Mapping, key: object, name: str = "", usual: float | None = None
-) -> float:
-    value = fields.get(key, usual)
-    number = float(value) if isinstance(value, int | float) else math.nan
-    if not math.isfinite(number):
-        raise MapError(f"{place}: {name or key} must be a finite number, got {value!r:.60}")
-    return number
+def _number(name: str, value: object, rule: Rule = FINITE) -> float:
+    require_number(name, value, rule)
+    return float(value)  # type: ignore[arg-type]
 
 
-def _read_image(place: Path, path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Return lightness (H, W), from 0 for black to 1 for white, and which pixels are opaque."""
+def _read_image(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return levels (H, W), lightness (L,) of each level, and which pixels (H, W) are opaque.
+
+    The lightness is 0 for black and 1 for white.
+    """
     from PIL import Image
 
     try:
-        with open_plain(path) as file, Image.open(file, formats=("PPM", "PNG")) as image:
-            if image.mode.startswith("I"):  # 16 bits
-                lightness = np.asarray(image, float) / 65535.0
-                return lightness, np.ones(lightness.shape, bool)
-            pixels = np.asarray(image.convert("RGBA"))
+        with open_plain(path) as file:
+            # Pillow skips comments byte by byte.
+            start = file.read(_HEADER)
+            header = re.match(rb"P[25](?:\s+(?:#.*\s+)*\d+){3}\s", start)
+            if start.startswith((b"P2", b"P5")) and not header:
+                raise ValueError(f"its header is incomplete or longer than {_HEADER} bytes")
+            file.seek(0)
+            with warnings.catch_warnings(), Image.open(file, formats=("PPM", "PNG")) as image:
+                warnings.simplefilter("error", Image.DecompressionBombWarning)
+                if math.prod(image.size) > _MOST_PIXELS:
+                    raise ValueError(f"it has {image.size[0]} x {image.size[1]} pixels")
+                if image.mode.startswith("I"):  # 16 bits
+                    level = np.asarray(image).astype(np.uint16)
+                    return level, np.arange(65536) / 65535.0, np.ones(level.shape, bool)
+                pixels = np.asarray(image.convert("RGBA"))
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         problem = " ".join(str(error).split())[:120]
-        raise MapError(f"{place}: image must be a PGM or PNG file: {problem}") from None
-    return pixels[..., :3].mean(axis=2) / 255.0, pixels[..., 3] == 255
+        rule = f"a PGM or PNG file of at most {_MOST_PIXELS:,} pixels: {problem}"
+        raise ArgumentError("image", rule, shown="") from None
+    level = pixels[..., :3].sum(axis=2, dtype=np.uint16)
+    return level, np.arange(766) / 3.0 / 255.0, pixels[..., 3] == 255

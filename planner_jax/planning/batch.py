@@ -314,8 +314,8 @@ class _Batch:
         plans, unsolved = self._first_plans(first, cases)
         for attempt in others:
             before, due = plans.status, unsolved
-            if attempt.within is not None:
-                before, due = _mark_due(mesh, attempt.within, plans)
+            if attempt.within is not None or attempt.improves:
+                before, due = _mark_due(mesh, attempt, plans)
             due.copy_to_host_async()  # the copy starts as soon as the number is computed
             most = np.asarray(due).max()  # greatest number of due cases on one device
             if most == 0:
@@ -388,13 +388,14 @@ def _cut_unsolved(
     return run_per_device(mesh, cut, LANES, LANES, PartitionSpec())(tree, status, begin)
 
 
-@functools.partial(jax.jit, static_argnames=("mesh", "within"))
-def _mark_due(mesh: Mesh, within: float, plans: PyTree) -> tuple[Array, Array]:
+@functools.partial(jax.jit, static_argnames=("mesh", "attempt"))
+def _mark_due(mesh: Mesh, attempt: Attempt, plans: PyTree) -> tuple[Array, Array]:
+    """Return statuses that are unsolved where a search is due, and their number."""
 
     def due(plans: PyTree) -> tuple[Array, Array]:
-        near = plans.violation <= within
-        status = jnp.where(near, plans.status, jnp.full_like(plans.status, Status.FEASIBLE))
-        return status, jnp.sum(is_unsolved(status), keepdims=True)
+        is_due = attempt.is_due(plans)
+        status = jnp.where(is_due, Status.INFEASIBLE, Status.FEASIBLE).astype(jnp.int32)
+        return status, jnp.sum(is_due, keepdims=True)
 
     return run_per_device(mesh, due)(plans)
 

@@ -22,6 +22,7 @@ from planner_jax.core.protocol import (
     Status,
     is_better,
     is_resident,
+    is_solved,
     is_unsolved,
     mark_out_of_time,
     select,
@@ -255,7 +256,8 @@ def _plan_one(planner: Planner, attempts: Sequence[Attempt], case: PyTree, watch
         watch.report(planner, attempt, 1, 1)
         if best is None or is_better(plan, best):
             best = plan
-        if not is_unsolved(int(best.status)):  # an int is checked faster than an array
+        # an int is checked faster than an array
+        if not is_unsolved(int(best.status)) and not any(each.improves for each in attempts):
             break
     return best
 
@@ -275,12 +277,19 @@ def _plan_purely(planner: Planner, attempts: Sequence[Attempt], cases: PyTree) -
             plans = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
         within = [np.inf if each.within is None else each.within for each in group]
         greatest = jnp.asarray(within, plans.violation.dtype)
+        improves = jnp.asarray([each.improves for each in group])
 
         def try_next(
-            k: Array, plans: PyTree, solve_by=solve_by, greatest=greatest, is_start=is_start
+            k: Array,
+            plans: PyTree,
+            solve_by=solve_by,
+            greatest=greatest,
+            improves=improves,
+            is_start=is_start,
         ) -> PyTree:
             is_first = is_start & (k == 0)
             due = is_unsolved(plans.status) & (plans.violation <= greatest[k])
+            due |= is_solved(plans.status) & improves[k]
 
             def solve_again(plans: PyTree) -> PyTree:
                 later = solve_by(k)

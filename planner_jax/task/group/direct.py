@@ -28,7 +28,7 @@ from planner_jax.task.intercept.case import InterceptCase
 from planner_jax.task.intercept.plan import InterceptPlan, make_plan, make_straight_plan
 from planner_jax.task.intercept.problem import MotionProblem
 from planner_jax.task.intercept.searches import Search, make_field, make_grid
-from planner_jax.task.intercept.terms import wrap
+from planner_jax.task.intercept.terms import HORIZON, wrap
 from planner_jax.task.intercept.units import enter_units, leave_units, units_of
 
 # The pursuits that starting points 1 to 7 of a leg follow, and the direct motion 0: the greatest
@@ -58,7 +58,7 @@ class DirectGroup(Planner[InterceptGroup, GroupPlan]):
     trials: int = 150  # greatest number of least-squares problems of a case
     movers: int = 8  # number of moving obstacles in least squares; every plan is checked with all
     turn: float = 0.3  # [rad], greatest deviation from the prescribed heading at a meeting
-    early: float = 100.0  # weight of the meeting time, as in `terms.Weights`
+    early: float = 100.0  # weight of a leg's duration, divided by the time up to which it may last
 
     def solve(self, case: InterceptGroup, attempt: Attempt, /) -> GroupPlan:
         """Plan one case leg by leg; if a leg has no plan, plan the leg before it again."""
@@ -162,7 +162,8 @@ class DirectGroup(Planner[InterceptGroup, GroupPlan]):
         guess = _PROBLEM.guess_directly(local, False)
         guess = dataclasses.replace(guess, point=jnp.where(first, guess.point, pursuit))
         keep, hurry = _PROBLEM.list_last_stages(_SEARCH)
-        weights = [dataclasses.replace(keep.weights, early=w) for w in (0.0, self.early)]
+        early = self.early * (HORIZON / local.time) ** 2
+        weights = [dataclasses.replace(keep.weights, early=w) for w in (0.0, early)]
         stages = [
             dataclasses.replace(keep, weights=weights[0], tolerance=1.0, settled=1),
             dataclasses.replace(hurry, weights=weights[1], tolerance=3e-3, settled=2),

@@ -75,9 +75,6 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
     pieces: int = 32  # number of pieces of speed and curvature
     samples: int = 3  # samples of each piece at which least squares check obstacles
     checked: int = 16  # samples of each piece at which the finished plan is checked
-    # Whether all paths of a search are tried and the best plan is selected, instead of the first
-    # solved plan. If `meet` is not "given", all paths are always tried.
-    tries_all: bool = False
     searches: tuple[Search, ...] | None = None  # by default `SEARCHES[meet]`
 
     def __post_init__(self) -> None:
@@ -102,7 +99,7 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
         return MotionProblem(self.meet, self.pieces, self.samples, self.checked)
 
     def with_effort(self, effort: str) -> Self:
-        """Return a planner that tries all paths of a search, and selects the plan of least cost.
+        """Return a planner with one more search, which tries to lower the cost of every plan.
 
         Args:
             effort: "good" tries 8 paths, and takes up to 48 steps to reduce the cost of each plan.
@@ -112,11 +109,12 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
         require_one_of(EFFORTS, "effort", effort)
         if effort not in _EFFORTS:
             return self
-        first, *others = self.attempts
-        paths, settling = _EFFORTS[effort]
-        first = dataclasses.replace(first, paths=max(paths, first.paths), settling=settling)
-        searches = (first, *others, *(NARROW if effort == "best" else ()))
-        return dataclasses.replace(self, searches=searches, tries_all=True)
+        first, (paths, settling) = self.attempts[0], _EFFORTS[effort]
+        paths = max(paths, first.paths)
+        more = {"paths": paths, "settling": settling, "tries_all": True, "improves": True}
+        last = dataclasses.replace(first, **more)
+        searches = (*self.attempts, last, *(NARROW if effort == "best" else ()))
+        return dataclasses.replace(self, searches=searches)
 
     def replanner(self) -> ReplanIntercept:
         """Return the planner by which `pj.replan` updates a plan while it is being driven."""
@@ -153,7 +151,7 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
     def solve(self, case: InterceptCase, attempt: Search) -> InterceptPlan:
         """Plan one case by least squares from several starting points, up to the first solved plan.
 
-        With `tries_all`, or if the meeting time is free, all paths are tried for the best plan.
+        If the search tries all paths, the best plan is returned.
         """
         units = units_of(case)
         plan = self._solve(enter_units(case, units), self.load_attempt(attempt, case))
@@ -183,7 +181,7 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
 
         def is_open(state: tuple) -> Array:
             k, found, best = state
-            is_enough = protocol.is_solved(best.status) & ~jnp.asarray(self.tries_all | is_free)
+            is_enough = protocol.is_solved(best.status) & ~jnp.asarray(search.tries_all | is_free)
             return ((k <= 0) | ((k < search.paths) & found.is_reached)) & ~is_enough
 
         nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(find))
@@ -209,18 +207,21 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
         problem = self.problem
         is_free = problem.is_time_free
         grid = make_grid(case, attempt.lattice, is_time_free=is_free)
-        field, stages = make_field(case, grid), problem.list_stages(attempt)
+        field = make_field(case, grid)
         if attempt.states:
             found = find_state_paths(case, attempt, grid, field, self.pieces)
         else:
             found = search_reach(case, attempt, grid, field, is_time_free=is_free, layers=layers)
 
+        # Either every plan runs the last stage, or only the best plan does.
+        early, late = (
+            dataclasses.replace(attempt, settling=jnp.where(is_due, attempt.settling, 0))
+            for is_due in (attempt.tries_all, ~jnp.asarray(attempt.tries_all))
+        )
+        stages = problem.list_stages(early)
+
         def solve_from(guess: Guess) -> InterceptPlan:
-            if self.tries_all:
-                plan = problem.refine(case, field, guess, attempt, stages)
-            else:
-                points, steps = problem.run_stages(case, field, guess, attempt, stages[:-1])
-                plan = problem.decode(case, points[-1], steps)
+            plan = problem.refine(case, field, guess, attempt, stages)
             return self._select_guess(case, guess, attempt, plan)
 
         each = jnp.arange(len(attempt.noise.layers))
@@ -230,8 +231,7 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
         plans = jax.vmap(solve_from)(guesses)
         best = protocol.index_of_best(plans)
         plan = jax.tree.map(lambda leaf: leaf[best], plans)
-        if not self.tries_all:
-            plan = problem.refine_solved(case, field, plan, attempt)
+        plan = problem.refine_solved(case, field, plan, late)
         return self._explain(case, attempt, found.is_reached, plan)
 
     def load_attempt(self, attempt: Search, cases: InterceptCase) -> LoadedSearch:

@@ -105,10 +105,15 @@ class MotionProblem:
         return self.pack(speed, curvature, point[-1] / units.time)
 
     def unpack(self, case: InterceptCase, point: Array) -> tuple[Array, Array, Array]:
-        """Split the unknowns into speed and curvature at all K + 1 knots, and the meeting time."""
+        """Split the unknowns into speed and curvature at all K + 1 knots, and the meeting time.
+
+        The speed at the end is the prescribed one if `terms.held_end_speed` returns such a speed.
+        """
         speed, curvature = point[: self.pieces], point[self.pieces : 2 * self.pieces]
         soonest = jnp.maximum(_SOONEST * case.time, case.earliest)
         time = jnp.clip(point[-1], jnp.minimum(soonest, case.time), case.time)
+        is_held, at_end = terms.held_end_speed(case)
+        speed = speed.at[-1].set(jnp.where(is_held, at_end, speed[-1]))
         return (
             jnp.concatenate([case.speed[None], speed]),
             jnp.concatenate([case.curvature[None], curvature]),
@@ -243,6 +248,9 @@ class MotionProblem:
         axle should follow at the knots 1 to K. `discs` discs cover the car's body.
         """
         speed, curvature, time = self.unpack(case, point)
+        if self.meet == "early":  # else the pull of an earlier meeting exceeds a small tolerance
+            share = jnp.maximum(terms.TOLERANCE / case.tolerance, 1.0)
+            weights = dataclasses.replace(weights, miss=weights.miss * share)
         drive = motion(case.start, time, speed, curvature, self.samples)
         limits, violation, _ = terms.limit_terms(case, time, speed, curvature, weights, 4)
         end, missed = terms.meeting_terms(case, drive, time, weights)
@@ -272,17 +280,22 @@ class MotionProblem:
             # the meeting shall be early, the square of the time.
             late = jnp.maximum(point[-1] / case.time - 1.0, 0.0)
             pull = weights.early if self.meet == "early" else 0.0
-            push = (weights.limit * late + pull * time / case.time) / case.time
-            gradient = gradient.at[-1].add(push)
-            stiffness = pull + jnp.where(late > 0.0, weights.limit, 0.0)
-            curvature = curvature.at[-1, -1].add(stiffness / case.time**2)
-            # A fixed time is decoupled from the other unknowns, and its steps are zero.
-            is_other = jnp.arange(gradient.size) < gradient.size - 1
-            is_moved = is_other | ~jnp.asarray(weights.is_time_fixed)
-            gradient = jnp.where(is_moved, gradient, 0.0)
-            eye = jnp.eye(gradient.size, dtype=gradient.dtype)
-            curvature = jnp.where(is_moved[:, None] & is_moved[None], curvature, eye)
-            total += weights.limit * late**2 + pull * (time / case.time) ** 2
+            pull /= terms.HORIZON**2
+            gradient = gradient.at[-1].add(weights.limit * late / case.time + pull * time)
+            stiffness = jnp.where(late > 0.0, weights.limit, 0.0) / case.time**2
+            curvature = curvature.at[-1, -1].add(stiffness + pull)
+            total += weights.limit * late**2 + pull * time**2
+        # A fixed time and a prescribed speed at the end are decoupled from the other unknowns. The
+        # steps of the time are zero. The unknown that the speed replaces moves to the speed.
+        is_held, at_end = terms.held_end_speed(case)
+        lag = jnp.where(is_held, point[self.pieces - 1] - at_end, 0.0)
+        is_moved = jnp.ones(point.size, bool).at[self.pieces - 1].set(~is_held)
+        if self.is_time_free:
+            is_moved = is_moved.at[-1].set(~jnp.asarray(weights.is_time_fixed))
+        gradient = jnp.where(is_moved, gradient, 0.0).at[self.pieces - 1].add(lag)
+        eye = jnp.eye(gradient.size, dtype=gradient.dtype)
+        curvature = jnp.where(is_moved[:, None] & is_moved[None], curvature, eye)
+        total += lag**2
         return Model(
             cost=total,
             gradient=gradient,

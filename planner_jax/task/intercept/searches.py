@@ -60,6 +60,9 @@ class Search(Attempt):
     is_direct: bool = False
     # Whether the search is left out if the cells of the default lattice are small enough.
     is_for_small_cars: bool = False
+    # Whether all paths are tried and the best plan is selected, instead of the first solved plan.
+    # If the meeting time is free, all paths are always tried.
+    tries_all: bool = False
     # Whether the meeting is at the latest time until all limits are kept, although it may be early.
     is_late: bool = False
 
@@ -74,7 +77,7 @@ class Search(Attempt):
 
 @with_run_time_numbers(
     *("paths", "following", "settling", "margin", "slack", "directness", "body_scale"),
-    *("noise", "is_last", "is_direct", "is_late"),
+    *("noise", "is_last", "is_direct", "is_late", "tries_all"),
 )
 @dataclasses.dataclass(frozen=True)
 class LoadedSearch(Search):
@@ -120,7 +123,7 @@ def load_search(
     )
     fields = dict(vars(search))
     del fields["starts"]
-    fields |= {"seed": 0, "candidates": candidates, "within": None}
+    fields |= {"seed": 0, "candidates": candidates, "within": None, "improves": False}
     return LoadedSearch(**fields, noise=noise, is_last=is_last)
 
 

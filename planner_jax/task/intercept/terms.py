@@ -21,6 +21,7 @@ from planner_jax.task.intercept.case import InterceptCase
 _HIGHEST = lax.Precision.HIGHEST
 # Numbers of intervals of a free meeting time, and of directions, in the bounds of `is_too_far`.
 _INTERVALS, _DIRECTIONS = 64, 32
+_NARROW = 0.03  # width of an interval of end speeds that is reduced to its middle
 _EXCESS = 1.002  # factor on distances of drives: the referee accepts limits exceeded by 0.1 %
 
 
@@ -32,12 +33,17 @@ class Weights:
     obstacle: float = 1e3  # [1/m^2], of the distance by which a body comes too close to an obstacle
     limit: float = 1e3  # of the relative excess of a value over its limit
     effort: float = 0.064  # [s^3/m^2], of the discomfort
-    early: float = 300.0  # of the meeting time divided by the case's time, if the time is free
+    early: float = 300.0  # of the meeting time divided by `HORIZON`, if the time is free
     follow: float = 0.0  # [1/m^2], of the distance at knots from a path of cells
     margin: float = 0.03  # [m], distance from obstacles below which they are penalised
     slack: float = 0.015  # a value is penalised above (1 - slack) times its limit
     is_time_fixed: bool = False  # whether the meeting time stays as it is, even if it is free
 
+
+# Time to which a free meeting time is related, and tolerance of the distance from the target for
+# which the weights are chosen, in the units of `units.enter_units`. They do not depend on the case:
+# if the time limit is twice as long, the balance of penalties and meeting time is the same.
+HORIZON, TOLERANCE = 16.0, 0.05
 
 # Factors of the discomfort, in the units of `units.enter_units`: of the lateral jerk, a time; and
 # of the steering angle's rate, an acceleration times a time.
@@ -120,7 +126,8 @@ def limit_terms(
     # The speed at the end has bounds of its own, in units of speed.
     low, high = case.end_speed[0], case.end_speed[1]
     over, under = v[0, -1] - high, low - v[0, -1]
-    is_over, is_under = over + weights.slack > 0.0, under + weights.slack > 0.0
+    is_held, _ = held_end_speed(case)
+    is_over, is_under = (~is_held & (each + weights.slack > 0.0) for each in (over, under))
     is_under &= low > limits.least_speed
     at_end = jnp.where(is_over, over + weights.slack, 0.0)
     at_end -= jnp.where(is_under, under + weights.slack, 0.0)
@@ -151,6 +158,18 @@ def limit_terms(
     if limits.jerk is not None:
         worst = jnp.maximum(worst, jnp.max(jerk_excess(limits.jerk, time, speed)))
     return squares, worst, discomfort
+
+
+def held_end_speed(case: InterceptCase) -> tuple[Array, Array]:
+    """Return whether the speed at the end is prescribed, () bool, and this speed () [m/s].
+
+    It is prescribed if its bounds leave no interval in which both of their penalties are zero. The
+    speed is then the middle of the interval, so that no penalty competes with the meeting time.
+    """
+    limits = case.limits
+    low = jnp.clip(case.end_speed[0], limits.least_speed, limits.speed)
+    high = jnp.clip(case.end_speed[1], limits.least_speed, limits.speed)
+    return high - low < _NARROW, 0.5 * (low + high)
 
 
 def jerk_excess(limit: Array, time: Array, speed: Array) -> Array:
