@@ -1,6 +1,7 @@
 """Scenarios of CommonRoad become cases of interceptions: roads, traffic, goals, and states."""
 
 import importlib
+import os
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -146,3 +147,150 @@ def test_cases_of_a_batch_have_equal_shapes(reader, tmp_path, monkeypatch):
     pj.require_sound(cases)
     assert cases.batch_shape == (2,)
     assert sorted(np.asarray(cases.movers.present).sum(axis=1)) == [2, 3]  # one is 1 km away
+
+
+def exact(name, value):
+    return f"<{name}><exact>{value}</exact></{name}>"
+
+
+def state_at(x, y, time, tag="state", more=""):
+    """Return the XML text of a state at standstill."""
+    point = f"<position><point><x>{x}</x><y>{y}</y></point></position>"
+    return f"<{tag}>{point}{exact('orientation', 0)}{exact('time', time)}{more}</{tag}>"
+
+
+BOX = "<rectangle><length>4</length><width>2</width></rectangle>"
+REGION = BOX.replace("</width>", "</width><center><x>45</x><y>0</y></center>")
+
+
+def write_scenario(folder, obstacles="", goal=f"<position>{REGION}</position>", signs=""):
+    """Write a straight lanelet of 100 m, a start at (10, 0), 20 m/s, and a goal at steps 20 to 60.
+
+    The time step is 0.1 s.
+    """
+    bounds = "".join(
+        f"<{side}><point><x>0</x><y>{y}</y></point><point><x>100</x><y>{y}</y></point></{side}>"
+        for side, y in (("leftBound", 4), ("rightBound", -4))
+    )
+    start = state_at(10, 0, 0, "initialState", exact("velocity", 20) + exact("yawRate", 0))
+    time = "<time><intervalStart>20</intervalStart><intervalEnd>60</intervalEnd></time>"
+    path = folder / "one.xml"
+    path.write_text(
+        f'<commonRoad timeStepSize="0.1"><lanelet id="1">{bounds}</lanelet>{signs}{obstacles}'
+        f'<planningProblem id="5">{start}<goalState>{time}{goal}</goalState></planningProblem>'
+        "</commonRoad>"
+    )
+    return path
+
+
+OCCUPIED = (
+    "<occupancySet><occupancy><shape><rectangle><length>4</length><width>2</width><center><x>30</x>"
+    f"<y>0</y></center></rectangle></shape>{exact('time', 10)}</occupancy></occupancySet>"
+)
+SHAPE, HERE = f"<shape>{BOX}</shape>", state_at(30, 0, 0, "initialState")
+AROUND = [[28.0, -1.0], [28.0, 1.0], [32.0, -1.0], [32.0, 1.0]]
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        f'<dynamicObstacle id="9">{SHAPE}{HERE}</dynamicObstacle>',
+        '<environmentObstacle id="9"><shape><rectangle><length>4</length><width>2</width><center>'
+        "<x>30</x><y>0</y></center></rectangle></shape></environmentObstacle>",
+        f'<staticObstacle id="9">{SHAPE}{HERE}</staticObstacle>',
+    ],
+    ids=["initial state alone", "environment", "static"],
+)
+def test_obstacles_that_stand_are_walls(reader, tmp_path, text):
+    free, blocked = (
+        reader.read(write_scenario(tmp_path, obstacle))[0].arguments for obstacle in ("", text)
+    )
+    assert len(blocked["walls"]) == len(free["walls"]) + 1 and not blocked["movers"]
+    np.testing.assert_allclose(sorted(blocked["walls"][-1].tolist()), AROUND)
+
+
+@pytest.mark.parametrize("kind", ["dynamicObstacle", "phantomObstacle"])
+def test_occupancies_are_movers_around_their_time_steps(reader, tmp_path, kind):
+    more = SHAPE + HERE if kind == "dynamicObstacle" else ""
+    path = write_scenario(tmp_path, f'<{kind} id="9">{more}{OCCUPIED}</{kind}>')
+    arguments = reader.read(path)[0].arguments
+    here = {tuple(np.round(times, 9)): poses for times, poses in arguments["mover_paths"]}
+    assert set(here) == {(0.95, 1.05)} | ({(-0.05, 0.05)} if more else set())
+    corners = arguments["movers"][-1] + here[0.95, 1.05][0, :2]
+    np.testing.assert_allclose(sorted(corners.tolist()), AROUND)
+    pj.require_sound(reader.read(path)[0].case())
+
+
+def test_a_trajectory_may_repeat_the_initial_state(reader, tmp_path):
+    states = "".join(state_at(30 + k, 0, k) for k in range(4))
+    text = f'<dynamicObstacle id="9">{SHAPE}{HERE}<trajectory>{states}</trajectory>'
+    problem = reader.read(write_scenario(tmp_path, text + "</dynamicObstacle>"))[0]
+    np.testing.assert_allclose(problem.arguments["mover_paths"][0][0], [0.0, 0.1, 0.2, 0.3])
+    pj.require_sound(problem.case())
+
+
+def test_a_goal_heading_may_pass_pi_and_signs_limit_the_speed(reader, tmp_path):
+    angles = "<orientation><intervalStart>3.0</intervalStart><intervalEnd>-3.0</intervalEnd>"
+    sign = (
+        '<trafficSign id="8"><trafficSignElement><trafficSignID>{}</trafficSignID>'
+        "<additionalValue>30</additionalValue></trafficSignElement></trafficSign>"
+    )
+    goal = f"<position>{REGION}</position>{angles}</orientation>"
+    problem = reader.read(write_scenario(tmp_path, goal=goal, signs=sign.format("274")))[0]
+    assert problem.arguments["end_heading"] == pytest.approx(np.pi)
+    assert problem.arguments["heading_tolerance"] == pytest.approx(0.98 * (np.pi - 3.0))
+    assert problem.arguments["speed"] == 30.0
+    other = reader.read(write_scenario(tmp_path, signs=sign.format("101")))[0]
+    assert other.arguments["speed"] == pytest.approx(1.1 * 20.0)  # by the initial speed
+
+
+def test_a_goal_without_a_position_is_a_square_ahead(reader, tmp_path):
+    arguments = reader.read(write_scenario(tmp_path, goal=""))[0].arguments
+    np.testing.assert_allclose(arguments["target"].pos, [10.0 + 6.0 * 20.0, 0.0], rtol=1e-6)
+    np.testing.assert_allclose(np.abs(arguments["region"]), reader.INSIDE * 60.0)
+    pj.require_sound(pj.intercept.case(**arguments))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("</commonRoad>", "", "no element found"),
+        ("commonRoad", "other", "the root commonRoad"),
+        ("<x>100</x>", "<x>10,5</x>", "decimal, got '10,5'"),
+        ("<x>100</x>", "<x>&e;</x>", "undefined entity"),
+        ("<x>100</x>", "<x>1e9</x>", "at most 10000 m apart"),
+        (f"<position>{REGION}</position>", '<position><lanelet ref="77"/></position>', "got 77"),
+        ("goalState", "goal", "must have a planning problem"),
+        ('timeStepSize="0.1"', "", "decimal, got None"),
+        ("<planning", '<dynamicObstacle id="9"/><planning', "dynamicObstacle 9 must have a shape"),
+        ("</commonRoad>", "<a>" * 100 + "</a>" * 100 + "</commonRoad>", "at most 64 deep"),
+    ],
+)
+def test_a_file_that_is_no_scenario_is_named_in_one_line(reader, tmp_path, old, new, message):
+    path = write_scenario(tmp_path)
+    path.write_text(path.read_text().replace(old, new))
+    with pytest.raises(reader.ScenarioError, match=rf"one.xml: .*{message}") as caught:
+        reader.read(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_pipe_and_a_file_of_many_elements_are_refused(reader, tmp_path, monkeypatch):
+    os.mkfifo(tmp_path / "pipe.xml")
+    with pytest.raises(OSError, match="no plain file"):
+        reader.read(tmp_path / "pipe.xml")
+    monkeypatch.setattr(reader, "MOST_ELEMENTS", 10)
+    with pytest.raises(reader.ScenarioError, match="at most 10 elements"):
+        reader.read(write_scenario(tmp_path))
+
+
+def test_rows_of_a_folder_go_on_after_a_file_that_cannot_be_read(
+    package, tmp_path, monkeypatch, capsys
+):
+    write_scenario(tmp_path).rename(tmp_path / "b.xml")
+    (tmp_path / "a.xml").write_text("<commonRoad>")
+    out = tmp_path / "plans.json"
+    monkeypatch.setattr("sys.argv", ["rows", str(tmp_path), "--out", str(out)])
+    monkeypatch.setattr(package[1], "plan_first", lambda planner, problems: 1 / 0)
+    with pytest.raises(ZeroDivisionError):  # the second file is read
+        package[1].main()
+    assert "UNREADABLE" in capsys.readouterr().out

@@ -103,6 +103,13 @@ def test_a_case_of_a_batch_is_drawn_by_its_index_and_says_what_fails(drive):
     assert any(line.get_marker() == "X" for line in axes.lines)
 
 
+def test_speeds_in_reverse_have_colours_of_their_own(drive):
+    case, plan = drive
+    speed = jnp.linspace(-0.5, 1.0, 9)
+    axes = pj.intercept.draw_plan(case, dataclasses.replace(plan, speed=speed))
+    assert axes.figure.axes[1].get_ylim() == pytest.approx((-0.5, 1.0))
+
+
 def test_a_missing_or_wrong_index_and_other_objects_are_rejected(drive):
     case, plan = drive
     cases, plans = (stack(each, each) for each in drive)

@@ -52,6 +52,30 @@ def test_more_effort_compares_more_motions_of_blocks_for_longer():
     assert pj.block.planner("brisk", effort="best") == pj.block.planner(effort="best", brisk=True)
 
 
+def test_more_effort_of_interceptions_improves_the_plans_of_less_effort():
+    own = pj.intercept.planner()
+    for effort in ("good", "best"):
+        attempts = pj.intercept.planner(effort=effort).attempts
+        num = len(own.attempts)
+        assert attempts[:num] == own.attempts
+        assert attempts[num].improves and attempts[num].tries_all
+        assert not any(each.improves for each in attempts[num + 1 :])
+
+
+@pytest.mark.slow
+def test_a_good_plan_never_costs_more_than_a_feasible_one_under_a_limit_of_jerk():
+    wall = [(3.0, 3.2), (3.6, 3.2), (3.6, 5.0), (3.0, 5.0)]
+    costs = []
+    for x, y, jerk in ((6.0, 4.0, 0.5), (7.2, 6.8, 0.3), (6.0, 3.0, 0.2)):
+        path = pj.TurningPath(*(np.array(each, np.float32) for each in ((x, y), (0, 0), 0.0)))
+        case = pj.intercept.case(path, walls=[wall], jerk=jerk)
+        plans = [pj.plan(pj.intercept.planner(effort=each), case) for each in EFFORTS[:2]]
+        assert all(pj.are_solved(each) and pj.intercept.judge(case, each).success for each in plans)
+        costs.append([float(each.cost) for each in plans])
+    feasible, good = np.array(costs).T
+    assert (good <= feasible).all() and (good < 0.7 * feasible).any()
+
+
 @pytest.mark.slow
 def test_more_effort_blocks_the_same_balls_at_less_cost():
     cases = jax.tree.map(np.asarray, pj.block.draw(12, "pole", 4))

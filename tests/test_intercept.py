@@ -111,6 +111,8 @@ def test_the_gradient_of_the_cost_matches_finite_differences(knots, float64, mee
     case = double(pj.take(pj.intercept.draw(1, "hard", 5), 0))
     case = case.replace(end_heading=jnp.array(2.0), heading_tolerance=jnp.array(0.1))
     case = case.replace(limits=case.limits.replace(jerk=jnp.array(0.4)))
+    if meet == "early":  # the unknown of a prescribed speed at the end moves to this speed
+        case = case.replace(end_speed=jnp.zeros(2), tolerance=jnp.array(0.01))
     problem = MotionProblem(meet, pieces=8)
     grid = jax.jit(lambda case: make_grid(case, ONE_SEARCH[0].lattice, is_time_free=False))(case)
     field = jax.jit(make_field)(case, grid)
@@ -281,6 +283,26 @@ def test_an_early_meeting_is_little_later_than_a_straight_drive(early):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(
+    "numbers",
+    [{"end_speed": (0.0, 0.0)}, {"end_speed": (0.0, 0.001)}, {"tolerance": 0.01}, {"time": 4.0}],
+    ids=["stop", "nearly a stop", "small tolerance", "little time"],
+)
+def test_an_early_meeting_does_not_wait_for_the_time_limit(numbers):
+    path = pj.TurningPath(jnp.array([6.0, 4.0]), jnp.zeros(2), jnp.array(0.0))
+    case = pj.intercept.case(path, **numbers)
+    plan = pj.plan(pj.intercept.planner(meet="early"), case)
+    verdict = pj.intercept.judge(case, plan)
+    assert pj.are_solved(plan) and verdict.success, verdict.sentence()
+    # Least time: accelerate from 0.5 to 1.5 m/s in 1 s, on 1 m, and drive at 1.5 m/s. A stop
+    # takes 1.5 s, on 1.125 m. The body's middle is 0.15 m ahead of the rear axle.
+    distance = 6.0 - 0.8 - 0.15 - numbers.get("tolerance", 0.05) - 1.0
+    is_stop = "end_speed" in numbers
+    least = 1.0 + (distance - 1.125 * is_stop) / 1.5 + 1.5 * is_stop
+    assert least - 5e-3 < float(plan.time) < least + 0.18
+
+
+@pytest.mark.slow
 def test_a_plan_stays_the_same_for_an_unchanged_target(planned):
     cases, plans = planned
     good = np.flatnonzero(pj.are_solved(plans))
@@ -314,7 +336,7 @@ def test_a_wall_that_is_seen_on_the_way_is_avoided():
     seen = dataclasses.replace(case, walls=walls, time=again.time, **driven)
     assert not pj.intercept.judge(dataclasses.replace(case, walls=walls), plan).success
     assert pj.are_solved(again) and pj.intercept.judge(seen, again).success
-    with pytest.raises(TypeError, match="walls must be"):
+    with pytest.raises(TypeError, match="walls must be made by pj.obstacles, got a list"):
         pj.replan(PLANNER, case, plan, 2.0, walls=[np.zeros((3, 2))])
 
 

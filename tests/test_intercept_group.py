@@ -100,6 +100,11 @@ def test_best_proposes_every_order_once():
     assert set(map(tuple, propose(two).order.tolist())) == {(0, 3, 1, 2), (3, 0, 1, 2)}
 
 
+def test_more_targets_than_all_orders_allow_name_the_planner_for_many():
+    with pytest.raises(ValueError, match="at most 8, .*the planner direct .*search.*, got 40"):
+        Best().propose(pj.take(pj.group.draw(1, "forty", 0), 0))
+
+
 def test_a_given_order_is_kept_and_must_be_a_permutation():
     group = line(6.0, 2.0, 3.0, present=[True, False, True])
     given = dataclasses.replace(group, order=jnp.array([1, 2, 0], jnp.int32))

@@ -92,15 +92,21 @@ def test_text_images_negated_maps_and_transparent_pixels_are_read(tmp_path):
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"resolution": "-1"}, "resolution must be > 0, got -1"),
-        ({"resolution": ""}, "resolution must be a finite number, got None"),
+        ({"resolution": "-1"}, "resolution must be finite and > 0, got -1"),
+        ({"resolution": ""}, "resolution must be a number, got None"),
         ({"origin": "[0, 0]"}, "origin must be a list of x, y and yaw"),
-        ({"origin": "[0, 0, .nan]"}, "origin must be a finite number"),
-        ({"mode": "raw"}, "mode must be trinary, got 'raw'"),
-        ({"image": "gone.pgm"}, "image must be a PGM or PNG file: .*No such file"),
-        ({"image": "map.yaml"}, "image must be a PGM or PNG file: cannot identify"),
-        ({"image": "3"}, "image must name a file, got 3"),
-        ({"free_thresh": "low"}, "free_thresh must be a finite number, got 'low'"),
+        ({"origin": "[0, 0, .nan]"}, "origin must be finite"),
+        ({"mode": "raw"}, "mode must be one of trinary, got 'raw'"),
+        ({"image": "gone.pgm"}, "image must be a PGM or PNG file .*: .*No such file"),
+        ({"image": "map.yaml"}, "image must be a PGM or PNG file .*: cannot identify"),
+        ({"image": "3"}, "image must be the name of a file, got 3"),
+        ({"free_thresh": "low"}, "free_thresh must be a number, got 'low'"),
+        ({"free_thresh": "0.65"}, "free_thresh must be below occupied_thresh, 0.65, got 0.65"),
+        ({"occupied_thresh": "65"}, "occupied_thresh must be finite and from 0 to 1, got 65"),
+        ({"occupied_threshold": "0.65"}, "field must be one of .*, got 'occupied_threshold'"),
+        ({"negate": "2"}, "negate must be 0 or 1, got 2"),
+        ({"resolution": "1:30"}, "resolution must be a number, got '1:30'"),
+        ({"resolution": "yes"}, "resolution must be a number, got True"),
         ({"image": "[", "origin": ""}, "must be YAML"),
     ],
 )
@@ -127,3 +133,47 @@ def test_grids_are_checked(given, message):
         pj.intercept.walls_of_grid(
             **{"occupied": np.ones((2, 2), bool), "resolution": 1.0, **given}
         )
+
+
+def test_numbers_of_maps_are_decimal(tmp_path):
+    assert pj.intercept.read_map(write_map(tmp_path, resolution="010")).resolution == 10.0
+
+
+@pytest.mark.parametrize("yaw", [0.785398, -2.0])
+def test_walls_of_a_turned_map_cover_all_points_outside_of_its_grid(yaw):
+    grid = pj.intercept.OccupancyMap(np.zeros((3, 5), bool), 1.0, (2.0, -1.0, yaw))
+    x, y = np.meshgrid(*np.linspace(grid.lower, grid.upper, 40).T)
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    along, across = cos * (x - 2.0) + sin * (y + 1.0), -sin * (x - 2.0) + cos * (y + 1.0)
+    is_inside = (along > 0.0) & (along < 5.0) & (across > 0.0) & (across < 3.0)
+    is_clear = np.min(np.abs([along, along - 5.0, across, across - 3.0]), axis=0) > 1e-3
+    edge = (x > x.min()) & (x < x.max()) & (y > y.min()) & (y < y.max())
+    kept = is_clear & edge
+    np.testing.assert_array_equal(covered(grid.walls(), x, y)[kept], ~is_inside[kept])
+    assert pj.obstacles(grid.walls()).present.sum() == 4
+    upright = pj.intercept.OccupancyMap(np.zeros((3, 5), bool), 1.0, (2.0, -1.0, np.pi / 2))
+    assert not upright.walls()
+
+
+def test_grids_of_too_many_rectangles_are_refused():
+    board = np.indices((200, 200)).sum(axis=0) % 2 == 0
+    with pytest.raises(ArgumentError, match="at most 10,000 rectangles .a greater coarsen"):
+        pj.intercept.walls_of_grid(board, 0.1)
+    assert len(pj.intercept.walls_of_grid(board, 0.1, coarsen=2)) == 1
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("map.pgm", b"P5\n4097 4096\n255\n", "it has 4097 x 4096 pixels"),
+        ("map.pgm", b"P2\n1025 1024\n255\n", "1,048,576 pixels: it has 1025 x 1024 pixels"),
+        ("map.pgm", b"P5\n20000 20000\n255\n", "20000|400000000"),
+        ("map.pgm", b"P5\n#" + bytes(5000) + b"\n1 1\n255\n\0", "header is incomplete or longer"),
+        ("map.pgm", b"P5\n" + b"# " * 2000 + b"1 1\n255\n\0", "header is incomplete or longer"),
+    ],
+)
+def test_large_images_are_refused_before_they_are_decoded(tmp_path, name, content, message):
+    path = write_map(tmp_path, name=name)
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(MapError, match=message):
+        pj.intercept.read_map(path)

@@ -106,6 +106,46 @@ def test_no_round_begins_after_its_time_and_what_is_solved_keeps_its_bits(planne
     assert_same(found, free, ~late)
 
 
+@dataclasses.dataclass(frozen=True)
+class Cheaper(Try):
+    improves: bool = True
+
+
+@jax.tree_util.register_static
+@dataclasses.dataclass(frozen=True)
+class Improving(pj.Planner):
+    attempts: tuple = (Try(number=2), Cheaper(number=1))
+
+    def solve(self, case, attempt):
+        cheap = 0.5 if attempt.improves else 1.0
+        return dataclasses.replace(outcome_of(case, attempt), cost=cheap * case.number)
+
+
+@pytest.mark.parametrize(
+    "plan_of",
+    [pj.plan, jax.jit(pj.solve, static_argnums=0), lambda planner, cases: pj.plan(planner, cases)],
+    ids=["NumPy arrays", "compiled", "jax arrays"],
+)
+def test_an_attempt_that_improves_keeps_the_cheaper_of_two_plans(plan_of, request):
+    arrays = np if "NumPy" in request.node.name else jnp
+    planner, numbers = Improving(), np.array([0.8, 1.5, 3.0], np.float32)
+    plans = plan_of(planner, Task(arrays.asarray(numbers)))
+    # The second attempt solves the first case at less cost, and loses the second one.
+    np.testing.assert_allclose(plans.cost, [0.4, 1.5, 3.0])
+    assert pj.are_solved(plans).tolist() == [True, True, False]
+    alone = [float(pj.plan(planner, Task(number)).cost) for number in numbers]
+    np.testing.assert_allclose(alone, plans.cost)
+
+
+def test_solved_cases_are_not_out_of_time(clock):
+    limit = {"time_limit": 1.0, "progress": clock.progress}
+    cases = Task(np.array([0.8, 1.5, 3.0], np.float32))
+    plans = pj.plan(Improving(), cases, **limit)
+    assert pj.are_solved(plans).tolist() == [True, True, False]
+    assert plans.status[2] == pj.Status.OUT_OF_TIME
+    assert pj.are_solved(pj.plan(Improving(), Task(np.float32(0.8)), **limit))
+
+
 def test_one_case_stops_too(clock):
     found = pj.plan(Rounds(), Task(np.float32(3.0)), time_limit=1.0, progress=clock.progress)
     assert found.status == pj.Status.OUT_OF_TIME

@@ -3,17 +3,20 @@
     python benchmarks/commonroad_reader/commonroad_rows.py FOLDER [--out PLANS.json] [--meet given]
 
 The alternative goals of a file are tried in turn, up to the first solved plan. The program prints
-for each file the status, the number of tried goals and the verdict of the library's referee.
+for each file the status, the number of tried goals, the speed limit and the verdict of the
+library's referee. Of a file that cannot be read it prints the reason, and goes on.
 """
 
 import argparse
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from commonroad_reader import AHEAD, CAR, Problem, read
 
 import planner_jax as pj
+from planner_jax.core.errors import PlannerJaxError
 from planner_jax.robot.car import CarPlan
 
 
@@ -29,6 +32,15 @@ def row_of(problem: Problem, plan: CarPlan) -> dict[str, object]:
     return {"file": problem.file, "problem": problem.number, "states": states}
 
 
+def plan_first(planner: Any, problems: list[Problem]) -> tuple[int, Problem, Any, CarPlan]:
+    """Plan alternative goals in turn; return the number tried, and the last with case and plan."""
+    for tried, problem in enumerate(problems, 1):  # noqa: B007
+        plan = pj.plan(planner, case := problem.case())
+        if pj.are_solved(plan):
+            break
+    return tried, problem, case, plan
+
+
 def main() -> None:
     """Print a row for every file, and write the plans."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -42,19 +54,19 @@ def main() -> None:
         parser.error(f"folder must have XML files, got {options.folder}")
     planner, rows, accepted = pj.intercept.planner(meet=options.meet), [], 0
     for file in files:
-        problems = read(file)
-        for tried, problem in enumerate(problems, 1):
-            case = problem.case()
-            plan = pj.plan(planner, case)
-            if pj.are_solved(plan) or tried == len(problems):
-                break
-        else:
-            parser.error(f"{file} must have a planning problem")
+        try:
+            tried, problem, case, plan = plan_first(planner, read(file))
+        except (PlannerJaxError, OSError) as error:
+            print(f"{file.stem:26} {'UNREADABLE':12} {error}")
+            continue
         verdict = pj.intercept.judge(case, plan)
         rows.append(row_of(problem, plan))
         accepted += bool(verdict.success)
-        status = pj.Status(int(plan.status)).name
-        print(f"{file.stem:26} {status:12} goals {tried}: {verdict.sentence()}")
+        status, limit = pj.Status(int(plan.status)).name, problem.arguments["speed"]
+        print(
+            f"{file.stem:26} {status:12} goals {tried}, speed <= {limit:.3g} m/s: "
+            f"{verdict.sentence()}"
+        )
     options.out.write_text(json.dumps(rows))
     print(f"accepted by the referee: {accepted} of {len(files)}")
 

@@ -17,10 +17,10 @@ from planner_jax.core.rules import FINITE, POSITIVE, Rule, within
 from planner_jax.host.files import open_plain
 from planner_jax.host.yaml_files import read_fields
 
-
 _FIELDS = ("image", "resolution", "origin", "negate", "occupied_thresh", "free_thresh", "mode")
 _SHARE = within(0.0, 1.0, "from 0 to 1")
 _MOST_PIXELS = 1 << 24  # greatest number of pixels of a map, as 4096 x 4096
+_MOST_NUMBERS = 1 << 20  # greatest number of pixels of a PGM file in text (P2)
 _HEADER = 1 << 12  # [B] in which the header of a PGM file ends, with its comments
 MOST_WALLS = 10_000  # greatest number of rectangles that cover a grid
 
@@ -148,7 +148,9 @@ def _cover(cells: np.ndarray) -> list[tuple[int, int, int, int]]:
             free[best[0] : best[1], best[2] : best[3]] = False
             found.append(best)
             if len(found) > MOST_WALLS:
-                rule = f"covered by at most {MOST_WALLS:,} rectangles (a greater coarsen needs fewer)"
+                rule = (
+                    f"covered by at most {MOST_WALLS:,} rectangles (a greater coarsen needs fewer)"
+                )
                 raise ArgumentError("occupied", rule, shown=f"{cells.sum():,} occupied cells")
     return found
 
@@ -168,7 +170,8 @@ def read_map(path: str | os.PathLike, *, unknown_is_free: bool = False) -> Occup
     if the darkness is below `free_thresh`, and unknown otherwise, or if its pixel is transparent.
 
     Args:
-        path: path of the YAML file. The image is a PGM (P2, P5) or PNG file of at most 2^24 pixels.
+        path: path of the YAML file. The image is a PGM or PNG file of at most 2^24 pixels, or
+            2^20 if it is a text (P2).
         unknown_is_free: whether unknown cells are free; by default they count as occupied.
 
     Raises:
@@ -219,25 +222,26 @@ def _read_image(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """
     from PIL import Image
 
+    most, bombs = _MOST_PIXELS, (Image.DecompressionBombError, Image.DecompressionBombWarning)
     try:
-        with open_plain(path) as file:
-            # Pillow skips comments byte by byte.
+        with open_plain(path) as file, warnings.catch_warnings(action="error", category=bombs[1]):
+            # Pillow skips comments byte by byte, and reads texts (P2) slowly.
             start = file.read(_HEADER)
-            header = re.match(rb"P[25](?:\s+(?:#.*\s+)*\d+){3}\s", start)
-            if start.startswith((b"P2", b"P5")) and not header:
-                raise ValueError(f"its header is incomplete or longer than {_HEADER} bytes")
+            if start.startswith((b"P2", b"P5")):
+                if not re.match(rb"P[25](?:\s+(?:#[^\r\n]*[\r\n]\s*)*\d+){3}\s", start):
+                    raise ValueError(f"its header is incomplete or longer than {_HEADER} bytes")
+                most = _MOST_NUMBERS if start.startswith(b"P2") else most
             file.seek(0)
-            with warnings.catch_warnings(), Image.open(file, formats=("PPM", "PNG")) as image:
-                warnings.simplefilter("error", Image.DecompressionBombWarning)
-                if math.prod(image.size) > _MOST_PIXELS:
+            with Image.open(file, formats=("PPM", "PNG")) as image:
+                if math.prod(image.size) > most:
                     raise ValueError(f"it has {image.size[0]} x {image.size[1]} pixels")
                 if image.mode.startswith("I"):  # 16 bits
                     level = np.asarray(image).astype(np.uint16)
                     return level, np.arange(65536) / 65535.0, np.ones(level.shape, bool)
                 pixels = np.asarray(image.convert("RGBA"))
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+    except (OSError, ValueError, SyntaxError, *bombs) as error:
         problem = " ".join(str(error).split())[:120]
-        rule = f"a PGM or PNG file of at most {_MOST_PIXELS:,} pixels: {problem}"
+        rule = f"a PGM or PNG file of at most {most:,} pixels: {problem}"
         raise ArgumentError("image", rule, shown="") from None
     level = pixels[..., :3].sum(axis=2, dtype=np.uint16)
     return level, np.arange(766) / 3.0 / 255.0, pixels[..., 3] == 255

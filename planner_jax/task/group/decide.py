@@ -99,7 +99,9 @@ class Best(Decision):
     def propose(self, case: InterceptGroup) -> GroupChoice:
         """Return the F = `finalists` best orders of a group's N targets, best first, (F, N)."""
         num = case.num_targets
-        rule = f"at most {MOST_PERMUTED}, because all orders are evaluated (for more targets take the "
+        rule = (
+            f"at most {MOST_PERMUTED}, because all orders are evaluated (for more targets take the "
+        )
         rule += "planner direct with the decision search)"
         require(num <= MOST_PERMUTED, "targets", rule, num)
         orders = jnp.asarray(list(itertools.permutations(range(num))), jnp.int32)

@@ -175,8 +175,9 @@ def sample_drive(
 
 def draw_judged(drive: SampledDrive, verdict: InterceptVerdict, ax: Axes | None = None) -> Axes:
     """Draw a drive from above as `draw_plan` does, with the referee's verdict as its title."""
-    most = max(float(np.nan_to_num(drive.speed).max()), 1e-9)
-    colours = ScalarMappable(Normalize(0.0, most), COLOURS)
+    speed = np.nan_to_num(drive.speed)  # negative in reverse
+    bounds = min(float(speed.min()), 0.0), max(float(speed.max()), 1e-9)
+    colours = ScalarMappable(Normalize(*bounds), COLOURS)
     with style.context():
         if ax is None:
             import matplotlib.pyplot as plt

@@ -15,7 +15,8 @@ from jax import Array
 from jaxtyping import PyTree
 from numpy.typing import ArrayLike
 
-from planner_jax.core.checks import require_beginning, require_kind, require_path
+from planner_jax.core.checks import require_beginning, require_path
+from planner_jax.core.errors import ArgumentTypeError
 from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import Attempt
 from planner_jax.plane.obstacles import Obstacles, move_on
@@ -92,7 +93,9 @@ class ReplanIntercept(Planner[Replanning, InterceptPlan]):
         require_path("target", target, batch, 2)
         for name, group in (("walls", walls), ("movers", movers)):
             if group is not None:
-                require_kind(name, group, Obstacles)
+                if not isinstance(group, Obstacles):
+                    shown = f"a {type(group).__name__}"
+                    raise ArgumentTypeError(name, "made by pj.obstacles", shown=shown)
                 require_beginning(name, group, batch, f"the batch shape {batch}")
         planned = (_states if cases.batch_shape else _state)(previous, elapsed)
         given = {"start": start, "speed": speed, "curvature": curvature}
