@@ -96,7 +96,7 @@ SMALL_SEARCH = {
     "points": 10,
     "searches": (BlockSearch(straight=12, tries=3, solver=LevenbergConfig(8)),),
 }
-SHORT = {"proportions": (0.2, 0.5, 1.0, 1.0, 1.0, 1.0), "nodes": 3, "num_table_nodes": 16}
+SHORT = {"proportions": (0.2, 0.5, 1.0, 1.0, 1.0, 1.0), "nodes": 3}
 
 
 @dataclasses.dataclass(frozen=True)

@@ -12,14 +12,16 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jax.custom_derivatives import SymbolicZero
 
-from planner_jax.ball.flight import BallState, fly, gravity_vector
+from planner_jax.ball.flight import BallState, gravity_vector
+from planner_jax.ball.flight_table import fly_out
 from planner_jax.core.arithmetic import reciprocal
 
-# Number of Runge-Kutta steps that integrate a flight; the position error is 0.2 mm after 2 s.
-_FLIGHT_STEPS = 10
-# Number of Runge-Kutta steps that integrate a flight in the first two Newton steps of `_aim`. With
-# fewer steps, Newton's method diverges for strong drag.
-_COARSE_STEPS = 8
+_FLIGHT_NODES = 17  # number of states of an integrated flight
+# Number of states in the first two Newton steps of `_aim`. With fewer, Newton's method diverges for
+# strong drag.
+_COARSE_NODES = 9
+
+_MOST_FOLDS = 4.0  # greatest natural logarithm of a speed's decrease in the first guess
 
 Tangent = Array | SymbolicZero
 
@@ -45,7 +47,7 @@ def aim_with_drag(
 def _aim(displacement: Array, flight_time: Array, drag: Array, gravity: Array) -> Array:
     def newton_step(_: Array, near: tuple[Array, Array]) -> tuple[Array, Array]:
         def landing(vel: Array) -> tuple[Array, Array]:
-            end = _displacement(vel, flight_time, drag, gravity, _COARSE_STEPS)
+            end = _displacement(vel, flight_time, drag, gravity, _COARSE_NODES)
             return end, end
 
         vel, _ = near
@@ -53,6 +55,9 @@ def _aim(displacement: Array, flight_time: Array, drag: Array, gravity: Array) -
         return vel - solve3(slope, end - displacement), slope
 
     start = aim_drag_free(jnp.zeros_like(displacement), displacement, flight_time, gravity)
+    # A ball with drag and initial speed v flies ln(1 + K_D v T) / K_D far, if it is not deflected.
+    folds = jnp.clip(drag * flight_time * jnp.sqrt(jnp.sum(start * start)), 1e-6, _MOST_FOLDS)
+    start = start * jnp.expm1(folds) * reciprocal(folds)
     vel, slope = lax.fori_loop(0, 2, newton_step, (start, jnp.eye(3, dtype=start.dtype)))
 
     def chord_step(_: Array, vel: Array) -> Array:
@@ -81,10 +86,9 @@ _aim.defjvp(_aim_jvp, symbolic_zeros=True)
 
 
 def _displacement(
-    vel: Array, flight_time: Array, drag: Array, gravity: Array, num_steps: int = _FLIGHT_STEPS
+    vel: Array, flight_time: Array, drag: Array, gravity: Array, nodes: int = _FLIGHT_NODES
 ) -> Array:
-    ball = BallState(pos=jnp.zeros_like(vel), vel=vel)
-    return fly(ball, flight_time, drag, gravity, num_steps=num_steps)[0].pos
+    return fly_out(vel, flight_time, drag, gravity, nodes).pos[-1]
 
 
 def solve3(matrix: Array, rhs: Array) -> Array:
@@ -97,23 +101,14 @@ def solve3(matrix: Array, rhs: Array) -> Array:
 def apex_with_drag(ball: BallState, flight_time: Array, drag: Array, gravity: Array) -> Array:
     """Return the greatest height [m] of a ball with quadratic drag within `flight_time` [s].
 
-    The flight is integrated in steps. From the last step whose initial vertical velocity v_z is
-    positive, the remaining climb is approximated by v_z^2 / (2 (g + 2/3 K_D |v| v_z)) with the drag
-    coefficient K_D. A falling ball is highest at time 0.
+    A falling ball is highest at time 0.
     """
     numbers = jnp.asarray(flight_time), jnp.asarray(drag), jnp.asarray(gravity)
     return ball.pos[2] + _climb(ball.vel, *numbers)
 
 
 def _compute_climb(vel: Array, flight_time: Array, drag: Array, gravity: Array) -> Array:
-    now = BallState(pos=jnp.zeros_like(vel), vel=vel)
-    _, path = fly(now, flight_time, drag, gravity, num_steps=_FLIGHT_STEPS)
-    height = jnp.concatenate([now.pos[None, 2], path.pos[:-1, 2]])
-    vels = jnp.concatenate([vel[None], path.vel[:-1]])
-    rising = jnp.maximum(vels[:, 2], 0.0)
-    speed = jnp.sqrt(jnp.maximum(jnp.sum(vels**2, axis=1), 1e-12))
-    reach = height + 0.5 * rising**2 / (gravity + drag * speed * rising * 2.0 / 3.0)
-    return reach[jnp.maximum(jnp.sum(vels[:, 2] > 0.0) - 1, 0)]
+    return fly_out(vel, flight_time, drag, gravity, _FLIGHT_NODES).highest()
 
 
 _climb = jax.custom_jvp(_compute_climb)

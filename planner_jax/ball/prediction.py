@@ -5,23 +5,21 @@ convolution [Keys1981], with the kernel's parameter a = -1/2, interpolates the t
 The interpolated position has a continuous time derivative.
 """
 
-import functools
-from collections.abc import Callable
 from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 from jax import Array
-from jax.custom_derivatives import SymbolicZero
 
 from planner_jax.ball.flight import BallState, require_ball, rk4_step
+from planner_jax.ball.flight_table import integrate_at
 from planner_jax.core.arithmetic import reciprocal
 from planner_jax.core.checks import require_kind, require_number, require_scalar
 from planner_jax.core.choices import require_size
 from planner_jax.core.origin import split_far, to_world
 from planner_jax.core.rules import NOT_NEGATIVE, POSITIVE, Field, Table
-from planner_jax.lanes import with_kernel
 
 LEAST_NODES = 5  # least number of nodes of a table
 
@@ -69,53 +67,15 @@ def predict_path(
     require_number("gravity", gravity)
     resolution = horizon / (num_nodes - 3)
     start, away = split_far(ball.pos)
-    pos, vel = _node_function(num_nodes)(start, ball.vel, resolution, drag, gravity)
-    return PathTable(pos=to_world(pos, away), vel=vel, resolution=resolution)
+    now = BallState(start, ball.vel)
 
+    def step(state: BallState, duration: Array) -> BallState:
+        return rk4_step(state, duration, drag, gravity)
 
-@functools.cache
-def _node_function(num_nodes: int) -> Callable:
-    def integrate(
-        pos: Array, vel: Array, resolution: Array, drag: Array, gravity: Array
-    ) -> tuple[Array, Array]:
-        ball = BallState(pos, vel)
-        before = rk4_step(ball, -resolution, drag, gravity)
-
-        def advance(state: BallState, _: None) -> tuple[BallState, BallState]:
-            after = rk4_step(state, resolution, drag, gravity)
-            return after, after
-
-        _, later = jax.lax.scan(advance, ball, None, length=num_nodes - 2)
-        nodes = jax.tree.map(
-            lambda a, b, c: jnp.concatenate([a[None], b[None], c]), before, ball, later
-        )
-        return nodes.pos, nodes.vel
-
-    path = "planner_jax.ball.prediction_kernel:table_kernel"
-
-    @functools.cache
-    def slopes(moving: tuple[int, ...]) -> Callable:
-        return with_kernel(jax.jacfwd(integrate, argnums=moving), path, num_nodes, moving)
-
-    def jvp(primals: tuple, tangents: tuple) -> tuple:
-        nodes = integrate_lanes(*primals)
-        moving = tuple(k for k, t in enumerate(tangents) if not isinstance(t, SymbolicZero))
-        further = tuple(k for k in moving if k > 0)
-        found = [jnp.zeros_like(leaf) for leaf in nodes]
-        if 0 in moving:  # a displacement of the initial position displaces the whole path
-            found[0] = found[0] + tangents[0][None]
-        if further:
-            for k, by in enumerate(slopes(further)(*primals)):
-                for argument, slope in zip(further, by, strict=True):
-                    change = tangents[argument]
-                    if change.ndim == 0:
-                        found[k] = found[k] + slope * change
-                    else:
-                        found[k] = found[k] + jnp.sum(slope * change[None, None], axis=-1)
-        return nodes, tuple(found)
-
-    integrate_lanes = with_kernel(integrate, path, num_nodes, jvp=jvp)
-    return integrate_lanes
+    times = resolution * jnp.asarray(np.arange(num_nodes - 1), jnp.result_type(resolution))
+    later = integrate_at(step, now, times, 1)
+    nodes = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), step(now, -resolution), later)
+    return PathTable(pos=to_world(nodes.pos, away), vel=nodes.vel, resolution=resolution)
 
 
 def horizon_of(table: PathTable) -> Array:

@@ -15,6 +15,7 @@ from jax import Array, lax
 from jaxtyping import PyTree
 
 from planner_jax.ball.flight import BallState, rk4_step
+from planner_jax.ball.flight_table import FlightTable, graded_times, integrate_at
 from planner_jax.core.arithmetic import at_least, components, reciprocal
 
 _LEAST_SPEED = 1e-3  # [m/s], smaller speeds count as this speed in divisions
@@ -68,6 +69,17 @@ def spin_step(ball: SpinningBall, duration: Array, air: Surroundings) -> Spinnin
     rate = lambda vel, *_: _rate(vel, ball, air)  # noqa: E731
     end: PyTree = rk4_step(BallState(pos, vel), duration, ball.drag, air.gravity, rate)  # pyright: ignore[reportArgumentType]
     return SpinningBall(jnp.stack(end.pos), jnp.stack(end.vel), ball.drag, ball.lift)
+
+
+def tabulate_spin(
+    ball: SpinningBall, duration: Array, air: Surroundings, num: int, substeps: int
+) -> FlightTable:
+    """Return the table of a flight without bounces in a duration () [s], of `num` states."""
+    push = jnp.sqrt(at_least(jnp.sum((ball.vel - air.wind) ** 2), _LEAST_SPEED**2))
+    times, growth = graded_times(ball.drag * push, duration, num)
+    nodes = integrate_at(lambda now, h: spin_step(now, h, air), ball, times, substeps)
+    acc = jax.vmap(lambda each: spin_acceleration(each, air))(nodes)
+    return FlightTable(nodes.pos, nodes.vel, acc, times, growth)
 
 
 def spin_bounce(ball: SpinningBall, air: Surroundings) -> SpinningBall:

@@ -13,7 +13,6 @@ import numpy as np
 from jax import Array, lax
 
 from planner_jax.ball.flight import BallState, drag_free_fall_time, fly, solve_impact
-from planner_jax.ball.prediction import target_at
 from planner_jax.baselines.hit.common import largest_violation, make_impact, motion_excess
 from planner_jax.baselines.hit.decoupled import aim_at_angle, solve_decoupled_hit
 from planner_jax.baselines.parts.minimum_jerk import minimum_jerk
@@ -138,7 +137,6 @@ class BatHit(OptimisedPlanner):
     transition: bool = True
     num_pieces: int = 4  # number of polynomial pieces
     nodes: int = 16  # number of intervals per piece in which penalties are integrated
-    num_table_nodes: int = 48  # number of nodes at which the incoming ball is tabulated
     time_weight: float = 1e3  # weight of the impact time
     limit_weight: float = 1e5  # weight of speed, acceleration, body rate and ground
     terminal_weight: float = 1e4  # weight of apex, hitting speed, and the defect of eqs 13-14
@@ -180,7 +178,7 @@ class BatHit(OptimisedPlanner):
 
     def prepare(self, case: HitCase) -> HitContext:
         """Tabulate the incoming ball's positions and velocities at equal time steps."""
-        return prepare_hit(case, self.num_table_nodes)
+        return prepare_hit(case)
 
     def impact(self, natural: Array, context: HitContext) -> tuple[Impact, Array]:
         """Return the impact from the last five variables, and the defect [Yu2023bat, eqs 13-14].
@@ -189,7 +187,7 @@ class BatHit(OptimisedPlanner):
         and x and z of the thrust per unit mass [m/s^2]. The defect is > 0 if no hit is possible.
         """
         case, time = context.case, jnp.exp(natural[0])
-        ball = target_at(context.path, time)
+        ball = context.path.at(time)
         hit = solve_decoupled_hit(
             ball, case.target, natural[1:3], natural[3:5], case.restitution, case.gravity
         )
@@ -205,7 +203,7 @@ class BatHit(OptimisedPlanner):
         stages = self.stage_times if self.transition else self.stage_times[:1]
         # If the ball lands early, the guess of the impact time is 0.9 of the landing time.
         time = jnp.minimum(sum(stages), 0.9 * jnp.maximum(context.landing_time, 0.1))
-        ball = target_at(context.path, time)
+        ball = context.path.at(time)
         after = aim_at_angle(ball.pos, case.target, self.first_angle, case.gravity)
         normal, _ = solve_impact(ball.vel, after, case.restitution)
         thrust = self.first_thrust_z * case.gravity / jnp.maximum(normal[2], 0.2) * normal

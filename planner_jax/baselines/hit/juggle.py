@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from planner_jax.ball.flight import solve_impact
-from planner_jax.ball.prediction import PathTable, target_at
+from planner_jax.ball.flight_table import FlightTable
 from planner_jax.baselines.hit.common import largest_violation, make_impact, motion_excess
 from planner_jax.baselines.parts.minimum_jerk import minimum_jerk_after_ramp
 from planner_jax.core.planner import Planner
@@ -23,7 +23,7 @@ _SHORTEST = 1e-2  # [s], least duration of a trajectory
 _LEAST_UPRIGHT = 1e-2  # least vertical component of the racket's normal, which is a divisor
 
 
-def falling_time(path: PathTable, height: Array, earliest: Array, latest: Array) -> Array:
+def falling_time(path: FlightTable, height: Array, earliest: Array, latest: Array) -> Array:
     """Return the time () [s] at which the ball falls through a height.
 
     Bisection is followed by one Newton step, and only this step is differentiated. If the ball does
@@ -38,12 +38,12 @@ def falling_time(path: PathTable, height: Array, earliest: Array, latest: Array)
 
     def halve(_: int, bounds: tuple[Array, Array]) -> tuple[Array, Array]:
         middle = 0.5 * (bounds[0] + bounds[1])
-        above = target_at(path, middle).pos[2] > height
+        above = path.at(middle).pos[2] > height
         return jnp.where(above, middle, bounds[0]), jnp.where(above, bounds[1], middle)
 
     earliest, latest = lax.fori_loop(0, _BISECTIONS, halve, (earliest, latest))
     time = lax.stop_gradient(0.5 * (earliest + latest))
-    ball = target_at(path, time)
+    ball = path.at(time)
     missing = ball.pos[2] - height
     crossed = jnp.abs(missing) < 1e-2
     sinking = lax.stop_gradient(jnp.minimum(ball.vel[2], -0.1))
@@ -84,7 +84,6 @@ class JuggleHit(Planner):
     racket_vel_xy: tuple[float, float] = (0.0, 0.0)  # [m/s], of the quadrotor at the impact
     ease: float = 0.02  # [s], duration of the ramp of the jerk at the start
     nodes: int = 60  # number of intervals per piece, at whose ends limits are evaluated
-    num_table_nodes: int = 48  # number of nodes at which the incoming ball is tabulated
 
     def __post_init__(self) -> None:
         require_settings(self)
@@ -94,7 +93,7 @@ class JuggleHit(Planner):
 
         The plan's cost is the mean squared jerk [Yu2023bat, eq. 15].
         """
-        impact = self.impact(prepare_hit(case, self.num_table_nodes))
+        impact = self.impact(prepare_hit(case))
         trajectory = minimum_jerk_after_ramp(
             case.head_state, impact.tail_state[:3], impact.stroke.time, self.ease
         )
@@ -125,7 +124,7 @@ class JuggleHit(Planner):
         latest = jnp.maximum(context.landing_time, highest)
         height = jnp.asarray(self.height, gravity.dtype)
         time = jnp.maximum(falling_time(path, height, highest, latest), _SHORTEST)
-        ball = target_at(path, time)
+        ball = path.at(time)
         rise = jnp.sqrt(2.0 * gravity * jnp.maximum(self.apex - ball.pos[2], 1e-3))
         fall = jnp.sqrt(2.0 / gravity * jnp.maximum(self.apex - case.target[2], 1e-3))
         flight_time = rise / gravity + fall

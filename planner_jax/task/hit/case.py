@@ -11,10 +11,12 @@ from jax import Array
 from jaxtyping import PyTree
 
 from planner_jax.ball.flight import BallState
+from planner_jax.ball.flight_table import is_resolved
 from planner_jax.core import GRAVITY, rules
+from planner_jax.core.arithmetic import Numbers, numpy_of
 from planner_jax.core.checks import floating
 from planner_jax.core.origin import NEAR, Located, find_origin, move
-from planner_jax.core.rules import Field, Table, require_sound
+from planner_jax.core.rules import Field, Rule, Table, require_sound
 from planner_jax.cost.extras import Extra, for_batch
 from planner_jax.robot.quadrotor import QuadrotorLimits
 from planner_jax.robot.quadrotor_model import PAPER_HITTER, RACKET, QuadrotorModel
@@ -25,6 +27,14 @@ from planner_jax.task.hit.spec import DRAG, START
 if TYPE_CHECKING:
     from planner_jax.robot.heading import Heading
 
+
+def _is_resolved(drag: Numbers, case: PyTree) -> Numbers:
+    """Return where a table of the ball's flight is right to 0.1 mm."""
+    with np.errstate(all="ignore"):
+        turn = 0.0 if case.lift is None else numpy_of(drag).sqrt((case.lift**2).sum(axis=-1))
+        return is_resolved(case.ball, drag, case.gravity, turn)
+
+
 # Shapes and ranges that `pj.require_sound` checks for the arrays of a `HitCase`.
 RULES: Table = (
     Field("ball.pos", (3,)),
@@ -33,6 +43,7 @@ RULES: Table = (
     Field("origin", (2,)),
     Field("target", (3,)),
     Field("drag", (), rules.NOT_NEGATIVE),
+    Field("drag", (), Rule("less for a flight as long and fast as this ball's", _is_resolved)),
     Field("lift", (3,)),
     Field("gravity", (), rules.POSITIVE),
     Field("restitution", (), rules.within(0.0, 1.0, "in [0, 1]")),

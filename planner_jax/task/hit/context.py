@@ -1,18 +1,15 @@
 """Functions that all hit planners use: ball's path, limits at the impact, balls out of reach."""
 
 import jax.numpy as jnp
-import numpy as np
 from flax import struct
 from jax import Array, lax
 
-from planner_jax.ball.flight import drag_free_fall_time
-from planner_jax.ball.prediction import PathTable, predict_path
+from planner_jax.ball.flight_table import FlightTable, longest_flight, tabulate_flight
 from planner_jax.core.arithmetic import reciprocal
 from planner_jax.robot.quadrotor import ALLOWED, beyond_reach, greatest_speed
 from planner_jax.task.hit.case import HitCase
 from planner_jax.task.hit.plan import Stroke
 
-_SHORTEST = 0.01  # [s], least duration of the ball's table; a ball on the ground lands at once
 _SLACK = 0.02  # [m], in `is_too_far`, far more than the errors of contacts that the referee accepts
 
 
@@ -21,28 +18,28 @@ class HitContext:
     """One case with its ball's predicted path and landing time, computed before the search."""
 
     case: HitCase
-    path: PathTable  # positions and velocities of the incoming ball at equally spaced times
+    path: FlightTable  # states of the incoming ball, from time 0 until after it lands
     landing_time: Array  # () [s], at which the incoming ball would land without a hit
 
 
-def prepare_hit(case: HitCase, num_nodes: int) -> HitContext:
-    """Tabulate the incoming ball's flight at `num_nodes` times, and estimate its landing time.
+def prepare_hit(case: HitCase) -> HitContext:
+    """Tabulate the incoming ball's flight, and estimate its landing time.
 
-    The table extends to 1.1 times the time at which a ball without drag would land.
+    The table extends until the ball has landed, by `longest_flight`.
     """
-    fall, _ = drag_free_fall_time(case.ball, jnp.zeros_like(case.drag), case.gravity)
-    horizon = lax.stop_gradient(jnp.maximum(1.1 * fall, _SHORTEST))
     if case.lift is None:
-        path = predict_path(case.ball, horizon, case.drag, case.gravity, num_nodes=num_nodes)
+        horizon = lax.stop_gradient(longest_flight(case.ball, case.drag, case.gravity))
+        path = tabulate_flight(case.ball, horizon, case.drag, case.gravity)
     else:
         from planner_jax.task.hit.spin import predict_spin
 
-        path = predict_spin(case, num_nodes)
-    node = jnp.maximum(jnp.sum(path.pos[1:, 2] > 0.0), 1)
-    # Landing time: after the last tabulated time at which the ball is above the ground, its rate
-    # of descent is assumed to be constant.
-    sinking = jnp.maximum(-path.vel[node, 2], 0.1)
-    landing = (node - 1).astype(sinking.dtype) * path.resolution + path.pos[node, 2] / sinking
+        path = predict_spin(case)
+    node = jnp.sum(path.pos[1:, 2] > 0.0)  # the last node above the ground, if any
+    # From there on a constant acceleration is assumed.
+    height, fall = jnp.maximum(path.pos[node, 2], 0.0), -path.vel[node, 2]
+    squared = fall * fall - 2.0 * height * path.acc[node, 2]
+    remaining = 2.0 * height / jnp.maximum(fall + jnp.sqrt(jnp.maximum(squared, 0.0)), 0.1)
+    landing = path.times[node] + remaining
     return HitContext(case=case, path=path, landing_time=lax.stop_gradient(landing))
 
 
@@ -65,9 +62,9 @@ def is_too_far(context: HitContext) -> Array:
     """
     case, path = context.case, context.path
     limits, ball = case.limits, case.ball
-    pos, vel = path.pos[1:-1], path.vel[1:-1]
-    half_step = 0.5 * path.resolution
-    times = path.resolution * jnp.asarray(np.arange(pos.shape[0]), pos.dtype)
+    pos, vel, times = path.pos, path.vel, path.times
+    # Half of the longer interval next to each time; the intervals become longer.
+    half_step = 0.5 * jnp.concatenate([times[1:] - times[:-1], times[-1:] - times[-2:-1]])
     # A bound on the ball's squared speed: without drag the ball would be fastest at the ground.
     fastest_squared = jnp.sum(ball.vel * ball.vel) + 2.0 * case.gravity * jnp.abs(ball.pos[2])
     bend = 0.5 * (case.gravity + case.drag * fastest_squared) * half_step**2

@@ -17,8 +17,6 @@ from jax import Array
 
 from planner_jax.ball.aim import aim_drag_free, aim_with_drag, apex_with_drag
 from planner_jax.ball.flight import BallState, drag_free_apex, gravity_vector, solve_impact
-from planner_jax.ball.prediction import LEAST_NODES, target_at
-from planner_jax.core.choices import require_size
 from planner_jax.cost.quadrotor import Measure
 from planner_jax.optimise.chain import ChainEnds, ChainPlanner
 from planner_jax.optimise.planner import pending
@@ -149,16 +147,11 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
     nodes: int = 4  # intervals of each piece at whose ends penalties are evaluated
     time_weight: float = 0.0
     energy_weight: float = 1e-8
-    num_table_nodes: int = 36
     drag_after_impact: bool = False
     impact_weight: float = 0.3  # [s] weight of the penalties for apex and hitting speed
     rounds: tuple[Round, ...] = _ROUNDS
     velocities: bool = False  # whether the velocities at the waypoints are variables
     learned: bool = True  # whether a network predicts starting points of usual cases
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        require_size("num_table_nodes", self.num_table_nodes, LEAST_NODES)
 
     @property
     def end_weight(self) -> float:
@@ -203,7 +196,7 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
         """Return the inputs of the network for starting points: ball, target, state and limits."""
         case, landing = context.case, context.landing_time
         head, limits, stroke = case.head_state, case.limits, case.hit_limits
-        balls = [target_at(context.path, share * landing) for share in _FEATURE_TIMES]
+        balls = [context.path.at(share * landing) for share in _FEATURE_TIMES]
         acceleration = limits.acceleration
         if acceleration is None:  # approximately the thrust minus the weight
             thrust = 2.5 * case.gravity if limits.max_thrust is None else limits.max_thrust
@@ -232,7 +225,7 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
 
     def prepare(self, case: HitCase) -> HitContext:
         """Return the case with a table of the incoming ball's path, for evaluations of the cost."""
-        return prepare_hit(case, self.num_table_nodes)
+        return prepare_hit(case)
 
     def guess_ends(self, context: HitContext, num: int) -> Array:
         """Return the variables of the impact in `num` starting points, (num, 1, 8).
@@ -305,7 +298,7 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
         """
         case = context.case
         time, flight_time, thrust = jnp.exp(natural[0]), jnp.exp(natural[1]), jnp.exp(natural[2])
-        ball = target_at(context.path, time)
+        ball = context.path.at(time)
         if case.lift is not None:
             from planner_jax.task.hit.spin import meet_spin
 

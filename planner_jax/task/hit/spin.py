@@ -12,14 +12,22 @@ from jaxtyping import PyTree
 
 from planner_jax.ball import spin as spinning
 from planner_jax.ball.aim import aim_with_drag, solve3
-from planner_jax.ball.flight import BallState, drag_free_fall_time
-from planner_jax.ball.prediction import PathTable
+from planner_jax.ball.flight import BallState
+from planner_jax.ball.flight_table import (
+    NODES,
+    SHORTEST,
+    SUBSTEPS,
+    FlightTable,
+    longest_flight,
+)
 from planner_jax.ball.recording import BALLS, Ball
 from planner_jax.ball.spin import SpinningBall
 from planner_jax.core.arithmetic import at_least
 from planner_jax.core.checks import numbers_of, require_kind
 from planner_jax.core.choices import require
 from planner_jax.robot.quadrotor import tangent_basis
+
+_RETURN_NODES = 24  # number of states of the flight after the impact
 
 
 def with_spin(
@@ -44,20 +52,19 @@ def _around(case: PyTree) -> spinning.Surroundings:
     return case.around.replace(gravity=case.gravity, restitution=case.restitution)
 
 
-def predict_spin(case: PyTree, num_nodes: int) -> PathTable:
-    """Return the path of the incoming ball until some time after it lands."""
+def predict_spin(case: PyTree) -> FlightTable:
+    """Return the path of the incoming ball until it has landed.
+
+    Lift and wind may keep a ball in the air for longer than `longest_flight`. A first table of
+    three times this duration determines when the ball lands.
+    """
     ball, air = SpinningBall(case.ball.pos, case.ball.vel, case.drag, case.lift), _around(case)
-    numbers = jnp.arange(num_nodes, dtype=case.drag.dtype)
-
-    def table(step: Array) -> PathTable:
-        start, times = spinning.spin_step(ball, -step, air), step * numbers
-        path = spinning.spin_flight(start, times, air, bounces=0, steps=num_nodes - 1)
-        return PathTable(*path, step)
-
-    fall, _ = drag_free_fall_time(case.ball, jnp.zeros_like(case.drag), case.gravity)
-    step = 3.0 * jnp.maximum(fall, 0.01) / num_nodes  # lift may keep a ball in the air for longer
-    above = jnp.cumprod((table(step).pos[:, 2] > 0.0).astype(step.dtype))
-    return table(lax.stop_gradient(step * jnp.sum(above) / (num_nodes - 3)))
+    table = lambda end: spinning.tabulate_spin(ball, end, air, NODES, SUBSTEPS)  # noqa: E731
+    longest = 3.0 * longest_flight(case.ball, case.drag, case.gravity)
+    first = table(lax.stop_gradient(longest))
+    above = jnp.cumprod((first.pos[1:, 2] > 0.0).astype(jnp.int32))
+    after = jnp.minimum(jnp.sum(above) + 1, NODES - 1)
+    return table(lax.stop_gradient(jnp.maximum(first.times[after], SHORTEST)))
 
 
 def meet_spin(
@@ -81,9 +88,11 @@ def meet_spin(
         vel, lift = racket + leaving.vel @ axes, leaving.lift @ axes
         return normal, racket, SpinningBall(ball.pos, vel, case.drag, lift)
 
+    def flight(leaving: SpinningBall) -> FlightTable:
+        return spinning.tabulate_spin(leaving, flight_time, air, _RETURN_NODES, 1)
+
     def miss(push: Array) -> Array:
-        leaving, times = strike(push)[2], flight_time[None]
-        return spinning.spin_flight(leaving, times, air, bounces=0, steps=12)[0][0] - case.target
+        return flight(strike(push)[2]).pos[-1] - case.target
 
     def solve(miss: PyTree, push: Array) -> Array:
         step = lambda _, x: x - solve3(jax.jacfwd(miss)(x), miss(x))  # noqa: E731
@@ -94,8 +103,4 @@ def meet_spin(
         miss, after - ball.vel, solve, lambda slope, y: solve3(jax.jacfwd(slope)(y), y)
     )
     normal, racket, top = strike(push)
-    after = top.vel
-    for share in (0.4, 0.7, 1.0, 1.0):  # of the remaining time to the apex
-        time = at_least(top.vel[2], 0.0) / at_least(-spinning.spin_acceleration(top, air)[2], 0.1)
-        top = spinning.spin_step(top, share * time, air)
-    return normal, racket, after, top.pos[2]
+    return normal, racket, top.vel, flight(top).highest()

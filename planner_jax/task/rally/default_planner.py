@@ -19,9 +19,7 @@ from jaxtyping import PyTree
 
 from planner_jax.ball.arc import fly_between
 from planner_jax.ball.flight import BallState, drag_free_fall_time, solve_impact
-from planner_jax.ball.prediction import LEAST_NODES, target_at
 from planner_jax.core.arithmetic import reciprocal
-from planner_jax.core.choices import require_size
 from planner_jax.cost.quadrotor import Measure
 from planner_jax.optimise.chain import ChainEnds, ChainPlanner
 from planner_jax.optimise.planner import pending
@@ -123,17 +121,12 @@ class ExactRally(ChainPlanner[RallyCase, RallyPlan]):
     nodes: int = 6  # intervals of each piece at whose ends penalties are evaluated
     time_weight: float = 0.0
     energy_weight: float = 5e-8
-    num_table_nodes: int = 36
     contact_weight: float = 0.3  # [s], weight of the penalties at the contacts
     place_weight: float = 3e-3
     apex_weight: float = 3e-3
     next_weight: float = 3.0
     rounds: tuple[Round, ...] = ROUNDS
     metric: bool = True  # whether the measured metric of the variables of two hits is used
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        require_size("num_table_nodes", self.num_table_nodes, LEAST_NODES)
 
     @property
     def end_weight(self) -> float:
@@ -206,7 +199,7 @@ class ExactRally(ChainPlanner[RallyCase, RallyPlan]):
     def prepare(self, case: RallyCase) -> RallyContext:
         """Return the case with a table of the ball's path up to the first hit."""
         of_hit: PyTree = case  # has the fields of `HitCase` that hits need
-        return RallyContext(**vars(prepare_hit(of_hit, self.num_table_nodes)))
+        return RallyContext(**vars(prepare_hit(of_hit)))
 
     def guess_ends(self, context: RallyContext, num: int) -> Array:
         """Return the variables of K hits in `num` starting points, (num, K, 11)."""
@@ -246,7 +239,7 @@ class ExactRally(ChainPlanner[RallyCase, RallyPlan]):
         limits = case.hit_limits
         durations, thrusts = jnp.exp(natural[:, 0]), jnp.exp(natural[:, 2])
         flights = jnp.concatenate([durations[1:], jnp.exp(natural[-1:, 1])])
-        first = target_at(context.path, durations[0] - case.ball_time)
+        first = context.path.at(durations[0] - case.ball_time)
         share = natural[:, 8:]
         places = case.places + case.place_range * share * jax.lax.rsqrt(1.0 + share * share)
         pos = jnp.concatenate([first.pos[None], places[:-1]])

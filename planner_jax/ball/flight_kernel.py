@@ -19,33 +19,36 @@ from planner_jax.core.compiled import Treedef
 from planner_jax.lanes.pallas import block_width, kernel_by_lanes
 
 _THREADS = 32  # greatest number of threads (balls) in one GPU block
-# Index of the velocity among the kernel's arguments: position, velocity, resolution, drag, gravity.
-_VEL = 1
+# Indices among the kernel's arguments: position, velocity, times, drag, gravity.
+_VEL, _DRAG = 1, 3
 
 
 def table_kernel(
-    num_nodes: int, moving: tuple[int, ...] = (), *, interpret: bool = False
+    num_nodes: int, substeps: int, moving: tuple[int, ...] = (), *, interpret: bool = False
 ) -> Callable:
-    """Build the GPU kernel that computes the states at the nodes of a `PathTable`.
+    """Build the GPU kernel that computes the states at the nodes of a `FlightTable`.
 
     Args:
         num_nodes: number N of nodes.
-        moving: arguments by which states are differentiated: 1 initial velocity, 2 resolution (time
-            between nodes), 3 drag, 4 gravity. With () the kernel returns states. Otherwise it
-            returns derivatives: of the positions, (N, 3) by each argument, or (N, 3, 3) by the
-            velocity, in the order of `moving`; then of the velocities in the same shapes.
+        substeps: number of Runge-Kutta steps between two nodes.
+        moving: arguments by which states are differentiated: 1 initial velocity, 3 drag, 4 gravity.
+            With () the kernel returns states. Otherwise it returns derivatives: of the positions,
+            (N, 3) by each argument, or (N, 3, 3) by the velocity, in the order of `moving`; then of
+            the velocities in the same shapes.
         interpret: run the kernel in Pallas's interpreter, without a GPU, for tests.
     """
 
     def kernel(treedef: Treedef, leaves: Sequence[Array]) -> Sequence[Array] | None:
-        pos, _, *numbers = leaves
+        pos, _, times, *numbers = leaves
         if pos.ndim != 2 or pos.dtype != jnp.float32 or any(x.ndim != 1 for x in numbers):
+            return None
+        if times.ndim != 2:
             return None
         lanes = pos.shape[1]
         threads = block_width(lanes, _THREADS)
         if threads is None:
             return None
-        return _call(num_nodes, moving, lanes, threads, interpret)(*leaves)
+        return _call(num_nodes, substeps, moving, lanes, threads, interpret)(*leaves)
 
     return kernel
 
@@ -57,43 +60,40 @@ class _Direction:
     result: int  # index of the array of results that holds the derivatives by this input
     index: tuple[int, ...]  # component of the velocity (last axis of the array); () for a scalar
     vel: tuple[float, ...]  # (3,) tangent of the velocity at time 0
-    numbers: tuple[float, ...]  # (3,) tangents of the scalars resolution, drag and gravity
+    numbers: tuple[float, ...]  # (2,) tangents of the scalars drag and gravity
 
 
 def _directions(moving: tuple[int, ...]) -> list[_Direction]:
-    still = (0.0, 0.0, 0.0)
+    still = (0.0, 0.0)
     units = [tuple(float(j == k) for j in range(3)) for k in range(3)]
     directions = []
     for result, argument in enumerate(moving):
         if argument == _VEL:
             directions += [_Direction(result, (k,), unit, still) for k, unit in enumerate(units)]
         else:
-            directions.append(_Direction(result, (), still, units[argument - _VEL - 1]))
+            directions.append(_Direction(result, (), (0.0, 0.0, 0.0), units[argument - _DRAG][:2]))
     return directions
 
 
 @functools.cache
 def _call(
-    num_nodes: int, moving: tuple[int, ...], lanes: int, threads: int, interpret: bool
+    num_nodes: int,
+    substeps: int,
+    moving: tuple[int, ...],
+    lanes: int,
+    threads: int,
+    interpret: bool,
 ) -> Callable:
     directions = _directions(moving)
     shapes = [(num_nodes, 3, 3) if argument == _VEL else (num_nodes, 3) for argument in moving]
     shapes = 2 * (shapes or [(num_nodes, 3)])  # shapes of results: positions, then velocities
 
-    def body(pos, vel, resolution, drag, gravity, *out):
-        numbers = resolution[...], drag[...], gravity[...]
+    def body(pos, vel, times, drag, gravity, *out):
+        numbers = drag[...], gravity[...]
         zero = jnp.zeros_like(numbers[0])
 
         def full(values: Iterable[ArrayLike]) -> Any:  # a vector as a tuple of components
             return tuple(zero + value for value in values)
-
-        def advance(ball: BallState, moved: list[BallState], sign: float = 1.0) -> tuple:
-            def step(ball: BallState, h: Array, *others: Array) -> BallState:
-                return rk4_step(ball, sign * h, *others)
-
-            after, push = jax.linearize(step, ball, *numbers)
-            pairs = zip(moved, directions, strict=True)
-            return after, [push(state, *full(each.numbers)) for state, each in pairs]
 
         def write(node: ArrayLike, ball: BallState, moved: list[BallState]) -> None:
             targets = [(each.result, each.index) for each in directions] or [(0, ())]
@@ -104,14 +104,25 @@ def _call(
 
         def write_and_advance(node: Array, carry: tuple) -> tuple:
             write(node, *carry)
-            return advance(*carry)
+            duration = (times[node + 1] - times[node]) / substeps
+
+            def advance(_: Array, carry: tuple) -> tuple:
+                ball, moved = carry
+
+                def step(ball: BallState, *numbers: Array) -> BallState:
+                    return rk4_step(ball, duration, *numbers)
+
+                after, push = jax.linearize(step, ball, *numbers)
+                pairs = zip(moved, directions, strict=True)
+                return after, [push(state, *full(each.numbers)) for state, each in pairs]
+
+            return jax.lax.fori_loop(0, substeps, advance, carry)
 
         ball = BallState(full(pos[k] for k in range(3)), full(vel[k] for k in range(3)))
         moved = [BallState(full((0.0, 0.0, 0.0)), full(each.vel)) for each in directions]
-        write(0, *advance(ball, moved, -1.0))
-        write(num_nodes - 1, *jax.lax.fori_loop(1, num_nodes - 1, write_and_advance, (ball, moved)))
+        write(num_nodes - 1, *jax.lax.fori_loop(0, num_nodes - 1, write_and_advance, (ball, moved)))
 
-    inputs = [(3,), (3,), (), (), ()]
+    inputs = [(3,), (3,), (num_nodes,), (), ()]
     return kernel_by_lanes(
         body, inputs, shapes, lanes, threads, name="flight_table", interpret=interpret
     )
