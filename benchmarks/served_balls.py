@@ -130,7 +130,7 @@ class Check:
         self.air = Air(self.drag, (1.0 / grip - 1.0) / reach * np.cross(change, normal), reach)
 
     def land(self, duration: np.ndarray, place: np.ndarray) -> None:
-        """Test that the balls are at a place (B, 3) after a duration (B,) [s] and rose as allowed."""
+        """Test the place (B, 3) of balls after a duration (B,) [s], and their greatest height."""
         _, pos, _ = fly(*self.ball, self.air, duration)
         self.is_wrong |= np.linalg.norm(pos[-1] - place, axis=1) > _TARGET
         apex = pos[..., 2].max(axis=0)

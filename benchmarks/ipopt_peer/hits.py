@@ -5,10 +5,13 @@
 
 from typing import Any
 
+import jax
 import numpy as np
 
+from planner_jax.ball.prediction import predict_path
 from planner_jax.benchmarks.ipopt_peer.program import Problem, body_axes, ca, rate_squared
 
+NODES = 48  # number of states in the table of the ball's path
 # Name of each number of a case that IPOPT's problem of a hit contains, in SI units -> its number of
 # values (3 for a vector).
 SIZES = {
@@ -34,7 +37,9 @@ def read_params(context: Any) -> dict[str, Any]:
     `context` is the result of the planner's `prepare` for the case, with NumPy leaves. It contains
     the case and a table of the ball's path.
     """
-    case, path = context.case, context.path
+    case, end = context.case, context.path.times[-1]
+    path = predict_path(case.ball, end, case.drag, case.gravity, num_nodes=NODES)
+    path = jax.tree.map(np.asarray, path)
     found = {"path_pos": path.pos, "path_vel": path.vel, "resolution": path.resolution}
     for source in (case, case.limits, case.hit_limits):
         found |= {n: getattr(source, n) for n in SIZES if hasattr(source, n)}
@@ -43,12 +48,11 @@ def read_params(context: Any) -> dict[str, Any]:
 
 def make_problem(planner: Any) -> Problem:
     """Define for IPOPT the problem that the planner `ExactHit` solves, with the same settings."""
-    nodes = planner.num_table_nodes
     return Problem(
         planner=planner,
-        sizes=SIZES | {"path_pos": 3 * nodes, "path_vel": 3 * nodes},
+        sizes=SIZES | {"path_pos": 3 * NODES, "path_vel": 3 * NODES},
         num_natural=8,
-        ends=lambda natural, params: ends(natural, params, nodes),
+        ends=lambda natural, params: ends(natural, params, NODES),
         limits=limits,
         factors=(2.0, 2.0, 2.0, 1.0),
         impact_weight=planner.impact_weight,

@@ -24,7 +24,8 @@ from jax.custom_derivatives import SymbolicZero
 from planner_jax.core.arithmetic import reciprocal
 
 _NODES = 5  # number of nodes of the climb, and of the fall
-_ITERATIONS = 4  # number of times that the rates are computed from the speed
+_ITERATIONS = 8  # number of times that the rates are computed from the speed
+_CONSTANT = 3  # number of the first iterations whose results are constants in derivatives
 
 
 def fly_between(
@@ -32,8 +33,9 @@ def fly_between(
 ) -> tuple[Array, Array, Array]:
     """Return the flight of a ball with quadratic drag from `pos` to `target`, both (3,) [m].
 
-    With 0.06 /m of drag, flights of a rally miss the target by less than 0.03 mm; with 0.2 /m, by
-    0.3 mm. Derivatives are computed in forward mode, and store no intermediate values.
+    With the product N of drag, initial speed and flight time, flights of up to 3 s miss the target
+    by less than 0.3 mm up to N = 3, by 0.6 mm up to N = 10, and by 4 mm up to N = 30. Derivatives
+    are computed in forward mode, and store no intermediate values.
 
     Args:
         pos: (3,) [m], position at the start.
@@ -100,7 +102,10 @@ def _solve(square: Array, rise: Array, fall: Array, drag: Array) -> Array:
     top = jnp.clip(0.5 + rise / fall, 0.0, 1.0)  # time of the apex in units of T
     lengths, times = divide(top)
     speed = speed_of(jnp.ones_like(times), rise + fall * (0.5 - times))
-    for _ in range(_ITERATIONS - 1):
+    for k in range(_ITERATIONS - 1):
+        if k < _CONSTANT:
+            top, times, speed = map(jax.lax.stop_gradient, (top, times, speed))
+            lengths, _ = divide(top)
         _, _, across, upward = rates_of(speed, lengths)
         top = jnp.clip(top + upward[0, -1] / fall, 0.0, 1.0)
         lengths, later = divide(top)

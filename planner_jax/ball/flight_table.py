@@ -30,9 +30,12 @@ SUBSTEPS = 3  # number of Runge-Kutta steps between two states
 SHORTEST = 0.01  # [s], least duration of a table; a ball on the ground lands at once
 _LEAST_GROWTH = 1e-2  # of pace times duration; with less the times are equally spaced
 _SMALL = 1e-6  # smaller arguments of quotients such as atan(x) / x count as this number
-# Greatest last step of a table, in the time constants of ball and air. Up to here tables of random
-# balls, with K_D up to 100 /m and speeds up to 1,000 m/s, are right to 0.1 mm.
-_LONGEST_STEP = 1.0
+_ERROR = 1e-4  # [m], greatest error of a table that `is_resolved` permits
+_ERROR_UNIT = 5e-4  # error of a table, divided by the fourth power of its steps, times K_D
+_LASTING = 3.0  # time constants after which a falling ball has its terminal velocity
+# Greatest last steps, in time constants of the drag at terminal velocity, at which the integration
+# is stable with a factor 2 to spare, and in units of the rotation by lift [rad].
+_LONGEST_STEP, _WIDEST_TURN = 4.0, 0.3
 
 
 @struct.dataclass
@@ -107,12 +110,19 @@ def longest_flight(ball: BallState, drag: Numbers, gravity: Numbers) -> Numbers:
 def is_resolved(ball: BallState, drag: Numbers, gravity: Numbers, turn: Numbers = 0.0) -> Numbers:
     """Return whether a table of a ball's flight to the ground is right to 0.1 mm, bool (...).
 
-    `turn` (...) [1/s] is the rate at which lift turns the velocity.
+    The steps of a table are measured in the time constant 1 / sqrt(g K_D) of the drag, and in
+    factors of the decreasing speed. The bound on their error is the greatest error of 4,000 random
+    flights, with K_D up to 1,000 /m and speeds up to 1,000 m/s. `turn` (...) [1/s] is the rate at
+    which lift turns the velocity.
     """
     xp, horizon = numpy_of(drag), longest_flight(ball, drag, gravity)
     growth = xp.maximum(drag * _speed(ball) * horizon, _LEAST_GROWTH)
-    step = (1.0 + 1.0 / growth) * horizon * xp.log1p(growth) / (NODES - 1)
-    return step * (xp.sqrt(gravity * drag) + turn) <= _LONGEST_STEP
+    share, rate = xp.log1p(growth) / (NODES - 1), xp.sqrt(gravity * drag)
+    last = share * (horizon / growth + horizon)
+    curved = share * (rate * horizon / growth + xp.minimum(rate * horizon, _LASTING))
+    error = _ERROR_UNIT * (curved**4 + share**4)
+    is_exact = error <= _ERROR * xp.maximum(drag, _SMALL)
+    return is_exact & (rate * last <= _LONGEST_STEP) & (turn * last <= _WIDEST_TURN)
 
 
 def _speed(ball: BallState) -> Numbers:

@@ -24,9 +24,10 @@ from planner_jax.robot.quadrotor import (
     add_drag,
     add_drag_rate,
     body_rate_squared,
+    net_thrust,
     thrust_in_air,
 )
-from planner_jax.trajectory.polynomial import Motion
+from planner_jax.trajectory.polynomial import Motion, PiecewisePolynomial, sample_pieces
 from planner_jax.trajectory.proportional_minco import ProportionalMinco
 
 
@@ -95,6 +96,9 @@ def tilt_excess(acc: Components, gravity: Array, limits: QuadrotorLimits) -> Arr
     up = z + gravity
     cosine = up * inverse_sqrt(at_least(_size_squared((x, y, up)), 1e-4))
     return (1.0 - cosine) * reciprocal(1.0 - jnp.cos(limits.max_tilt)) - 1.0
+
+
+_OVERTURN_NODES = 4  # intervals of a piece, at whose ends `overturn_excess` evaluates the motion
 
 
 class QuadrotorCase(Protocol):
@@ -285,6 +289,36 @@ def _groups(limits: QuadrotorLimits) -> tuple[tuple[tuple[int, int], ...], ...]:
     return tuple(
         tuple((order, axis) for order in sorted(each) for axis in axes(order)) for each in together
     )
+
+
+def overturn_excess(
+    trajectory: PiecewisePolynomial, gravity: Array, limits: QuadrotorLimits
+) -> Array:
+    """Return the greatest relative excess of the body rate near upside down, between samples; ().
+
+    Upside down the Hopf fibration has no attitude: the body turns about the thrust at a rate that
+    grows without limit, for a time shorter than the intervals between samples. From each sample the
+    thrust direction z is followed at its rate w along a great circle. With the vertical component n
+    of the circle's normal, the body rate at the lowest point is  w sqrt(1 + (n / (1 + z_z))^2) ,
+    and there  1 + z_z = 1 - sqrt(1 - n^2) . The result is -1 if no lowest point is within an
+    interval.
+    """
+    load = _load(sample_pieces(trajectory, _OVERTURN_NODES), limits)
+    pull = net_thrust(load.acc, gravity)
+    unit = inverse_sqrt(at_least(jnp.sum(pull * pull, axis=1), 1e-4))[:, None]
+    z = pull * unit
+    turn = jnp.cross(z, load.jerk * unit)
+    rate = jnp.sum(turn * turn, axis=1)
+    squared = jnp.clip(turn[:, 2] ** 2 * reciprocal(at_least(rate, 1e-6)), 1e-12, 1.0)
+    level = jnp.sqrt(1.0 - squared)
+    steps = jnp.repeat(trajectory.durations / _OVERTURN_NODES, _OVERTURN_NODES + 1)
+    angle = jnp.minimum(jnp.sqrt(rate) * steps, 1.0)
+    is_met = -z[:, 2] >= level * jnp.cos(angle)
+    top = rate * (1.0 + (1.0 + level) ** 2 * reciprocal(squared))
+    excess = jnp.where(
+        is_met & (z[:, 2] < 0.0), top * reciprocal(limits.body_rate) ** 2 - 1.0, -1.0
+    )
+    return relative(jnp.max(excess))
 
 
 def greatest_excess(

@@ -22,7 +22,12 @@ from planner_jax.core.planner import CaseT, PlanT
 from planner_jax.core.protocol import require_settings
 from planner_jax.cost.along import BETWEEN_NODES, Along, integrate_along
 from planner_jax.cost.penalty import smooth_hinge
-from planner_jax.cost.quadrotor import QuadrotorCase, flight_along, greatest_excess
+from planner_jax.cost.quadrotor import (
+    QuadrotorCase,
+    flight_along,
+    greatest_excess,
+    overturn_excess,
+)
 from planner_jax.optimise.planner import OptimisedPlanner
 from planner_jax.optimise.settings import Curvature, Evaluation
 from planner_jax.optimise.shipped import StartNetwork, load_scale, select_start
@@ -269,10 +274,12 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
             lasting = jnp.where(active, durations, 0.0)
             of_moving = self.along(nodes, case), chain.columns, lasting, self.stands
             greatest.append(moving(*of_moving)[1])
+        trajectory = chain_trajectory(self.maps, chain, active)
         along = [jnp.max(jnp.where(active, each, -1.0)) for each in greatest]
+        along.append(overturn_excess(trajectory, case.gravity, case.limits))
         at_ends = jnp.max(self.relative_excess(ends.excess))
         violation = functools.reduce(jnp.maximum, [*along, at_ends])
-        return self.make_plan(chain_trajectory(self.maps, chain, active), ends, violation, context)
+        return self.make_plan(trajectory, ends, violation, context)
 
 
 def _split_moving(case: QuadrotorCase) -> tuple[QuadrotorCase, PyTree]:

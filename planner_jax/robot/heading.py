@@ -7,7 +7,7 @@ robot, so it is computed after the trajectory, which is planned at the heading o
 
 import dataclasses
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import ClassVar
 
 import jax
@@ -17,15 +17,15 @@ from flax import struct
 from jax import Array, lax
 from jaxtyping import PyTree
 
-from planner_jax.ball.prediction import predict_path
+from planner_jax.ball.flight_table import NODES, SUBSTEPS, tabulate_flight
 from planner_jax.ball.target import state_at
 from planner_jax.core.arithmetic import Numbers, numpy_of
 from planner_jax.core.choices import require, require_one_of
 from planner_jax.core.rules import POSITIVE, Field, Rule, Table
 from planner_jax.robot.attitude import yaw_at
-from planner_jax.robot.quadrotor import add_drag, add_drag_rate, body_rate, thrust_in_air
+from planner_jax.robot.quadrotor import Air, add_drag, add_drag_rate, body_rate, thrust_in_air
 from planner_jax.robot.rotor_thrusts import rotor_thrusts
-from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
+from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate, sample_pieces
 
 MAX_YAW_RATE = 2.0  # [rad/s], default of cases with a heading
 KNOTS, _FINE = 64, 8  # pieces of a heading, and intervals of each, at whose ends limits are tested
@@ -36,7 +36,6 @@ _ROUNDING = 1e-4  # relative excess of a rotor's thrust that is no reason for a 
 # What a heading may follow, and the horizontal speed [m/s] or distance [m] of the robot from the
 # ball, from which on it does; below half of it, the heading is held.
 _FOLLOWED = {"velocity": 0.5, "ball": 0.3}
-_NODES = 36  # of the table of a ball's flight to a hit
 
 
 def _is_rising(value: Numbers, part: PyTree) -> Numbers:
@@ -121,9 +120,8 @@ def plan_heading(plan: PyTree, case: PyTree) -> PiecewisePolynomial:
     times = step * jnp.asarray(np.arange(KNOTS * _FINE + 1) / _FINE, step.dtype)
     orders = range(1, 4 if limits.rotors is None else 5)
     flown = [jax.vmap(lambda t, k=k: evaluate(path, t, k))(times) for k in orders]
-    load = add_drag(limits.air, flown[0], flown[1])
-    loads = [load, *map(functools.partial(add_drag_rate, limits.air), flown[1:-1], flown[2:])]
-    x, y, twist = body_rate(load, loads[1], gravity)
+    loads = _loads(limits.air, flown)
+    x, y, twist = body_rate(loads[0], loads[1], gravity)
     square = (_SHARE * limits.body_rate) ** 2 - x * x - y * y
     spare = jnp.where(square > 0.0, jnp.sqrt(jnp.where(square > 0.0, square, 1.0)), 0.0)
     # The interval of psi' at every knot; linear between knots, psi' is then within it at all times.
@@ -135,22 +133,40 @@ def plan_heading(plan: PyTree, case: PyTree) -> PiecewisePolynomial:
     wanted = _requests(plan, case, path, times[::_FINE])
     if limits.rotors is None:
         return _turn(case.heading, step, wanted, room, 1.0)
-    pull = None if limits.air is None else thrust_in_air(limits.air, flown[0], load, gravity)
-    pull = None if pull is None else pull[within]
+    # The snap jumps between the pieces of the path, whose both ends are therefore tested too.
+    joint, ends = sample_pieces(path, 1), jnp.cumsum(path.durations)
+    at_joints = joint.vel, joint.acc, joint.jerk, joint.snap
+    joint_times = jnp.stack([ends - path.durations, ends], axis=1).ravel()
+
+    def greatest(flown: Sequence[Array], turn: tuple[Array, Array, Array]) -> Array:
+        loads, rotors = _loads(limits.air, flown), limits.rotors
+        pull = None
+        if limits.air is not None:
+            pull = thrust_in_air(limits.air, flown[0], loads[0], gravity)
+        thrusts = jnp.stack(rotor_thrusts(*loads, gravity, rotors, pull, turn))
+        beyond = jnp.maximum(thrusts - rotors.max_thrust, rotors.min_thrust - thrusts)
+        return jnp.max(beyond) / rotors.max_thrust
 
     def excess(found: PiecewisePolynomial) -> Array:
         since, (start, rate, half) = times[None, : _FINE + 1], jnp.moveaxis(found.coeffs, 1, 0)
         turn = start + since * (rate + since * half), rate + 2.0 * since * half, 2.0 * half
-        load, jerk, snap = (each[within] for each in loads)
-        rotors = limits.rotors
-        thrusts = jnp.stack(rotor_thrusts(load, jerk, snap, gravity, rotors, pull, turn))
-        beyond = jnp.maximum(thrusts - rotors.max_thrust, rotors.min_thrust - thrusts)
-        return jnp.max(beyond) / rotors.max_thrust
+        read = jax.vmap(lambda t: tuple(evaluate(found, t, k)[0] for k in range(3)))
+        along = greatest([each[within] for each in flown], turn)
+        return jnp.maximum(along, greatest(at_joints, read(joint_times)))
 
     tried = [_turn(case.heading, step, wanted, room, factor) for factor in _SLOWER]
     beyond = jnp.stack([excess(each) for each in tried])
     first = jnp.argmax(beyond <= jnp.maximum(beyond[-1], 0.0) + _ROUNDING)
     return jax.tree.map(lambda *leaves: jnp.stack(leaves)[first], *tried)
+
+
+def _loads(air: Air | None, flown: Sequence[Array]) -> list[Array]:
+    """Return the derivatives of the motion that needs the same attitude without drag and wind.
+
+    `flown` has the velocity and its derivatives; the result has one entry less.
+    """
+    rates = map(functools.partial(add_drag_rate, air), flown[1:-1], flown[2:])
+    return [add_drag(air, flown[0], flown[1]), *rates]
 
 
 def _requests(
@@ -177,7 +193,14 @@ def _balls(plan: PyTree, case: PyTree) -> Callable[[Array], Array]:
     """Return a function of time () [s]: the position (3,) [m] of the ball that is met next."""
     if "targets" not in vars(case):  # a hit
         end = plan.stroke.time
-        path = predict_path(case.ball, end, case.drag, case.gravity, num_nodes=_NODES)
+        if case.lift is None:
+            path = tabulate_flight(case.ball, end, case.drag, case.gravity)
+        else:
+            from planner_jax.ball.spin import SpinningBall, tabulate_spin  # few balls have a spin
+
+            ball = SpinningBall(case.ball.pos, case.ball.vel, case.drag, case.lift)
+            air = dataclasses.replace(case.around, gravity=case.gravity)
+            path = tabulate_spin(ball, end, air, NODES, SUBSTEPS)
         return lambda time: path.at(time).pos
 
     def at(time: Array) -> Array:

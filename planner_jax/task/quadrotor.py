@@ -16,6 +16,7 @@ from planner_jax.core.rules import Field, Table
 from planner_jax.robot.quadrotor import QuadrotorLimits, RotorLimits
 from planner_jax.robot.quadrotor_model import NET, RECOVERY_TILT, QuadrotorModel, Tool
 
+_LEAST_COSINE = 1e-6  # cosine of half the tilt of a start that is given as upside down
 _MOMENTS = rules.Rule("> 0", lambda x, _: (x > 0.0) | (np.arange(x.shape[-1]) > 2))
 # Shapes and ranges of the quadrotor's limits, for the cases of hits and of catches.
 FLIGHT_RULES: Table = (
@@ -85,6 +86,8 @@ def start_state(
         w, x, y, z = np.moveaxis(numbers_of("start_attitude", attitude, batch, (4,)), -1, 0)
         square = np.asarray(w * w + x * x + y * y + z * z, float)
         rules.require_rule("start_attitude", square, square > 0.0, "a quaternion", batch)
+        # Exactly upside down, the thrust alone would not determine the axis of the tilt.
+        w = np.where(w * w + z * z == 0.0, _LEAST_COSINE * np.sqrt(square), w)
         axis = 2.0 * np.stack([w * y + x * z, y * z - w * x, -x * x - y * y], axis=-1)
         weight = np.asarray(numbers_of("gravity", gravity, batch, ()), float)
         head[..., 2, :] = weight[..., None] * axis / square[..., None]  # weight * (body z - e_3)

@@ -27,7 +27,7 @@ from planner_jax.core.checks import numbers_of, require_kind
 from planner_jax.core.choices import require
 from planner_jax.robot.quadrotor import tangent_basis
 
-_RETURN_NODES = 24  # number of states of the flight after the impact
+_RETURN_NODES = 16  # number of states of the flight after the impact
 
 
 def with_spin(
