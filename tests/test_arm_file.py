@@ -15,6 +15,8 @@ from planner_jax.robot.arm_file import Shield, describe_arm, irb1600, read_arm
 from planner_jax.robot.capsule_fit import cover, measure_excess
 
 mujoco = pytest.importorskip("mujoco")
+# Links of `MJCF` have the masses that MuJoCo computes by its own density.
+pytestmark = pytest.mark.filterwarnings("ignore:.*no mass is stated")
 RATES = {"velocity": 2.0, "acceleration": 9.0}
 
 # Defaults, an include, a mesh, links of several bodies, joints beside the origins of their bodies,

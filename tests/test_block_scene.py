@@ -77,10 +77,13 @@ def test_a_scene_file_lists_obstacles_and_the_protected_body(tmp_path):
         ("[1]", "a.yaml must be fields with values"),
         ("meshes: [{scale: 2}]", r"a.yaml: meshes\[0\] must have the fields file, scale, pos"),
         ("meshes: [{file: a.stl, scale: 0}]", r"a.yaml: meshes\[0\].scale must be > 0, got 0"),
-        ("meshes: [{file: b.stl}]", r"a.yaml: meshes\[0\] must be an STL, .* got b.stl: .*opening"),
+        (
+            "meshes: [{file: b.stl}]",
+            r"a.yaml: meshes\[0\] must be a binary STL, .* got b.stl: No such file",
+        ),
         ("meshes: [{file: a.yaml}]", r"a.yaml: meshes\[0\] must be .*, got a.yaml: no decoder"),
         ("meshes: [{file: flat.obj}]", r".*\[0\] must be .* with a volume; .*obj: .*coplanar"),
-        ("meshes: [{file: flat.obj, turn: [0, 0, 0, 0]}]", r"a.yaml: the rotation of meshes\[0\]"),
+        ("meshes: [{file: flat.obj, turn: [0, 0, 0, 0]}]", r"a.yaml: meshes\[0\].turn must"),
     ],
 )
 def test_a_wrong_element_of_a_scene_file_is_named(tmp_path, monkeypatch, text, message):

@@ -186,7 +186,7 @@ def test_shapes_are_checked():
         pj.reach.case(GOAL, goals=[GOAL])
     with pytest.raises(ValueError, match="goal must have a shape that ends with"):
         pj.reach.case(np.zeros(5))
-    with pytest.raises(ValueError, match=r"the radius of capsules\[0\] must be >= 0, got -0.1"):
+    with pytest.raises(ValueError, match=r"capsules\[0\].radius must be >= 0, got -0.1"):
         pj.reach.make_scene(capsules=[([(0.0, 0.0, 0.0), (0.0, 0.0, 1.0)], -0.1)])
 
 

@@ -27,6 +27,8 @@ _SENTENCES = {
     "velocity": "{failed_part} is {excess:.2%} above its limit at {time:.3f} s",
     "acceleration": "{failed_part} is {excess:.2%} above its limit at {time:.3f} s",
     "torque": "{failed_part} needs {excess:.2%} more torque than its limit at {time:.3f} s",
+    "reach": "no motion exists: {failed_part} is {excess:.3g} rad beyond its limit at every goal",
+    "ends": "no motion is free: {failed_part} are {excess:.3g} m inside each other",
     "goal": "{failed_part} ends {excess:.3g} rad or rad/s off standstill at the nearest goal",
     "obstacle": "{failed_part} are {excess:.3g} m inside each other at {time:.3f} s",
     "self": "{failed_part} are {excess:.3g} m inside each other at {time:.3f} s",
@@ -36,6 +38,7 @@ LONGEST_STEP = 0.005  # [s], greatest time between two samples of the motion
 LARGEST_TURN = 0.017  # [rad], greatest change between two samples, as norm of the joints' changes
 LONGEST_PLAN = 60.0  # [s]
 THICKNESS = 0.01  # [m], of the shield
+_LEAST = 1e-9  # [m], least size of a body
 _FAR = 5.0  # [m], greatest distance that is computed
 _KINDS = ("obstacle", "self")
 
@@ -175,6 +178,16 @@ def _judge(
     final = np.abs(last[0][-1] - case.goals), np.abs(last[1][-1])
     nearest = final[0].max(axis=1).argmin()
     test("goal", np.maximum(final[0][nearest], final[1])[None], ends[-1:], relative)
+    scene, hulls = case.scene, () if case.scene.meshes is None else case.scene.meshes.corners
+    bodies = Bodies(case.arm, scene.cylinder_ends, scene.cylinder_radius, hulls, scene)
+    if tests["goal"][0]:
+        beyond = np.maximum(case.goals - arm.upper, arm.lower - case.goals)
+        goals = case.goals[beyond.max(axis=1) <= 0.0]
+        if len(goals):
+            depth, parts["ends"] = _deepest_end(bodies, case.angles, goals)
+            tests["ends"] = (depth > 0.0, depth, 0.0)
+        else:
+            test("reach", beyond[beyond.max(axis=1).argmin()][None], ends[-1:], 0.0)
     # A joint's angle has its extremes at the ends of pieces and where its rate is zero.
     rise = np.where(coeffs[:, 2] == 0.0, np.inf, coeffs[:, 2])
     turning = np.clip(-0.5 * coeffs[:, 1] / rise, 0.0, durations[:, None])
@@ -203,12 +216,22 @@ def _judge(
         excess, at, joint = compare(*of_plan, stays=True)
         tests["torque"], parts["torque"] = (excess > relative, excess, at), names[joint]
         measured["torque_share"] = excess + 1.0
-    scene, hulls = case.scene, () if case.scene.meshes is None else case.scene.meshes.corners
-    bodies = Bodies(case.arm, scene.cylinder_ends, scene.cylinder_radius, hulls, scene)
     for kind, (least, at, part) in bodies.clearances(samples).items():
         measured[f"{kind}_clearance"] = least
         tests[kind], parts[kind] = (-least > contact, -least, float(time[at])), part
     return tests, parts, measured, True
+
+
+def _deepest_end(bodies: "Bodies", start: np.ndarray, goals: np.ndarray) -> tuple[float, str]:
+    """Return how deep [m] bodies are in each other at the start, or else at the freest goal.
+
+    The second result names the bodies and the end. The depth is at most 0 if both are free.
+    """
+    found = []
+    for name, angles in [("start", start), *(("goal", goal) for goal in goals)]:
+        gap, _, part = min(bodies.clearances(angles[None]).values())
+        found.append((-gap, f"at the {name} {part}"))
+    return found[0] if found[0][0] > 0.0 else min(found[1:])
 
 
 class Bodies:
@@ -240,9 +263,9 @@ class Bodies:
             return len(self._names) - 1
 
         def add_capsule(name: str, body, ends: np.ndarray, radius: float) -> int:
-            if np.linalg.norm(ends[1] - ends[0]) < 1e-9:
-                return add(name, body, kinds.mjGEOM_SPHERE, pos=ends[0], size=[radius, 0.0, 0.0])
-            size = [radius, 0.0, 0.0]
+            size = [max(radius, _LEAST), 0.0, 0.0]
+            if np.linalg.norm(ends[1] - ends[0]) < _LEAST:
+                return add(name, body, kinds.mjGEOM_SPHERE, pos=ends[0], size=size)
             return add(name, body, kinds.mjGEOM_CAPSULE, fromto=ends.ravel(), size=size)
 
         def add_hull(name: str, body, corners: np.ndarray, **pose) -> int:
@@ -276,11 +299,15 @@ class Bodies:
             lower, upper = arm.base_box
             upright = np.array([1.0, 0.0, 0.0, 0.0])
             box = 0.5 * (lower + upper), upright, 0.5 * (upper - lower)
-            base = add_box("the base", links[-1], *box)
+            if box[2].max() < _LEAST:  # a point, if capsules enclose the base
+                base = add_capsule("the base", links[-1], arm.base_box, 0.0)
+            else:
+                base = add_box("the base", links[-1], *box)
             own += [(k, base) for k in based]
         fixed = [add_hull(f"mesh {k + 1}", links[-1], hull) for k, hull in enumerate(hulls)]
         for k, each in enumerate(zip(ends, radius, strict=True), 1):
-            shape = {"fromto": each[0].ravel(), "size": [max(each[1], 1e-9), 0.0, 0.0]}
+            size = [max(each[1], _LEAST), 0.0, 0.0]
+            shape = {"fromto": each[0].ravel(), "size": size}
             fixed.append(add(f"cylinder {k}", links[-1], kinds.mjGEOM_CYLINDER, **shape))
         self._pairs, pairs = {}, []
         if scene is not None:

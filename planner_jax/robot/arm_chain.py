@@ -4,7 +4,6 @@ import importlib
 import itertools
 import math
 import os
-import re
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -12,18 +11,13 @@ from typing import Any
 import numpy as np
 
 from planner_jax.core.errors import ArgumentError
-from planner_jax.host.files import open_plain
+from planner_jax.robot.arm_text import ArmText
 from planner_jax.robot.capsule_fit import Cover, ball_points, prism_points
 
 COUNTS = (6, 7)  # numbers of hinges that a chain may have
+DENSITY = 1000.0  # [kg/m^3], of geoms whose file states neither mass nor density
 BASE, OUTSIDE = -1, -2  # indices of the base and of other bodies; links 1 to n are 0 to n - 1
 
-_INCLUDE = re.compile(r"<include\s[^>]*?file\s*=\s*[\"']([^\"']+)")
-# Attributes of older files that MuJoCo no longer accepts; none of them changes an arm.
-_DROPPED = re.compile(
-    r"(<(?:option|compiler)\b[^>]*?)\s(?:collision|apirate|convexhull|exactmeshinertia)"
-    r"\s*=\s*(?:\"[^\"]*\"|'[^']*')"
-)
 Frame = tuple[np.ndarray, np.ndarray]  # position (3,) [m] of the origin, and rotation (3, 3)
 
 
@@ -36,14 +30,8 @@ class ArmModel:
 
     def __init__(self, path: str | os.PathLike, tip: str | None) -> None:
         """Read the file, or the text of a file, which begins with "<"."""
-        text = os.fspath(path)
-        self.path = None if text.lstrip().startswith("<") else Path(text)
-        self.name = "arm" if self.path is None else text
-        self.text, self._includes, self._is_changed = text, {}, self.path is None
-        if self.path is not None:
-            self.text = self._load(self.path, ArgumentError("arm", "an MJCF or URDF file", text))
-        root = re.search(r"<(robot|mujoco)\b", self.text)
-        self.is_urdf = root is not None and root[1] == "robot"
+        self.source = ArmText(path)
+        self.path, self.name, self.error = self.source.path, self.source.name, self.source.error
         self.mujoco, self.model = self._compile()
         model = self.model
         bodies = self._follow(tip)
@@ -70,10 +58,6 @@ class ArmModel:
             *(self._find_tip(tip)[:2] if tip else ("body", moving[-1])), self.num - 1
         )
         self._require_open()
-
-    def error(self, element: str, rule: str, verb: str = "have", shown: str = "") -> ArgumentError:
-        """Return the error that an element of the file breaks a rule."""
-        return ArgumentError(f"{self.name}: {element}", rule, verb=verb, shown=shown)
 
     def pose_of(self, kind: str, index: int, link: int) -> tuple[np.ndarray, np.ndarray]:
         """Return position (3,) [m] and rotation (3, 3) of an element in the frame of a link."""
@@ -166,51 +150,36 @@ class ArmModel:
         return origin + corners @ turn.T
 
     def torque(self, joint: int) -> float:
-        """Return the greatest torque [N m] of a joint and of its actuator, infinite if unknown."""
+        """Return the greatest torque [N m] of a joint and of its actuator, infinite if unknown.
+
+        The torque is 0 if the joint can be driven in one direction only.
+        """
         model = self.model
         ranges = [model.jnt_actfrcrange[joint]] if model.jnt_actfrclimited[joint] else []
         for k in range(model.nu):
             of_joint = model.actuator_trntype[k] == self.mujoco.mjtTrn.mjTRN_JOINT
             if of_joint and model.actuator_trnid[k, 0] == joint and model.actuator_forcelimited[k]:
                 ranges.append(model.actuator_forcerange[k] * model.actuator_gear[k, 0])
-        torques = [float(np.min(np.abs(each))) for each in ranges]
-        return min((each for each in torques if each > 0.0), default=math.inf)
-
-    def _load(self, path: Path, error: ArgumentError) -> str:
-        """Return a file's text without comments and attributes that MuJoCo has dropped.
-
-        The files that it includes are added to `_includes`.
-        """
-        try:
-            with open_plain(path) as file:
-                text = file.read().decode("utf-8-sig", "replace")
-        except OSError:
-            raise error from None
-        text = re.sub(
-            r"<!--.*?-->", lambda found: "\n" * found[0].count("\n"), text, flags=re.DOTALL
-        )
-        while _DROPPED.search(text):
-            text, self._is_changed = _DROPPED.sub(r"\1", text), True
-        for name in _INCLUDE.findall(text):
-            if name not in self._includes:
-                places = [Path(self.name).parent / name, path.parent / name]
-                place = places[0] if places[0].is_file() else places[1]
-                missing = self.error(f'include "{name}"', f"the file {places[0]}; put it there")
-                self._includes[name] = self._load(place, missing).encode()
-        return text
+        # A range of zeros states no limit.
+        torques = [min(-least, most) for least, most in map(sorted, ranges) if least or most]
+        return max(min(torques, default=math.inf), 0.0)
 
     def _compile(self) -> tuple[Any, Any]:
         mujoco: Any = importlib.import_module("mujoco")  # slow to import
         try:
-            if self._is_changed:
-                spec = mujoco.MjSpec.from_string(self.text, include=self._includes)
-            else:
-                spec = mujoco.MjSpec.from_file(str(self.path))
+            spec = mujoco.MjSpec.from_string(self.source.text, include=self.source.includes)
             spec.modelfiledir = "" if self.path is None else str(self.path.absolute().parent)
             spec.compiler.fusestatic = False  # `tip` may name a body without a joint
             for mesh in spec.meshes:
                 self._locate(spec, mesh)
-            return mujoco, spec.compile()
+            model = spec.compile()
+            # Bodies whose masses MuJoCo computes by its own density, since the file states none.
+            self.weighed = {
+                body.id
+                for body in spec.bodies
+                if not body.explicitinertial and any(map(_has_default_mass, body.geoms))
+            }
+            return mujoco, model
         except ArgumentError:
             raise
         except ValueError as error:
@@ -231,10 +200,11 @@ class ArmModel:
             path = Path(path).name if spec.strippath else path
             places = [base / (spec.meshdir or "") / path]
         found = next((place for place in places if place.is_file()), None)
+        element = f'mesh "{mesh.name or Path(path).stem}"'
         if found is None:
-            element = f'mesh "{mesh.name or Path(path).stem}"'
             raise self.error(element, f"the file {mesh.file}; put it at {places[0]}")
         if is_packaged:
+            self.source.check(element, found)
             mesh.file = str(found)
 
     def _joints_of(self, body: int) -> list[int]:
@@ -318,3 +288,7 @@ class ArmModel:
                     names = " and ".join(model.body(body).name for body in both)
                     rule = f"the chain open, but connects {names}; remove it"
                     raise self.error(element, rule, "leave")
+
+
+def _has_default_mass(geom: Any) -> bool:
+    return math.isnan(geom.mass) and geom.density == DENSITY

@@ -9,6 +9,7 @@ import functools
 import importlib.resources
 import itertools
 import os
+import warnings
 from collections.abc import Iterable
 from typing import Any, NamedTuple
 
@@ -20,13 +21,15 @@ from planner_jax.core.arithmetic import host_leaf
 from planner_jax.core.choices import require
 from planner_jax.referee import solids
 from planner_jax.robot.arm import Arm, ArmLimits
-from planner_jax.robot.arm_chain import BASE, OUTSIDE, ArmModel, Frame
+from planner_jax.robot.arm_chain import BASE, DENSITY, OUTSIDE, ArmModel, Frame
 from planner_jax.robot.arm_ik import choose_ik
 from planner_jax.robot.arm_limits import Limits, limits_of
 from planner_jax.robot.capsule_fit import Cover, cover, measure_excess
 
 _THICKNESS = 0.01  # [m], of a shield's plate
 _FORK = 0.71  # see `irb1600`
+# [rad], [rad/s] Greater limits of angles or rates are likely to be in degrees.
+_MOST_TURN, _MOST_RATE = 4.0 * np.pi, 50.0
 _SIDES = 32  # number of corners of the polygon in a disc
 _CORNERS = np.array([(0.0, a, b) for a in (-1.0, 1.0) for b in (-1.0, 1.0)])  # of a plate
 
@@ -155,11 +158,16 @@ def read_arm(
             the file or its only key, or the angles nearest to 0 within the limits.
         dtype: type of every leaf.
 
+    A Python warning names links whose masses the file does not state, and joints whose limits look
+    like degrees.
+
     Raises:
         ArgumentError: the file is no such arm, or lacks limits. The message is one line that names
             the file, the element and the remedy.
     """
-    return _read(path, limits, shield, tip, home, dtype)[0]
+    arm, _, doubts = _read(path, limits, shield, tip, home, dtype)
+    _warn(doubts)
+    return arm
 
 
 @functools.cache
@@ -168,7 +176,14 @@ def read_shield_arm(path: str, tip: str | None = None, shield: Shield | None = N
 
     A process reads each file once.
     """
-    return _read(path, shield=shield, tip=tip, usual=Shield())[0]
+    arm, _, doubts = _read(path, shield=shield, tip=tip, usual=Shield())
+    _warn(doubts)
+    return arm
+
+
+def _warn(doubts: list[str]) -> None:
+    for doubt in doubts:
+        warnings.warn(doubt, stacklevel=3)
 
 
 def describe_arm(path: str | os.PathLike, **settings: Any) -> str:
@@ -187,8 +202,8 @@ def _read(
     home: Iterable[float] | None = None,
     dtype: DTypeLike = np.float32,
     usual: Shield | None = None,
-) -> tuple[Arm, str]:
-    """Return the arm of a file, and the text of `describe_arm`.
+) -> tuple[Arm, str, list[str]]:
+    """Return the arm of a file, the text of `describe_arm`, and what may be wrong with the file.
 
     `usual` is the shield of an arm whose file has none, if no other one is passed.
     """
@@ -258,7 +273,26 @@ def _read(
         ik="numerical",
     )
     arm = dataclasses.replace(arm, ik=choose_ik(arm))
-    return arm, _describe(model, covers, source, checked.touching, stated["torque"])
+    doubts = _find_doubts(model, stated)
+    text = _describe(model, covers, source, checked.touching, stated["torque"])
+    return arm, "\n".join([text, *doubts]), doubts
+
+
+def _find_doubts(model: ArmModel, stated: dict[str, np.ndarray]) -> list[str]:
+    """Return lines that name links with masses of MuJoCo's, and joints with limits in degrees."""
+    weighed = {int(model.link[body]) for body in model.weighed} - {BASE, OUTSIDE}
+    links = ", ".join(model.link_names[k] for k in sorted(weighed))
+    turns, rates = np.max(np.abs(stated["position"]), axis=1), stated["velocity"]
+    wide = (turns > _MOST_TURN) | (rates > _MOST_RATE)
+    joints = ", ".join(np.array(model.joint_names)[wide])
+    doubts = []
+    if links:
+        density = f"MuJoCo computes it by {DENSITY:g} kg/m^3"
+        doubts.append(f"{model.name}: no mass is stated for {links}; {density}")
+    if joints:
+        limits = f"limits up to {np.max(turns):g} rad and {np.max(rates):g} rad/s"
+        doubts.append(f"{model.name}: {limits} of {joints} look like degrees; state radians")
+    return doubts
 
 
 def _quaternion(turn: np.ndarray) -> np.ndarray:

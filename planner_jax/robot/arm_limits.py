@@ -2,13 +2,12 @@
 
 import math
 import os
-import xml.etree.ElementTree as ET
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from planner_jax.core.checks import require_path_name
 from planner_jax.core.errors import ArgumentError
 from planner_jax.host.yaml_files import read_fields
 from planner_jax.robot.arm_chain import ArmModel
@@ -40,8 +39,8 @@ def limits_of(model: ArmModel, limits: Limits) -> dict[str, np.ndarray]:
         if model.model.jnt_limited[joint]:
             found["position"][name] = model.model.jnt_range[joint]
         found["torque"][name] = model.torque(joint)
-    of_urdf = _read_urdf(model.text) if model.is_urdf else {}
-    stated, source = _find_limits(model.path, limits, names)
+    stated, source = _find_limits(model, limits)
+    of_urdf = _of_urdf(model, stated) if model.source.is_urdf else {}
     for given in (of_urdf, stated):
         for kind, values in given.items():
             found[kind] |= values
@@ -51,17 +50,21 @@ def limits_of(model: ArmModel, limits: Limits) -> dict[str, np.ndarray]:
         joints = [name for name in names if any(name in each for each in lacking.values())]
         rule = f"limits of {kinds}; state them in {source} (docs/arms.md)"
         raise model.error(f"joints {', '.join(joints)}", rule)
+    for name, torque in found["torque"].items():
+        if not torque > 0.0:
+            rule = f"a range of forces on both sides of 0; state a torque in {source}"
+            raise model.error(f'joint "{name}"', rule)
     return {kind: np.array([values[name] for name in names]) for kind, values in found.items()}
 
 
-def _find_limits(path: Path | None, limits: Limits, joints: tuple[str, ...]) -> tuple[Stated, str]:
+def _find_limits(model: ArmModel, limits: Limits) -> tuple[Stated, str]:
     """Return the limits that a dictionary or a YAML file states, and the name of their source.
 
     Args:
-        path: the arm's file. Without `limits`, `NAME.limits.yaml` beside it is read if it exists.
+        model: the arm. Without `limits`, `NAME.limits.yaml` beside its file is read if it exists.
         limits: the argument of `read_arm`.
-        joints: names of the arm's joints in their order.
     """
+    path, joints = model.path, model.joint_names
     source = "limits"
     if limits is None:
         beside = None if path is None else path.with_name(f"{path.stem}.limits.yaml")
@@ -69,6 +72,7 @@ def _find_limits(path: Path | None, limits: Limits, joints: tuple[str, ...]) -> 
             return {}, "limits=" if beside is None else f"{beside.name} beside it, or in limits="
         limits = beside
     if not isinstance(limits, Mapping):
+        require_path_name("limits", limits)
         source = os.fspath(limits)
         try:
             limits = read_fields(source)
@@ -79,9 +83,10 @@ def _find_limits(path: Path | None, limits: Limits, joints: tuple[str, ...]) -> 
                 source, str(error).removeprefix("must "), verb="", shown=""
             ) from None
     if "joint_limits" in limits:
-        return _from_moveit(source, limits["joint_limits"], joints), source
+        return _from_moveit(source, limits["joint_limits"], model), source
     stated: Stated = {}
     for kind, values in limits.items():
+        values = _plain(values)
         if kind not in _MOVEIT:
             rule = f"fields {', '.join(_MOVEIT)}, or joint_limits"
             raise ArgumentError(source, rule, kind, verb="have")
@@ -90,7 +95,7 @@ def _find_limits(path: Path | None, limits: Limits, joints: tuple[str, ...]) -> 
             if unknown:
                 rule = f"of the joints {', '.join(joints)}"
                 raise ArgumentError(f"{source}: {kind}", rule, unknown[0])
-        elif isinstance(values, list):
+        elif isinstance(values, list) and not (kind == "position" and _is_pair(values)):
             if len(values) != len(joints):
                 rule = f"one value for each of the {len(joints)} joints"
                 raise ArgumentError(f"{source}: {kind}", rule, len(values), verb="have")
@@ -101,37 +106,57 @@ def _find_limits(path: Path | None, limits: Limits, joints: tuple[str, ...]) -> 
     return stated, source
 
 
-def _read_urdf(text: str) -> Stated:
+def _of_urdf(model: ArmModel, others: Stated) -> Stated:
     """Return velocities and efforts of a URDF's `<limit>` elements; 0 states no limit.
 
-    MuJoCo's compiler ignores the velocity.
+    MuJoCo's compiler ignores the velocity. Limits that `others` states are left out.
     """
-    root = ET.fromstring(text)
     stated: Stated = {}
-    for joint in root.iterfind("joint"):
-        for limit in joint.iterfind("limit"):
-            for kind, name in (("velocity", "velocity"), ("torque", "effort")):
-                value = float(limit.get(name, 0.0))
-                if value > 0.0:
-                    stated.setdefault(kind, {})[joint.get("name", "")] = value
+    for joint in model.joint_names:
+        fields = model.source.limits.get(joint, {})
+        for kind, name in (("velocity", "velocity"), ("torque", "effort")):
+            try:
+                value: Any = float(text := fields.get(name, "0"))
+            except ValueError:
+                value = text
+            if value != 0.0 and joint not in others.get(kind, {}):
+                stated.setdefault(kind, {})[joint] = _number(model.name, kind, joint, value)
     return stated
 
 
-def _from_moveit(source: str, fields: Any, joints: tuple[str, ...]) -> Stated:
+def _from_moveit(source: str, fields: Any, model: ArmModel) -> Stated:
     stated: Stated = {}
-    for name, values in fields.items() if isinstance(fields, Mapping) else ():
+    if not isinstance(fields, Mapping):
+        raise ArgumentError(f"{source}: joint_limits", "fields with the names of joints", fields)
+    known = [model.model.joint(k).name for k in range(model.model.njnt)]
+    for name, values in fields.items():
+        place = f"{source}: joint_limits"
+        if name not in known and name not in model.joint_names:
+            raise ArgumentError(place, f"of the joints {', '.join(model.joint_names)}", name)
+        if not isinstance(values, Mapping):
+            raise ArgumentError(f"{place} of {name}", "fields with values", values)
         for kind, (flag, *names) in _MOVEIT.items():
-            has_values = name in joints and isinstance(values, Mapping) and names[0] in values
-            if has_values and values.get(flag, True):
+            if name in model.joint_names and names[0] in values and values.get(flag, True):
                 found = [values.get(each) for each in names]
                 number = found if kind == "position" else found[0]
                 stated.setdefault(kind, {})[name] = _number(source, kind, name, number)
     return stated
 
 
+def _plain(value: Any) -> Any:
+    """Return numbers and lists instead of scalars and arrays of NumPy and instead of tuples."""
+    value = value.tolist() if isinstance(value, np.ndarray | np.generic) else value
+    return [*map(_plain, value)] if isinstance(value, list | tuple) else value
+
+
+def _is_pair(values: list[Any]) -> bool:
+    return len(values) == 2 and not any(isinstance(each, list) for each in values)
+
+
 def _number(source: str, kind: str, joint: str, value: Any) -> Any:
     """Return a limit, or the two limits of the position; raise unless the numbers are sound."""
-    numbers = value if isinstance(value, list | tuple) else [value]
+    value = _plain(value)
+    numbers = value if isinstance(value, list) else [value]
     are_numbers = all(isinstance(x, int | float) and not isinstance(x, bool) for x in numbers)
     if kind == "position":
         rule, is_sound = "two finite numbers in ascending order", len(numbers) == 2 and are_numbers

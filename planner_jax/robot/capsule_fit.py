@@ -13,7 +13,9 @@ from scipy.optimize import minimize
 from scipy.spatial import ConvexHull, QhullError
 
 from planner_jax.core.errors import ArgumentError
+from planner_jax.host.files import read_plain
 
+LARGEST_MESH = 1 << 25  # [B], of a file
 # [m]: one more capsule is used if it reduces the mean excess by at least this length.
 _WORTH = 0.002
 _ROUNDING = 1e-6  # [m], added to fitted radii, so that capsules in float32 enclose the body too
@@ -76,13 +78,14 @@ def enclosing_box(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarra
 def hull_of(mesh: str | os.PathLike | ArrayLike, scale: float, name: str) -> np.ndarray:
     """Return the corners (V, 3) [m] of the convex hull of a mesh.
 
-    The mesh is an STL, OBJ or MSH file, which MuJoCo reads, or points (N, 3). Its unit of length is
-    `scale` [m]. An `ArgumentError` calls the mesh `name`.
+    The mesh is a binary STL, OBJ or MSH file, which MuJoCo reads, or points (N, 3). Its unit of
+    length is `scale` [m]. An `ArgumentError` calls the mesh `name`.
     """
-    points, shown = mesh, ""
+    points, shown, head = mesh, "", b""
     try:
         if isinstance(mesh, str | os.PathLike):
             shown = f"{os.fspath(mesh)}: "
+            head = read_plain(mesh, LARGEST_MESH)[:5]  # the compiler would wait for a pipe's writer
             mujoco: Any = importlib.import_module("mujoco")  # slow to import
             spec, turn = mujoco.MjSpec(), np.zeros(9)
             read = spec.add_mesh(name="mesh", file=os.fspath(mesh))
@@ -92,9 +95,12 @@ def hull_of(mesh: str | os.PathLike | ArrayLike, scale: float, name: str) -> np.
             points = model.mesh_vert @ turn.reshape(3, 3).T + model.mesh_pos[0]
         points = scale * np.reshape(np.asarray(points, float), (-1, 3))
         return points[ConvexHull(points).vertices]
-    except (ValueError, QhullError) as error:
-        reason = str(error).removeprefix("Error: ").partition("\n")[0]
-        rule = "an STL, OBJ or MSH file of a mesh with a volume; correct the path or the mesh"
+    except (OSError, TypeError, ValueError, QhullError) as error:
+        reason = getattr(error, "strerror", None) or str(error)
+        reason = reason.removeprefix("Error: ").partition("\n")[0]
+        if head == b"solid":
+            reason = f"{reason}; an STL file of text is not read, convert it to a binary one"
+        rule = "a binary STL, OBJ or MSH file of a mesh with a volume; correct the path or the mesh"
         raise ArgumentError(name, rule, shown=shown + reason) from None
 
 

@@ -17,6 +17,7 @@ from planner_jax.ball.flight import BallState, drag_free_fall_time, drag_free_fl
 from planner_jax.core import rules
 from planner_jax.core.arithmetic import host_leaf
 from planner_jax.core.choices import require
+from planner_jax.core.errors import ArgumentError
 from planner_jax.core.rules import Field, Table
 from planner_jax.robot.capsule_fit import cover, enclosing_box, hull_of, measure_excess
 
@@ -28,6 +29,17 @@ POLE, POLE_TOP, POLE_RADIUS = (0.806, 0.0), 2.52, 0.05
 _ADVANCES, _MORE_SPEED, _REACHED = 32, 1.0, 1e-4
 ABSENT = -10.0  # [m], radius of a capsule that does not exist
 FLOOR = -0.4826  # [m], height of the floor
+_LEAST = 1e-9  # least length of a quaternion, and of a cylinder's axis [m]
+_ROD: dict[str, tuple[int, ...] | None] = {"ends": (2, 3), "radius": ()}
+# Fields of an obstacle of each kind, with their shapes; None is a file or points.
+SOLIDS: dict[str, dict[str, tuple[int, ...] | None]] = {
+    "boxes": {"middle": (3,), "size": (3,), "turn": (4,)},
+    "spheres": {"middle": (3,), "radius": ()},
+    "capsules": _ROD,
+    "cylinders": _ROD,
+    "meshes": {"file": None, "scale": (), "position": (3,), "turn": (4,)},
+    "protected_capsule": _ROD,
+}
 # Four horizontal beams form a square around the robot's pedestal. Each beam is modelled as a
 # capsule that encloses its cross-section of 0.025 m x 0.076 m.
 RIG_HALF, RIG_LENGTH = 0.559, 1.09  # [m], half the side of the square, and length of a beam
@@ -172,20 +184,25 @@ def make_scene(
             [m], > 0.
         outer: lowest and highest corner [m] of the box in which balls may be met; by default the
             box of [Natarajan2024].
+
+    Raises:
+        ArgumentError: an obstacle lacks a field, or a number is wrong. The line names the entry.
     """
-    rounded = [(np.broadcast_to(middle, (2, 3)), radius) for middle, radius in spheres]
-    rounded += [*capsules]
-    for k, (_, radius) in enumerate(rounded):
-        kind = f"spheres[{k}]" if k < len(spheres) else f"capsules[{k - len(spheres)}]"
-        require(bool(radius >= 0.0), f"the radius of {kind}", ">= 0", radius)
+    given = {"boxes": boxes, "spheres": spheres, "capsules": capsules, "cylinders": cylinders}
+    solids = {kind: _read_solids(kind, each) for kind, each in (given | {"meshes": meshes}).items()}
+    rounded = [(np.tile(middle, (2, 1)), radius) for middle, radius in solids["spheres"]]
+    rounded += solids["capsules"]
     paper, capsule = paper_scene(), protected_capsule
     body, ends = protected_box, None
     if capsule is not None:
-        body = np.sort(np.asarray(capsule[0], float), axis=0)
         require(protected_box is None, "protected_box", "left out beside protected_capsule", body)
-        require(bool(capsule[1] > 0.0), "the radius of protected_capsule", "> 0", capsule[1])
+        capsule = _read_solid("protected_capsule", capsule, "protected_capsule")
+        body = np.sort(capsule[0], axis=0)
+        require(bool(capsule[1] > 0.0), "protected_capsule.radius", "> 0", float(capsule[1]))
         if np.sum(np.ptp(body, axis=0) > 0.0) > 1:
             ends = host_leaf(capsule[0], np.float32)
+    corners = {"protected_box": body, "outer": outer}
+    body, outer = (x if x is None else read_numbers(k, x, (2, 3)) for k, x in corners.items())
 
     def box(corners: ArrayLike | None, usual: Box) -> Box:
         return usual if corners is None else Box(*host_leaf(corners, np.float32))
@@ -195,19 +212,63 @@ def make_scene(
         inner=box(body, paper.inner),
         inner_radius=host_leaf(0.0 if capsule is None else capsule[1], np.float32),
         outer=box(outer, paper.outer),
-        floor=host_leaf(floor, np.float32),
+        floor=host_leaf(read_numbers("floor", floor, ()), np.float32),
         beam_ends=paper.beam_ends[:0],
         beam_radius=paper.beam_radius[:0],
-        **_solids(rounded, boxes, cylinders),
-        meshes=_enclose(meshes) if meshes else None,
+        **_solids(rounded, solids["boxes"], solids["cylinders"]),
+        meshes=_enclose(solids["meshes"]) if solids["meshes"] else None,
         inner_ends=ends,
     )
+
+
+def _read_solids(kind: str, given: Any) -> list[tuple]:
+    try:
+        entries = [*given]
+    except TypeError:
+        raise ArgumentError(kind, "a list of obstacles", given) from None
+    return [_read_solid(kind, entry, f"{kind}[{k}]") for k, entry in enumerate(entries)]
+
+
+def _read_solid(kind: str, entry: Any, place: str) -> tuple:
+    """Return the numbers of an obstacle; raise an error with its place unless they are sound."""
+    shapes = SOLIDS[kind]
+    if not isinstance(entry, list | tuple) or len(entry) != len(shapes):
+        raise ArgumentError(place, f"a tuple of {', '.join(shapes)}", entry)
+    found = {
+        name: value if shape is None else read_numbers(f"{place}.{name}", value, shape)
+        for (name, shape), value in zip(shapes.items(), entry, strict=True)
+    }
+    rules = {
+        "radius": (">= 0", lambda x: x >= 0.0),
+        "size": ("> 0", lambda x: np.all(x > 0.0)),
+        "scale": ("> 0", lambda x: x > 0.0),
+        "turn": ("a quaternion other than 0", lambda x: np.linalg.norm(x) > _LEAST),
+    }
+    if kind == "cylinders":
+        rules["ends"] = ("two different points", lambda x: np.linalg.norm(x[1] - x[0]) > _LEAST)
+    for name in rules.keys() & found.keys():
+        rule, holds = rules[name]
+        require(bool(holds(found[name])), f"{place}.{name}", rule, found[name].tolist())
+    return tuple(found.values())
+
+
+def read_numbers(name: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """Return finite numbers of a shape as float64; raise an `ArgumentError` for all else."""
+    try:
+        found = np.array(value, float)
+        has_switch = any(isinstance(each, bool | np.bool_) for each in np.array(value, object).flat)
+    except (TypeError, ValueError, OverflowError):
+        found, has_switch = np.full(0, np.nan), False
+    if found.shape != shape or has_switch or not np.isfinite(found).all():
+        lists = " lists of ".join(map(str, shape))
+        rule = f"{lists} finite numbers" if shape else "a finite number"
+        raise ArgumentError(name, rule, value)
+    return found
 
 
 def _enclose(meshes: Sequence) -> Meshes:
     hulls, excess, capsules, boxes = [], [], [], []
     for k, (mesh, scale, position, turn) in enumerate(meshes):
-        require(bool(np.any(turn)), f"the rotation of meshes[{k}]", "a quaternion != 0", turn)
         own = hull_of(mesh, float(scale), f"meshes[{k}]")
         rotation = Rotation.from_quat(np.roll(turn, -1))
         middle, axes, half = enclosing_box(own)
@@ -230,7 +291,7 @@ def _enclose(meshes: Sequence) -> Meshes:
 
 def _solids(rods: Sequence, boxes: Sequence, cylinders: Sequence) -> dict[str, Any]:
     def column(solids: Sequence, k: int, *shape: int) -> np.ndarray:
-        return np.reshape([solid[k] for solid in solids], (-1, *shape)).astype(np.float32)
+        return np.reshape([solid[k] for solid in solids], (-1, *shape)).astype(float)
 
     turn = column(boxes, 2, 4)
     leaves = {
@@ -242,7 +303,7 @@ def _solids(rods: Sequence, boxes: Sequence, cylinders: Sequence) -> dict[str, A
         "cylinder_ends": column(cylinders, 0, 2, 3),
         "cylinder_radius": column(cylinders, 1),
     }
-    return {name: host_leaf(leaf) for name, leaf in leaves.items()}
+    return {name: host_leaf(leaf, np.float32) for name, leaf in leaves.items()}
 
 
 def entry_time(box: Box, ball: BallState, gravity: Array) -> tuple[Array, Array]:

@@ -12,19 +12,10 @@ from planner_jax.core.errors import ArgumentError
 from planner_jax.host.yaml_files import read_fields
 from planner_jax.robot.arm import Arm
 from planner_jax.robot.arm_file import Shield, irb1600, read_shield_arm
-from planner_jax.task.block.scene import Scene, make_scene
+from planner_jax.task.block.scene import SOLIDS, Scene, make_scene, read_numbers
 
-_ROD = {"ends": (2, 3), "radius": ()}
 _USUAL = {"turn": [1.0, 0.0, 0.0, 0.0], "scale": 1.0, "position": [0.0, 0.0, 0.0]}
-# Fields of an element of each list of obstacles in a file, with their shapes; None is a file.
-_KINDS: dict[str, dict[str, tuple[int, ...] | None]] = {
-    "boxes": {"middle": (3,), "size": (3,), "turn": (4,)},
-    "spheres": {"middle": (3,), "radius": ()},
-    "capsules": _ROD,
-    "cylinders": _ROD,
-    "meshes": {"file": None, "scale": (), "position": (3,), "turn": (4,)},
-}
-_SINGLE: dict[str, tuple[int, ...]] = {"floor": (), "protected_box": (2, 3), "outer": (2, 3)}
+_SINGLE = ("floor", "protected_box", "outer")
 _SHIELD = {"half": (2,), "radius": (), "position": (3,), "turn": (4,), "mass": ()}
 
 
@@ -36,20 +27,19 @@ def read_scene(path: str | os.PathLike) -> Scene:
     """
     source, scene = os.fspath(path), {}
     for name, value in _fields("scene", source).items():
-        if name in _KINDS:
-            if not isinstance(value, list):
-                raise ArgumentError(f"{source}: {name}", "a list of obstacles", value)
-            places = [f"{source}: {name}[{k}]" for k in range(len(value))]
-            folder, of = os.path.dirname(source), _KINDS[name]
-            parts = [_element(*each, of, folder) for each in zip(places, value, strict=True)]
-            scene[name] = [tuple(each.values()) for each in parts]
+        if name in _SINGLE:
+            scene[name] = value
+        elif name not in SOLIDS:
+            raise ArgumentError(
+                source, f"fields of {', '.join((*SOLIDS, *_SINGLE))}", name, verb="have"
+            )
         elif name == "protected_capsule":
-            scene[name] = tuple(_element(f"{source}: {name}", value, _ROD).values())
-        elif name in _SINGLE:
-            scene[name] = _numbers(f"{source}: {name}", value, _SINGLE[name])
+            scene[name] = _element(f"{source}: {name}", value, name)
+        elif isinstance(value, list):
+            parts = [(f"{source}: {name}[{k}]", each, name) for k, each in enumerate(value)]
+            scene[name] = [_element(*part, os.path.dirname(source)) for part in parts]
         else:
-            known = ", ".join((*_KINDS, "protected_capsule", *_SINGLE))
-            raise ArgumentError(source, f"fields of {known}", name, verb="have")
+            raise ArgumentError(f"{source}: {name}", "a list of obstacles", value)
     try:
         return make_scene(**scene)
     except ArgumentError as error:
@@ -72,7 +62,7 @@ def read_shield(text: str) -> Shield:
         if shape is None:
             known = ", ".join(("corners", *_SHIELD))
             raise ArgumentError(text, f"fields of {known}", name, verb="have")
-        numbers = _numbers(f"{text}: {name}", value, shape).tolist()
+        numbers = read_numbers(f"{text}: {name}", value, shape).tolist()
         numbers = [*map(tuple, numbers)] if name == "corners" else numbers
         given[name] = tuple(numbers) if shape else numbers
     try:
@@ -107,33 +97,14 @@ def _fields(name: str, source: str) -> dict[str, Any]:
         raise ArgumentError(source, str(error).removeprefix("must "), verb="", shown="") from None
 
 
-def _element(place: str, value: Any, shapes: dict[str, Any], folder: str = "") -> dict[str, Any]:
+def _element(place: str, value: Any, kind: str, folder: str = "") -> tuple:
     """Return one obstacle's fields; the path of a file is relative to `folder`."""
+    shapes = SOLIDS[kind]
     if not isinstance(value, dict) or {*value} - {*shapes} or "file" in {*shapes} - {*value}:
         raise ArgumentError(place, f"the fields {', '.join(shapes)}", value, verb="have")
-    found: dict[str, Any] = {}
-    for name, shape in shapes.items():
-        own = value.get(name, _USUAL.get(name))
-        is_file = shape is None
-        found[name] = (
-            os.path.join(folder, str(own)) if is_file else _numbers(f"{place}.{name}", own, shape)
-        )
-    name = next(each for each in ("radius", "size", "scale") if each in found)
-    if not np.all(found[name] > 0.0):
-        raise ArgumentError(f"{place}.{name}", "> 0", value[name])
-    if "cylinders" in place and np.array_equal(*found["ends"]):
-        raise ArgumentError(f"{place}.ends", "two different points", value["ends"])
-    return found
-
-
-def _numbers(place: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
-    try:
-        found = np.array(value, float)
-    except (TypeError, ValueError):
-        found = np.full(0, np.nan)
-    if found.shape != shape or not np.isfinite(found).all():
-        rule = (
-            f"{' lists of '.join(map(str, shape))} finite numbers" if shape else "a finite number"
-        )
-        raise ArgumentError(place, rule, value)
-    return found
+    if "radius" in value and value["radius"] == 0.0:
+        raise ArgumentError(f"{place}.radius", "> 0", value["radius"])
+    found = {name: value.get(name, _USUAL.get(name)) for name in shapes}
+    if "file" in shapes:
+        found["file"] = os.path.join(folder, str(found["file"]))
+    return tuple(found.values())

@@ -51,6 +51,10 @@ class ReachPlan(ArmPlan):
 class Search(Attempt):
     """An attempt: check the fastest and the straight motion to each goal."""
 
+    def is_due(self, plans: "ReachPlan") -> Array:
+        """Return which plans need this search, bool: no search reaches a goal beyond the limits."""
+        return super().is_due(plans) & (plans.status != Status.OUT_OF_REACH)
+
 
 @with_run_time_numbers("rays", "shortcuts", "seed")
 @dataclasses.dataclass(frozen=True)
