@@ -3,6 +3,9 @@
 import dataclasses
 import functools
 import itertools
+import os
+import re
+import warnings
 
 import numpy as np
 import pytest
@@ -132,6 +135,8 @@ def folder(tmp_path_factory):
         (place / name).write_text(text)
     (place / "seven.xml").write_text(MJCF)
     (place / "wrist.xml").write_text(WRIST)
+    (place / "loop.xml").write_text('<mujoco><include file="back.xml"/></mujoco>')
+    (place / "back.xml").write_text('<mujoco><include file="loop.xml"/></mujoco>')
     (place / "maker/urdf/six.urdf").write_text(urdf())
     return place
 
@@ -404,7 +409,150 @@ BAD = [
     ("<geom", "<gem", "the model must be accepted by MuJoCo: .*gem"),
     ('size=".04 .03 .1"', 'size="-1 .03 .1"', "the model must be accepted by MuJoCo: "),
     (".1 .2 .3 .4", "9 .2 .3 .4", "home must have 7 angles within the limits; correct them"),
+    (
+        '"-3 3"',
+        '"0 50"',
+        'joint "d" must have a range of forces on both sides of 0; state a torque',
+    ),
+    (
+        '<include file="wrist',
+        '<include file="bad',
+        "accepted by MuJoCo: .*bad.xml' already included",
+    ),
+    ('<include file="wrist', '<include file="loop', "accepted by MuJoCo: .* already included"),
+    ("<mujoco>", '<!DOCTYPE a [<!ENTITY b "c">]><mujoco>', "must have no <!DOCTYPE>; remove it"),
+    ("<mujoco>", "<!-- " * 20_000 + "<mujoco>", "the model must be accepted by MuJoCo: no XML"),
+    ("<asset>", "<include " * 10_000 + "<asset>", "the model must be accepted by MuJoCo: no XML"),
+    ("<asset>", "<a " + " ".join(f'a{k}="1"' for k in range(300)) + "/><asset>", "200 attributes"),
+    (
+        "<mujoco>",
+        '<?xml version="1.0" encoding="odd"?><mujoco>',
+        "encoding must be known, got 'odd",
+    ),
 ]
+# Elements that make MuJoCo wait for a pipe's writer, or fill the memory.
+HOSTILE = [
+    ('<asset><hfield name="h" file="{pipe}" size="1 1 1 1"/>', 'hfield "h" must have a plain file'),
+    ('<asset><texture name="t" type="2d" file="{pipe}"/>', 'texture "t" must have a plain file'),
+    ('<asset><texture name="t" type="cube" fileup="{pipe}"/>', 'texture "t" must have a plain'),
+    ('<asset><mesh name="m" file="../{pipe}"/>', 'mesh "m" must have a plain file'),
+    ('<asset><model name="m" file="{pipe}"/>', 'include "pipe" must have the file .*no plain'),
+    (
+        '<asset><mesh name="m" file="huge.stl"/>',
+        'mesh "m" must have a plain file of at most 32 MiB',
+    ),
+    (
+        '<asset><texture name="t" file="huge.png"/>',
+        "pixels at .*huge.png, got 30000 x 30000 pixels",
+    ),
+    ('<asset><hfield name="h" nrow="40000" ncol="40000" size="1 1 1 1"/>', "element hfield must"),
+    ('<custom><numeric name="n" size="2000000000"/></custom><asset>', "element numeric must have"),
+    ('<size nkey="2000000000"/><asset>', "element size must have at most .*nkey"),
+    (
+        '<worldbody><replicate count="2000"><replicate count="2000"><geom size="1"/></replicate>'
+        "</replicate></worldbody><asset>",
+        "at most 20000 elements, with all copies",
+    ),
+]
+
+
+@pytest.mark.parametrize(("element", "message"), HOSTILE)
+def test_a_pipe_or_a_huge_element_of_a_file_is_refused(folder, element, message):
+    pipe, path = folder / "pipe", folder / "hostile.xml"
+    if not pipe.exists():
+        os.mkfifo(pipe)
+        with (folder / "shapes/huge.stl").open("wb") as file:
+            file.truncate(1 << 31)  # sparse
+        size = (30_000).to_bytes(4)
+        (folder / "huge.png").write_bytes(b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR" + size + size)
+    path.write_text(MJCF.replace("<asset>", element.replace("{pipe}", "pipe"), 1))
+    with pytest.raises(ArgumentError, match=message) as error:
+        read_arm(path, limits=RATES)
+    assert "\n" not in str(error.value) and "hostile.xml" in str(error.value)
+
+
+def test_a_sparse_arm_file_of_gigabytes_is_refused(tmp_path):
+    with (path := tmp_path / "huge.xml").open("wb") as file:
+        file.truncate(3 << 30)
+    with pytest.raises(ArgumentError, match="arm must be an MJCF or URDF file, .* larger than"):
+        read_arm(path)
+
+
+def boxes_urdf():
+    """Return the arm of `urdf` with boxes instead of meshes."""
+    return urdf().replace(
+        '<mesh filename="package://maker/meshes/rock.obj"/>', '<box size=".1 .1 .2"/>'
+    )
+
+
+@pytest.mark.parametrize("speed", ["3,14", "", "${v}", "inf", "-1", "nan"])
+def test_a_speed_of_a_urdf_that_is_no_finite_number_is_named(tmp_path, speed):
+    path = tmp_path / "a.urdf"
+    path.write_text(boxes_urdf().replace('velocity="3"', f'velocity="{speed}"'))
+    with pytest.raises(ArgumentError, match="a.urdf: velocity of q2 must be a finite number > 0"):
+        read_arm(path, limits={"acceleration": 5})
+    stated = read_arm(path, limits={"acceleration": 5, "velocity": {"q2": 3}})
+    np.testing.assert_array_equal(stated.limits.velocity, np.arange(1.0, 7.0))
+
+
+def test_the_text_of_a_file_has_the_encoding_that_it_declares(tmp_path):
+    text = '<?xml version="1.0" encoding="ISO-8859-1"?>' + boxes_urdf()
+    text = text.replace('name="q1"', 'name="Gelänk"').replace("<link", "<!-- ä -- -->\n<link", 1)
+    (tmp_path / "a.urdf").write_bytes(text.encode("latin-1"))
+    assert read_arm(tmp_path / "a.urdf", limits={"acceleration": 5}).joint_names[1] == "Gelänk"
+    (tmp_path / "a.urdf").write_bytes(text.replace("ISO-8859-1", "utf-8").encode("latin-1"))
+    with pytest.raises(ArgumentError, match="a.urdf: the text must be in the encoding that"):
+        read_arm(tmp_path / "a.urdf", limits={"acceleration": 5})
+
+
+def test_limits_are_numbers_and_arrays_of_numpy_too():
+    given = {
+        "acceleration": np.full(6, 10.0),
+        "velocity": np.float32(2.0),
+        "torque": (1, np.int64(2), 3.0, 4, 5, np.inf),
+        "position": np.tile([-1.0, 1.0], (6, 1)),
+    }
+    arm = read_arm(boxes_urdf(), limits=given)
+    np.testing.assert_array_equal(arm.limits.acceleration, np.full(6, 10.0))
+    np.testing.assert_array_equal(arm.limits.velocity, np.full(6, 2.0))
+    np.testing.assert_array_equal(arm.limits.torque, [1, 2, 3, 4, 5, np.inf])
+    np.testing.assert_array_equal([arm.lower, arm.upper], [[-1.0] * 6, [1.0] * 6])
+
+
+MOVEIT = {f"q{k}": {"max_velocity": 1.5, "max_acceleration": 4.0} for k in range(6)}
+
+
+@pytest.mark.parametrize(
+    ("joints", "message"),
+    [
+        (
+            MOVEIT | {"J2": {"max_velocity": 0.5}},
+            "limits: joint_limits must be of the joints q0, .*J2",
+        ),
+        ([1], r"limits: joint_limits must be fields with the names of joints, got \[1\]"),
+        ({"q1": 3}, "limits: joint_limits of q1 must be fields with values, got 3"),
+    ],
+)
+def test_an_unknown_joint_of_a_moveit_file_is_named(joints, message):
+    arm = read_arm(boxes_urdf(), limits={"joint_limits": MOVEIT})
+    np.testing.assert_array_equal(arm.limits.velocity, np.full(6, 1.5))
+    with pytest.raises(ArgumentError, match=message):
+        read_arm(boxes_urdf(), limits={"joint_limits": joints})
+
+
+def test_invented_masses_and_limits_in_degrees_are_warned_of_and_described():
+    limits = {"acceleration": 5}
+    bare = re.sub("<inertial>.*?</inertial>", "", boxes_urdf(), count=3, flags=re.DOTALL)
+    degrees = boxes_urdf().replace('upper="1.5" velocity="3"', 'upper="170" velocity="3"')
+    for text, message in (
+        (bare, "no mass is stated for l0, l1; MuJoCo computes it by 1000 kg/m"),
+        (degrees, "limits up to 170 rad and 6 rad/s of q2 look like degrees; state radians"),
+    ):
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            read_arm(text, limits=limits)
+        assert [message in str(each.message) for each in caught] == [True]
+        assert message in describe_arm(text, limits=limits)
 
 
 @pytest.mark.parametrize(("old", "new", "message"), BAD)

@@ -17,7 +17,12 @@ from planner_jax.robot.arm import REGIMES, reach_of
 from planner_jax.robot.arm_file import irb1600
 from planner_jax.runs.timing import CompileClock
 from planner_jax.sweep.block.settings import REGIMES as SWEPT
-from planner_jax.task.block.clearance import clearances, clearances_and_slopes, num_of_obstacles
+from planner_jax.task.block.clearance import (
+    clearances,
+    clearances_and_slopes,
+    least_clearances,
+    num_of_obstacles,
+)
 from planner_jax.task.block.default_planner import (
     OnlineBlock,
     Search,
@@ -122,6 +127,25 @@ def test_the_arm_is_clear_at_home_and_not_when_it_reaches_into_the_pole():
     assert home.min() > 0.003 and home.size > num
     assert at(ahead, scene)[:num].min() < 0.0 < at(ahead, scene)[num:].min()
     assert at(ahead, as_numpy(paper_scene(has_pole=False))).min() > 0.0
+
+
+@pytest.mark.slow
+def test_an_arm_that_starts_nearer_than_the_margin_is_planned_with_the_margin_that_remains():
+    gap_at = jax.jit(lambda scene: least_clearances(irb1600(), scene, irb1600().home[None])[0])
+    near, far = 0.0, 1.0  # [m], factors of the pole's place; the arm touches the nearer pole
+    for _ in range(30):
+        share = 0.5 * (near + far)
+        scene = as_numpy(paper_scene(pole=(0.1, 0.8 * share)))
+        near, far = (near, share) if gap_at(scene) > 1.4e-3 else (share, far)
+    assert 0.0 < gap_at(scene) < 0.5 * OnlineBlock.margin
+    usual = pj.block.draw(16, "open", 3)
+    cases = pj.block.case(usual.ball.pos, usual.ball.vel, scene=scene)
+    plans = pj.plan(pj.block.planner(), cases)
+    verdict = pj.block.judge(cases, plans)
+    assert verdict.success[np.asarray(pj.are_solved(plans))].all()
+    assert verdict.success.sum() > 4
+    told = pj.block.prospects(pj.take(cases, 0)).sentence()
+    assert told.endswith("and the arm starts 1.4 mm from a body")
 
 
 def make_shelf():

@@ -1,5 +1,7 @@
 """Scenes and shields of blocks from YAML files and short texts."""
 
+import os
+
 import numpy as np
 import pytest
 
@@ -83,6 +85,23 @@ def test_a_scene_file_lists_obstacles_and_the_protected_body(tmp_path):
         ),
         ("meshes: [{file: a.yaml}]", r"a.yaml: meshes\[0\] must be .*, got a.yaml: no decoder"),
         ("meshes: [{file: flat.obj}]", r".*\[0\] must be .* with a volume; .*obj: .*coplanar"),
+        (
+            "meshes: [{file: text.stl}]",
+            r"a.yaml: meshes\[0\] must be .*; an STL file of text is not",
+        ),
+        (
+            "meshes: [{file: pipe}]",
+            r"a.yaml: meshes\[0\] must be .*, got pipe: it is no plain file",
+        ),
+        (
+            "meshes: [{file: huge.obj}]",
+            r"a.yaml: meshes\[0\] must be .*huge.obj: it is larger than",
+        ),
+        (
+            "spheres: [{middle: [0, 0, 0], radius: yes}]",
+            r".*spheres\[0\].radius must be a finite num",
+        ),
+        ("boxes: [{middle: [0, no, 0], size: [1, 1, 1]}]", r".*boxes\[0\].middle must be 3 finite"),
         ("meshes: [{file: flat.obj, turn: [0, 0, 0, 0]}]", r"a.yaml: meshes\[0\].turn must"),
     ],
 )
@@ -90,8 +109,42 @@ def test_a_wrong_element_of_a_scene_file_is_named(tmp_path, monkeypatch, text, m
     monkeypatch.chdir(tmp_path)
     (tmp_path / "a.yaml").write_text(text)
     (tmp_path / "flat.obj").write_text(SQUARE.format(0))
+    (tmp_path / "text.stl").write_text("solid part\nfacet normal 0 0 1\nendsolid part\n" * 9)
+    os.mkfifo(tmp_path / "pipe")
+    with (tmp_path / "huge.obj").open("wb") as file:
+        file.truncate(3 << 30)  # sparse
     with pytest.raises(ArgumentError, match=f"^{message}"):
         read_scene("a.yaml")
+
+
+ZERO, UNIT, TURN = (0, 0, 0), (1, 1, 1), (1, 0, 0, 0)
+
+
+@pytest.mark.parametrize(
+    ("solids", "message"),
+    [
+        ({"boxes": [(ZERO, UNIT)]}, r"boxes\[0\] must be a tuple of middle, size, turn, got"),
+        ({"boxes": (ZERO, UNIT, TURN)}, r"boxes\[0\].middle must be 3 finite numbers, got 0"),
+        ({"boxes": [(ZERO, UNIT, (0, 0, 0, 0))]}, r"boxes\[0\].turn must be a quaternion other"),
+        ({"boxes": [(ZERO, UNIT, (1e-200, 0, 0, 0))]}, r"boxes\[0\].turn must be a quaternion oth"),
+        ({"boxes": [(ZERO, (1, -1, 1), TURN)]}, r"boxes\[0\].size must be > 0, got \[1.0, -1.0"),
+        ({"boxes": [(ZERO, (1, np.nan, 1), TURN)]}, r"boxes\[0\].size must be 3 finite numbers"),
+        ({"boxes": 3}, "boxes must be a list of obstacles, got 3"),
+        ({"spheres": [(0, 0, 0, 0.1)]}, r"spheres\[0\] must be a tuple of middle, radius, got"),
+        ({"spheres": [(ZERO, True)]}, r"spheres\[0\].radius must be a finite number, got True"),
+        ({"cylinders": [([ZERO, ZERO], 1)]}, r"cylinders\[0\].ends must be two different points"),
+        ({"protected_capsule": {}}, "protected_capsule must be a tuple of ends, radius, got {}"),
+        ({"protected_capsule": ([ZERO, UNIT], 0)}, "protected_capsule.radius must be > 0, got 0"),
+        ({"protected_box": [ZERO]}, "protected_box must be 2 lists of 3 finite numbers"),
+        ({"floor": "low"}, "floor must be a finite number, got 'low'"),
+        ({"meshes": [(b"x", 1, ZERO, TURN)]}, r"meshes\[0\] must be a binary STL, OBJ or MSH file"),
+        ({"meshes": [(np.eye(4, 3), 0, ZERO, TURN)]}, r"meshes\[0\].scale must be > 0, got 0"),
+    ],
+)
+def test_a_wrong_entry_of_a_scene_is_named(solids, message):
+    with pytest.raises(ArgumentError, match=f"^{message}") as error:
+        make_scene(**solids)
+    assert "\n" not in str(error.value)
 
 
 def test_a_shield_is_described_by_its_size_or_by_a_file(tmp_path):

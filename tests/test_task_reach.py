@@ -10,11 +10,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import planner_jax as pj
+from planner_jax.robot.arm import shield_pose
 from planner_jax.robot.arm_file import irb1600
 from planner_jax.task.block.clearance import clearances, clearances_and_slopes
 from planner_jax.task.reach import shortcut, tree
-from planner_jax.task.reach.default_planner import Search, TreeSearch
+from planner_jax.task.reach.default_planner import ReachPlan, Search, TreeSearch
 from planner_jax.task.reach.motion import join_knots, pad_knots, straight_knots
+from planner_jax.trajectory.polynomial import PiecewisePolynomial
 from tests.derivatives import double
 from tests.trees import as_numpy
 
@@ -154,11 +156,40 @@ def test_the_judge_names_the_limit_that_a_motion_breaks(name, change):
 def test_a_start_or_goal_in_an_obstacle_is_blocked(side):
     inside = np.array([0.0, 0.3, -0.3, 0.0, 0.6, 0.0])
     ends = {"angles": inside} if side == "start" else {"goal": inside}
-    assert pj.plan(DIRECT, reach(scene=WALL, **ends)).status == pj.Status.BLOCKED
+    case = reach(scene=WALL, **ends)
+    plan = pj.plan(DIRECT, case)
+    assert plan.status == pj.Status.BLOCKED
+    told = pj.reach.judge(case, plan).sentence()
+    assert f"no motion is free: at the {side} the shield and box 1 are" in told
 
 
-def test_a_goal_beyond_the_joints_limits_is_out_of_reach():
-    assert pj.plan(DIRECT, reach(GOAL + [9.0, 0, 0, 0, 0, 0])).status == pj.Status.OUT_OF_REACH
+def test_a_goal_beyond_the_joints_limits_is_out_of_reach_without_a_search():
+    case = reach(GOAL + [9.0, 0, 0, 0, 0, 0])
+    plan = pj.plan(DIRECT, case)
+    assert plan.status == pj.Status.OUT_OF_REACH
+    assert "joint_1 is 6.66 rad beyond its limit at every goal" in (
+        pj.reach.judge(case, plan).sentence()
+    )
+    assert not TreeSearch().is_due(plan)
+
+
+def test_an_arm_whose_base_is_a_capsule_is_judged():
+    num = ARM.num
+    point = np.tile([[0.0, 0.0, 0.1]], (2, 1)).astype(np.float32)
+    arm = dataclasses.replace(ARM, base_box=point, base_pairs=(1,))
+    rods = [([(0.0, 0.0, 3.0), (0.0, 0.0, 4.0)], 0.0)]  # a radius of 0 is judged, too
+    case = pj.reach.case(START, angles=START, arm=arm, scene=pj.reach.make_scene(capsules=rods))
+    coeffs = np.concatenate([START[None], np.zeros((2, num), np.float32)])[None]
+    path = PiecewisePolynomial(coeffs=coeffs, durations=np.ones(1, np.float32))
+    still = ReachPlan(motion=path, goal=0, cost=1.0, violation=0.0, iterations=0, status=1)
+    still = jax.tree.map(np.asarray, still)
+    verdict = pj.reach.judge(case, still)
+    assert verdict.success, verdict.sentence()
+    turn, face = map(np.asarray, shield_pose(ARM, START))
+    middle = face - 0.005 * turn[:, 0]  # of the plate
+    inside = dataclasses.replace(arm, base_box=np.stack([middle, middle]))
+    verdict = pj.reach.judge(dataclasses.replace(case, arm=inside), still)
+    assert verdict.failed_limit == "self" and "the base" in verdict.sentence()
 
 
 def test_the_nearest_free_goal_is_reached():

@@ -178,7 +178,9 @@ class OnlineBlock(Planner):
     samples: int = 32  # samples of a motion at which least squares compute distances
     worst: int = 8  # samples with the least distances, at which least squares compute derivatives
     checked: int = 96  # samples of the returned plan at which limits are checked
-    margin: float = 0.003  # [m], least distance of the arm from all obstacles and itself
+    # [m], least distance of the arm from all obstacles and itself. A motion that starts nearer has
+    # half of the distance at the start as its margin.
+    margin: float = 0.003
     # [m], least distance from capsules, boxes and cylinders; covers gaps between samples
     obstacle_margin: float = 0.012
     slack: float = 0.004  # fraction of every limit that plans leave unused
@@ -260,7 +262,8 @@ class OnlineBlock(Planner):
             return dataclasses.replace(plan, status=explain_status(poses, plan.status))
         flight, poses, order = self._rank(case)
         goals, goal_order, straight = self._rank_straight(case, poses, _EVERY, attempt)
-        model = lambda point: self.model(point, case, flight)  # noqa: E731
+        margin = self._margin(case)
+        model = lambda point: self.model(point, case, flight, margin)  # noqa: E731
         solver, tries = attempt.solver, jnp.where(flight.comes, attempt.tries, 0)
         kept = jnp.where(attempt.in_turn, 0, jnp.minimum(attempt.kept, tries))
 
@@ -329,6 +332,8 @@ class OnlineBlock(Planner):
         is_left = (~is_solved(best.status)) | bool(self.settling)
         slots, num, dtype = kept + 1, orders.shape[0], cases.angles.dtype
 
+        margins = jax.vmap(self._margin)(cases)
+
         def advance(search: LevenbergState, most: Array, given: tuple) -> LevenbergState:
             return continue_search(lambda x: self.model(x, *given), search, solver, most)
 
@@ -349,7 +354,7 @@ class OnlineBlock(Planner):
             some = jax.tree.map(lambda leaf: leaf.at[lanes].get(mode="clip"), searches)
             some = jax.tree.map(lambda a, b: jnp.where(is_trial, a, b), begun, some)
             own = jnp.minimum(lanes // slots, num - 1)
-            given = jax.tree.map(lambda leaf: leaf[own], (cases, flights))
+            given = jax.tree.map(lambda leaf: leaf[own], (cases, flights, margins))
             later = jnp.minimum(some.steps + _TURN, solver.max_steps)
             some = jax.vmap(advance)(some, jnp.where(is_trial, solver.trial, later), given)
             searches = jax.tree.map(lambda a, b: a.at[lanes].set(b, mode="drop"), searches, some)
@@ -395,6 +400,7 @@ class OnlineBlock(Planner):
         poses, order, num = self._rank_straight(case, poses, 1, attempt)
         shares, coarse = self._shares(), min(_COARSE, self.checked)
         few = tuple(np.arange(1, coarse + 1) / coarse)
+        margin = self._margin(case)
         block = max(1, len(shares) // coarse)  # number of motions that are checked together first
         blocks = (num + block - 1) // block
 
@@ -412,7 +418,7 @@ class OnlineBlock(Planner):
             angles = jnp.where(is_coarse, several, sample(k, shares))
             gaps = least_clearances(case.arm, case.scene, angles)
             least = jnp.min(gaps[: block * coarse].reshape(block, coarse), axis=1)
-            found = (least >= self.margin) & (first + jnp.arange(block) < num)
+            found = (least >= margin) & (first + jnp.arange(block) < num)
             if case.limits.torque is not None:
                 ranks = jnp.minimum(first + jnp.arange(block), len(order) - 1)
                 points = jax.vmap(lambda k: self.encode_straight(case, poses, order[k]))(ranks)
@@ -486,7 +492,9 @@ class OnlineBlock(Planner):
         self, case: BlockCase, flight: Flight, start: Array, solver: LevenbergConfig
     ) -> BlockPlan:
         """Return the plan that least squares find from a start: joint rates and time of contact."""
-        end = levenberg.least_squares(lambda point: self.model(point, case, flight), start, solver)
+        margin = self._margin(case)
+        model = lambda point: self.model(point, case, flight, margin)  # noqa: E731
+        end = levenberg.least_squares(model, start, solver)
         return self.finish(case, flight, end.point, end.steps)
 
     def encode_straight(self, case: BlockCase, poses: EndPoses, index: Array) -> Array:
@@ -513,7 +521,16 @@ class OnlineBlock(Planner):
         last = jnp.where(case.ends_at_rest, 0.0, steps[-1])
         return steps.at[-1].set(last), case.rates * duration, duration
 
-    def model(self, point: Array, case: BlockCase, flight: Flight) -> Model:
+    def _margin(self, case: BlockCase) -> Array:
+        """Return the margin () [m] that the start of a case allows."""
+        return self._margin_from(case.clearances(case.angles[None])[0])
+
+    def _margin_from(self, gap: Array) -> Array:
+        return jnp.where(gap < self.margin, 0.5 * jnp.maximum(gap, 0.0), self.margin)
+
+    def model(
+        self, point: Array, case: BlockCase, flight: Flight, margin: Array | float | None = None
+    ) -> Model:
         """Return the cost, a sum of squares, and its quadratic model by rates and time of contact.
 
         The residuals are the errors of the shield's contact with the ball, excesses over joint
@@ -527,7 +544,8 @@ class OnlineBlock(Planner):
         gaps, slopes_at = clearances_and_slopes(case.arm, case.scene, angles)
         gaps = lax.optimization_barrier(gaps)  # (R, S)
         is_of_scene = np.arange(gaps.shape[0]) < num_of_obstacles(case.arm, case.scene)
-        margins = np.where(is_of_scene, self.obstacle_margin, 1.3 * self.margin)[:, None]
+        margin = self.margin if margin is None else margin
+        margins = jnp.where(is_of_scene, self.obstacle_margin, 1.3 * margin)[:, None]
         near, worst = lax.top_k(jnp.max(margins - gaps, axis=0), self.worst)
         slopes = slopes_at(worst)  # (R, n, W)
         short = jnp.maximum(margins - gaps[:, worst], 0.0) * self.weights.clearance  # (R, W)
@@ -551,7 +569,7 @@ class OnlineBlock(Planner):
         size = case.arm.num * pieces
         ends_free = jnp.where(case.ends_at_rest, 0.0, 1.0)
         free = jnp.ones(size + 1, dtype).at[size - case.arm.num : size].set(ends_free)
-        too_near = near[0] - 0.3 * self.margin
+        too_near = near[0] - 0.3 * margin
         cost = joints.cost + jnp.sum(rows**2) + jnp.sum(short**2)
         joint_excess = joints.excess
         if case.limits.torque is not None:
@@ -632,7 +650,8 @@ class OnlineBlock(Planner):
         joint_excess = jnp.maximum(joints.excess, beyond)
         if case.limits.torque is not None:
             joint_excess = jnp.maximum(joint_excess, self.torque_excess(case, point))
-        excess = _combine_excess(joint_excess, contact, self.margin - jnp.min(gaps[1:]))
+        margin = self._margin_from(gaps[0])
+        excess = _combine_excess(joint_excess, contact, margin - jnp.min(gaps[1:]))
         violation = jnp.where(point[-1] > case.delay, excess, jnp.inf)
         status = status_of(joints.load, violation, violation > FEASIBILITY_TOLERANCE)
         is_blocked = (gaps[0] < 0.0) & ~is_solved(status)  # the arm touches something at the start

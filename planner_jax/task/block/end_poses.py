@@ -108,15 +108,41 @@ def end_poses(
     # Within the outline of the shield, which may have any rotation about its normal.
     most = jnp.minimum(case.offset, shield_inradius(case.arm))
     offset = most * jnp.asarray(_OFFSETS[chosen % len(_OFFSETS)], time.dtype)
+    return poses_at(case, flight, time, offset, pieces)
 
-    def solve_point(time: Array, offset: Array) -> tuple[Array, Array]:
+
+def poses_at(
+    case: BlockCase,
+    flight: Flight,
+    time: Array,
+    offset: Array,
+    pieces: int,
+    tilt: Array | None = None,
+) -> EndPoses:
+    """Return the arm poses that meet the ball at P times; see `end_poses`.
+
+    Args:
+        case: the case.
+        flight: times between which the ball may be met.
+        time: (P,) [s], of the contacts.
+        offset: (P, 2) [m], of the ball from the shield's middle, along two edges.
+        pieces: number of pieces of the straight motions.
+        tilt: (P, 2) [rad], of the shield's normal from the reversed velocity of the ball, towards
+            the two other axes of `frame_of`; by default 0.
+    """
+
+    def solve_point(time: Array, offset: Array, tilt: Array | None) -> tuple[Array, Array]:
         ball = drag_free_flight(case.ball, time, case.gravity)
         rotation = frame_of(face_ball(ball.vel))
+        if tilt is not None:
+            angle = jnp.sqrt(jnp.maximum(jnp.sum(tilt**2), 1e-12))
+            lean = jnp.append(jnp.cos(angle), tilt * jnp.sin(angle) / angle)
+            rotation = frame_of(product(rotation, lean))
         shift = offset[0] * rotation[:, 1] + offset[1] * rotation[:, 2]
         shift -= case.ball_radius * rotation[:, 0]
         return inverse_kinematics(case.arm, rotation, ball.pos + shift, is_roll_free=True)
 
-    angles, found = jax.vmap(solve_point)(time, offset)
+    angles, found = jax.vmap(solve_point)(time, offset, tilt)
     if case.arm.turns_in_plane:
         angles = angles.at[:, :, -1].set(case.angles[-1])
     time = jnp.repeat(time, angles.shape[1])

@@ -9,21 +9,28 @@ from jax import Array
 
 from planner_jax.core.checks import require_kind
 from planner_jax.core.choices import require
+from planner_jax.robot.arm import shield_inradius
 from planner_jax.robot.arm_dynamics import USED
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.default_planner import OnlineBlock
-from planner_jax.task.block.end_poses import end_poses, flight_of
+from planner_jax.task.block.end_poses import Flight, flight_of, poses_at
 from planner_jax.task.block.motion import least_times
 
-_POINTS, _PIECES = 192, 10  # number of points of the ball's path with poses; see `end_poses`
+_PIECES = 10  # see `poses_at`
+# Contacts are sampled in rounds: first evenly, then near the best contacts, ever closer to them.
+_ROUNDS, _POINTS, _BEST = 8, 160, 16
+_SPREAD, _NARROWER = 0.25, 0.45  # standard deviation in the second round, and its ratio to the next
+_TOUCH = 1e-3  # [m], greatest depth of two bodies in each other that the referee accepts
+_SURE = 1e-2  # [s], time that later samples could still save
 
 
 @dataclasses.dataclass(frozen=True)
 class Prospects:
     """Numbers of poses in which an arm meets a ball, and the time that the arm lacks.
 
-    In a pose the shield meets the ball where it may be blocked. Inverse kinematics find the poses
-    at 192 points of the ball's path. Obstacles between start and poses are ignored.
+    In a pose the shield meets the ball where it may be blocked, off the shield's middle and tilted
+    as far as the case allows. Inverse kinematics find the poses at 1280 samples of time, offset and
+    tilt. Obstacles between start and poses are ignored.
     """
 
     poses: int  # number of poses within the limits of the joint angles
@@ -35,14 +42,21 @@ class Prospects:
     # Greatest ratio of a joint's torque to its limit, in the straight motion to a clear pose in
     # time that needs the least. 0 without limits of torque, infinite if no clear pose is in time.
     torque: float = 0.0
+    start: float = np.inf  # [m], least distance between two bodies at the start
 
     def sentence(self) -> str:
         """Describe why the ball cannot be blocked, or that a search for a motion may succeed."""
+        if self.start < 0.0:
+            return f"at the start bodies are {-self.start:.3g} m inside each other"
+        near = f", and the arm starts {1e3 * self.start:.2g} mm from a body"
+        return self._of_poses() + (near if self.start < OnlineBlock.margin else "")
+
+    def _of_poses(self) -> str:
         if not self.poses:
             return "the shield cannot get to the ball's path between the two boxes"
         if not self.clear:
             return f"the arm touches something in all {self.poses} poses that meet the ball"
-        if self.later > 0.0:
+        if self.later > _SURE:
             return f"the ball is too early: the arm is ready {self.later:.3f} s after it"
         if self.torque > 1.0:
             return (
@@ -51,7 +65,7 @@ class Prospects:
             )
         return (
             f"{self.clear} of {self.poses} poses that meet the ball are clear, and one is reached "
-            f"{-self.later:.3f} s early if nothing is in the way"
+            f"{max(-self.later, 0.0):.3f} s early if nothing is in the way"
         )
 
 
@@ -70,17 +84,62 @@ def prospects(case: BlockCase) -> Prospects:
     """
     require_kind("case", case, BlockCase)
     require(case.batch_shape == (), "case", "one case", shown=f"batch shape {case.batch_shape}")
-    found, gaps, late, torque = (np.asarray(each) for each in _measure(case))
-    is_clear = found & (gaps > 0.0)
+    start, *measured = _measure(case)
+    found, gaps, late, torque = (np.asarray(each) for each in measured)
+    is_clear = found & (gaps >= -_TOUCH)
     later = float(np.min(late, initial=np.inf, where=is_clear))
-    torque = float(np.min(torque, initial=np.inf, where=is_clear & (late <= 0.0)))
-    return Prospects(int(found.sum()), int(is_clear.sum()), later, torque)
+    torque = float(np.min(torque, initial=np.inf, where=is_clear & (late <= _SURE)))
+    return Prospects(int(found.sum()), int(is_clear.sum()), later, torque, float(start))
 
 
 @jax.jit
-def _measure(case: BlockCase) -> tuple[Array, Array, Array, Array]:
-    flight = flight_of(case)
-    poses = end_poses(case, flight, _POINTS, _PIECES)
+def _measure(case: BlockCase) -> tuple[Array, ...]:
+    """Return the least distance [m] at the start, and four arrays (rounds, C) of C poses a round.
+
+    The arrays are whether the pose exists, its least distance [m], the time [s] by which the arm is
+    late, and the greatest ratio of a torque to its limit.
+    """
+    flight, dtype, key = flight_of(case), case.angles.dtype, jax.random.key(0)
+    evenly = jax.random.uniform(key, (_POINTS, 6), dtype, -1.0, 1.0)
+    evenly = evenly.at[:, 0].set((2.0 * jnp.arange(_POINTS, dtype=dtype) + 1.0) / _POINTS - 1.0)
+
+    def sample(state: tuple[Array, ...], turn: tuple[Array, Array]) -> tuple[tuple, tuple]:
+        (shares, best, costs), (spread, key) = state, turn
+        found, gaps, late, torque = _measure_contacts(case, flight, shares)
+        # Poses that are reached in time are the best; then clear ones, then those that exist.
+        cost = jnp.where(gaps >= -_TOUCH, late, 1e2 - gaps)
+        cost = jnp.min(jnp.where(found, cost, 1e4).reshape(_POINTS, -1), axis=1)
+        every, costs = jnp.concatenate([best, shares]), jnp.concatenate([costs, cost])
+        order = jnp.argsort(costs)[:_BEST]
+        best, costs = every[order], costs[order]
+        away = jax.random.normal(key, (_POINTS, 6), dtype)
+        near = jnp.tile(best, (_POINTS // _BEST, 1)) + spread * away
+        return (jnp.clip(near, -1.0, 1.0), best, costs), (found, gaps, late, torque)
+
+    first = evenly, evenly[:_BEST], jnp.full(_BEST, jnp.inf, dtype)
+    spread = _SPREAD * _NARROWER ** jnp.arange(_ROUNDS, dtype=dtype)
+    measured = jax.lax.scan(sample, first, (spread, jax.random.split(key, _ROUNDS)))[1]
+    return case.clearances(case.angles[None])[0], *measured
+
+
+def _measure_contacts(case: BlockCase, flight: Flight, shares: Array) -> tuple[Array, ...]:
+    """Return measurements of the poses at contacts that shares (P, 6) in [-1, 1] describe.
+
+    The shares are of the time, the offset (2), the tilt (2) and the last joint's angle.
+    """
+
+    def in_disc(share: Array) -> Array:
+        return share / jnp.maximum(jnp.sqrt(jnp.sum(share**2, axis=1, keepdims=True)), 1.0)
+
+    middle, half = 0.5 * (flight.earliest + flight.latest), 0.5 * (flight.latest - flight.earliest)
+    most = jnp.minimum(case.offset, shield_inradius(case.arm))
+    offset, tilt = most * in_disc(shares[:, 1:3]), case.tilt * in_disc(shares[:, 3:5])
+    poses = poses_at(case, flight, middle + half * shares[:, 0], offset, _PIECES, tilt)
+    if case.arm.turns_in_plane:  # half of the poses keep the last joint's angle
+        turn = jnp.sign(shares[:, 5]) * jnp.maximum(jnp.abs(shares[:, 5]) - 0.5, 0.0)
+        last = case.angles[-1] + jnp.pi * jnp.repeat(turn, len(poses.time) // len(shares))
+        last = jnp.clip(last, case.arm.lower[-1], case.arm.upper[-1])
+        poses = dataclasses.replace(poses, angles=poses.angles.at[:, -1].set(last))
     settings = case.rates, case.limits.velocity, case.limits.acceleration, case.ends_at_rest
     away = poses.angles - case.angles[None]
     least = jax.vmap(lambda away: jnp.max(least_times(away, *settings)[0]))(away)
