@@ -19,7 +19,16 @@ from planner_jax.benchmarks.serve_soak import distance_off
 from planner_jax.cli.main import main
 from planner_jax.live import planner as live_planner
 from planner_jax.live.course import with_recovery
-from planner_jax.live.packets import BALL, ROBOT, Fault, Motion, Reason, read_answer, request
+from planner_jax.live.packets import (
+    BALL,
+    ROBOT,
+    USUAL,
+    Fault,
+    Motion,
+    Reason,
+    read_answer,
+    request,
+)
 from planner_jax.live.planner import LivePlanner
 from planner_jax.live.server import Server
 from planner_jax.live.settings import CatchServe, HitServe
@@ -71,7 +80,8 @@ class Throw:
         found = None if answer is None else read_answer(answer)
         if found is not None:
             self.planner.record_sent(data, time.perf_counter())
-            self.answers.append(found)
+            if not found.fault or found.fault in USUAL:
+                self.answers.append(found)
         return found
 
     def packet(self, kind, values):

@@ -1,5 +1,6 @@
 """Packets between a live planning server and its client: format, order, and rejected packets."""
 
+import dataclasses
 import struct
 
 import numpy as np
@@ -82,8 +83,8 @@ def test_no_bytes_crash_it(data):
         packets.read_answer(prefix + data)
 
 
-def packet(sequence, sent):
-    return Packet(packets.BALL, 0, sequence, sent, sent, (0.0, 0.0, 0.0))
+def packet(sequence, sent, ball=0):
+    return Packet(packets.BALL, ball, sequence, sent, sent, (0.0, 0.0, 0.0))
 
 
 def faults(marks):
@@ -94,9 +95,8 @@ def faults(marks):
 
 def test_packets_in_order_count_and_others_do_not():
     marks = [(1, 1.0, 9.0), (3, 1.02, 9.02), (2, 1.01, 9.03), (3, 1.02, 9.03), (4, 1.03, 9.04)]
-    found, arrivals = faults(marks)
+    found, _ = faults(marks)
     assert found == [0, 0, Fault.OUT_OF_ORDER, Fault.DUPLICATE, 0]
-    assert arrivals.newest == 1.03
     # The packet numbers of a sender may restart at 1, if its clock continues.
     found, _ = faults([(900, 1.0, 9.0), (1, 1.5, 9.5), (2, 1.6, 9.6)])
     assert found == [0, 0, 0]
@@ -120,14 +120,90 @@ def test_another_clock_is_accepted_after_a_second_without_a_used_packet():
     assert found[:5] == [(Fault.OTHER_CLOCK, False)] * 5
     assert found[5] == (Fault.NONE, True)
     assert arrivals.check(packet(6, 505.2), "a", 10.4) == (Fault.NONE, False)
-    assert arrivals.newest == 505.2
 
 
 def test_the_number_of_senders_in_memory_is_bounded():
     arrivals = Arrivals()
-    for k in range(500):
-        arrivals.check(packet(1, 1.0 + 1e-3 * k), k, 9.0 + 1e-3 * k)
-    assert len(arrivals._senders) <= 32
+    found = [
+        arrivals.check(packet(1, 1.0 + 1e-3 * k, ball=k), k, 9.0 + 1e-3 * k)[0] for k in range(500)
+    ]
+    assert len(arrivals._senders) <= 32 and set(found[32:]) == {Fault.CROWDED}
+    # The places of senders that were silent for a second are free again.
+    assert arrivals.check(packet(1, 2.1, ball=1), "late", 10.1)[0] is Fault.NONE
+
+
+def test_a_packet_cannot_come_from_the_future():
+    arrivals = Arrivals()
+    arrivals.check(packet(1, 1.0), "a", 9.0)
+    for k, ahead in enumerate((0.99, 0.5, 0.03)):
+        early = arrivals.check(packet(1, 1.01 + ahead, ball=1), f"other {k}", 9.01)
+        assert early == (Fault.OTHER_CLOCK, False)
+    # A single wrong time stamp of the clock's owner has no effect on its next packets.
+    assert arrivals.check(packet(2, 1.92), "a", 9.02)[0] is Fault.OTHER_CLOCK
+    assert arrivals.check(packet(3, 1.03), "a", 9.03)[0] is Fault.NONE
+    assert arrivals.ahead == 0.0
+    assert arrivals.check(packet(1, 1.05, ball=1), "b", 9.04)[0] is Fault.NONE
+    assert arrivals.ahead == pytest.approx(0.01)
+
+
+@pytest.mark.parametrize("step", [0.3, 0.03])
+def test_the_owner_of_the_clock_may_set_it_forward_with_two_packets(step):
+    arrivals = Arrivals()
+    arrivals.check(packet(1, 1.0), "a", 9.0)
+    marks = [(n, 1.0 + 0.01 * n + step, 9.0 + 0.01 * n) for n in range(2, 5)]
+    found = [arrivals.check(packet(n, sent), "a", now) for n, sent, now in marks]
+    assert found == [(Fault.OTHER_CLOCK, False), (Fault.NONE, False), (Fault.NONE, False)]
+    assert arrivals.ahead == 0.0
+
+
+def test_ball_robot_and_clock_belong_to_the_sender_that_came_first():
+    arrivals = Arrivals()
+    robot = Packet(packets.ROBOT, 0, 1, 1.0, 1.0, (0.0,) * 9)
+    assert arrivals.check(packet(1, 1.0), "a", 9.0)[0] is Fault.NONE
+    assert arrivals.check(robot, "b", 9.0)[0] is Fault.NONE  # number 0, but not the ball
+    for k in range(1, 300):  # "a" observes a ball, "b" the robot, and "c" lies about both
+        sent, now = 1.0 + 0.01 * k, 9.0 + 0.01 * k
+        state = dataclasses.replace(robot, sent=sent, sequence=k + 1)
+        assert arrivals.check(packet(k + 1, sent), "a", now)[0] is Fault.NONE
+        assert arrivals.check(state, "b", now)[0] is Fault.NONE
+        assert arrivals.check(packet(k, sent), "c", now)[0] is Fault.OTHER_SENDER
+        assert arrivals.check(state, "c", now)[0] is Fault.OTHER_SENDER
+        assert arrivals.check(packet(k, 500.0 + sent), "d", now)[0] is Fault.OTHER_CLOCK
+    # The clock passes on to "b" when "a" is silent, and the ball is free.
+    for k in range(300, 410):
+        sent, now = 1.0 + 0.01 * k, 9.0 + 0.01 * k
+        state = dataclasses.replace(robot, sent=sent, sequence=k + 1)
+        assert arrivals.check(state, "b", now)[0] is Fault.NONE
+        assert arrivals.check(packet(k, 500.0 + sent), "d", now)[0] is Fault.OTHER_CLOCK
+    assert arrivals.check(packet(1, 5.1), "c", 13.1)[0] is Fault.NONE
+
+
+def test_a_ball_belongs_to_its_sender_while_the_sender_sends_anything():
+    arrivals = Arrivals()
+    arrivals.check(packet(1, 1.0, ball=7), "a", 9.0)
+    for k in range(1, 60):
+        assert arrivals.check(packet(k + 1, 1.0 + 0.1 * k), "a", 9.0 + 0.1 * k)[0] is Fault.NONE
+    assert arrivals.check(packet(1, 7.0, ball=7), "b", 15.0)[0] is Fault.OTHER_SENDER
+
+
+def test_the_packets_and_balls_of_a_sender_are_limited():
+    arrivals = Arrivals()
+    times = 1e-4 * np.arange(1, 20001)  # 10,000 packets a second
+    arrivals.check(packet(0, 1.0, ball=99), "a", 9.0)
+    found = [arrivals.check(packet(k, 1.0 + t), "b", 9.0 + t)[0] for k, t in enumerate(times)]
+    assert 1990 <= found.count(Fault.NONE) <= 2060 and found.count(Fault.TOO_FAST) > 17900
+    found = [
+        arrivals.check(packet(k, 1.5 + 0.001 * k, ball=100 + k), "c", 9.5 + 0.001 * k)[0]
+        for k in range(1, 900)
+    ]
+    assert found.count(Fault.NONE) == 16 and set(found[16:]) == {Fault.CROWDED}
+
+
+def test_a_refused_packet_is_answered_once_a_second():
+    arrivals = Arrivals()
+    times = 0.001 * np.arange(2500)
+    assert sum(arrivals.begin_refusal("a", t) for t in times) == 3
+    assert sum(arrivals.begin_refusal(k, 9.0 + 0.9e-3 * k) for k in range(1000)) == 32
 
 
 def test_quantiles_of_times_are_right_to_a_per_cent():

@@ -45,6 +45,9 @@ class Fault(enum.IntEnum):
     OTHER_CLOCK = 9
     STALE = 10
     OUTLIER = 11
+    OTHER_SENDER = 12
+    CROWDED = 13
+    TOO_FAST = 14
 
     @property
     def words(self) -> str:
@@ -52,19 +55,29 @@ class Fault(enum.IntEnum):
         return self.name.lower().replace("_", " ")
 
 
-# Faults of packets that get no answer; the texts complete "a packet from ADDRESS ...".
-SILENT = {
+# Faults of packets that are no requests, and get no answer.
+SILENT = (Fault.STRANGE, Fault.CUT, Fault.OTHER_VERSION, Fault.UNKNOWN_KIND)
+# Faults of packets from correct senders, whose answers have setpoints.
+USUAL = (Fault.STALE, Fault.OUTLIER)
+# Faults that the server prints; the texts complete "a packet from ADDRESS ...".
+PRINTED = {
     Fault.STRANGE: f"does not begin with {MAGIC.decode()}",
     Fault.CUT: "has another length than its kind",
     Fault.OTHER_VERSION: f"is of another version than {VERSION}",
     Fault.UNKNOWN_KIND: "is neither of a ball nor of a robot",
+    Fault.NOT_FINITE: "has a number that is NaN or infinite",
+    Fault.ABSURD: "has an absurd position, velocity, acceleration or time",
+    Fault.OTHER_CLOCK: "has another clock than the packets before",
+    Fault.OTHER_SENDER: "is of a ball or robot that belongs to another address",
+    Fault.CROWDED: "is of too many balls, or there are too many other senders",
+    Fault.TOO_FAST: "follows the packets before too fast",
 }
 
 
 class Motion(enum.IntEnum):
     """Kind of trajectory from which the setpoints in an answer are sampled."""
 
-    NONE = 0  # no setpoints, since no state of the robot has arrived
+    NONE = 0  # no setpoints: no state of the robot has arrived, or the request is refused
     SAFE = 1  # a trajectory to standstill, or standstill
     PLAN = 2  # a plan that meets the ball, followed by a trajectory to standstill
 

@@ -35,6 +35,7 @@ from planner_jax.live.packets import (
     BALL,
     MOST_SETPOINTS,
     SILENT,
+    USUAL,
     WIDTH,
     Fault,
     Motion,
@@ -111,6 +112,7 @@ class LivePlanner(Generic[CaseT, PlanT]):
         self._sight = Sight(stroke.flight, stroke.drag, float(self._gravity), noise)
         self._worker = concurrent.futures.ThreadPoolExecutor(1, "planning")
         self.report, self._arrivals = Report(deadline), Arrivals()
+        self.fault = Fault.NONE  # why the last packet is not used
         self._forget()
 
     def _forget(self) -> None:
@@ -151,9 +153,11 @@ class LivePlanner(Generic[CaseT, PlanT]):
         self.report.begin()
 
     def answer(self, data: bytes, sender: Hashable, received: float) -> bytes | None:
-        """Use the measurement in a packet; return the answer, or None for an unreadable packet.
+        """Use the measurement in a packet; return the answer, or None for no answer.
 
-        `received` [s] is the arrival time by `time.perf_counter()`.
+        `received` [s] is the arrival time by `time.perf_counter()`. The attribute `fault` is then
+        the reason why the packet is not used. An unreadable packet gets no answer. A refused one
+        gets an answer without setpoints, but at most one per sender in a second.
         """
         self._complete()
         report = self.report
@@ -161,27 +165,33 @@ class LivePlanner(Generic[CaseT, PlanT]):
         packet = packets.read_request(data)
         if isinstance(packet, Fault):
             assert packet in SILENT
+            self.fault = packet
             report.faults[packet] += 1
             return None
-        fault, is_anew = self._arrivals.check(packet, sender, received)
+        if not packet.fault and self._is_absurd(packet):
+            packet = dataclasses.replace(packet, fault=Fault.ABSURD)
+        self.fault, is_anew = self._arrivals.check(packet, sender, received)
+        if self.fault:
+            report.faults[self.fault] += 1
+            is_answered = self._arrivals.begin_refusal(sender, received)
+            return self._encode(packet, packet.sent) if is_answered else None
         if is_anew:
             report.counts["clocks"] += 1
             self._forget()
         report.stages["read"].add(time.perf_counter() - received)
-        # The setpoints start at the sending time of the newest packet, on the client's clock.
-        due = self._arrivals.newest
-        if fault is Fault.NONE:
-            use = self._use_ball if packet.kind == BALL else self._use_robot
-            fault = use(packet, due, received)
+        # The setpoints start at the sending time of this packet, but not in the future, and not
+        # before the current trajectory.
+        due = packet.sent - self._arrivals.ahead
+        due = due if self._flight is None else max(due, self._flight.start)
+        use = self._use_ball if packet.kind == BALL else self._use_robot
+        self.fault = use(packet, due, received)
+        if self.fault:
+            report.faults[self.fault] += 1
         else:
-            self._collect(due)
-        if fault is Fault.NONE:
             report.counts["used"] += 1
             report.counts["late"] += self._arrivals.was_late
-        else:
-            report.faults[fault] += 1
         with report.stages["setpoints"].measure():
-            return self._pack(packet, fault, due)
+            return self._pack(packet, due)
 
     def record_sent(self, data: bytes, received: float) -> None:
         """Record a sent answer's delay; only then compute the stop after a new plan."""
@@ -189,17 +199,20 @@ class LivePlanner(Generic[CaseT, PlanT]):
         self.report.counts["answered"] += 1
         self.report.counts["missed"] += taken > self.deadline
         self.report.stages["answer"].add(taken)
-        if data[5] == BALL:
+        if data[5] == BALL and (not self.fault or self.fault in USUAL):
             self.report.stages["ball"].add(taken)
         self._complete()
+
+    def _is_absurd(self, packet: Packet) -> bool:
+        if packet.kind == BALL:
+            return False
+        speed, rise = (math.hypot(*packet.values[k : k + 3]) for k in (3, 6))
+        is_slow = speed <= _FASTEST * float(self._limits.speed) and rise <= _ABRUPT
+        return not is_slow or packet.values[2] < _LOWEST
 
     def _use_robot(self, packet: Packet, due: float, _: float) -> Fault:
         self._collect(due)
         pos, vel, acc = np.reshape(packet.values, (3, 3))
-        speed, rise = (float(np.linalg.norm(each)) for each in (vel, acc))
-        is_slow = speed <= _FASTEST * float(self._limits.speed) and rise <= _ABRUPT
-        if not is_slow or pos[2] < _LOWEST:
-            return Fault.ABSURD
         flight = self._flight
         if flight is not None:
             on_course = state_of(flight.course, max(packet.measured - flight.start, 0.0))
@@ -292,7 +305,7 @@ class LivePlanner(Generic[CaseT, PlanT]):
         if flight is not None and flight.plan is not None and due >= flight.contact:
             if flight is not self._met:
                 self._met, self._done[flight.ball], self._reason = flight, due, Reason.DONE
-        if job is None or not job.found.done():
+        if job is None or not job.found.done() or due < job.start:
             return
         self._job = None
         found = job.found.result()
@@ -324,16 +337,26 @@ class LivePlanner(Generic[CaseT, PlanT]):
         old, new = (state_of(each.course, due - each.start) for each in (flight, found))
         return all(math.dist(old[k], new[k]) <= _JOIN[k] for k in range(2))
 
-    def _pack(self, packet: Packet, fault: Fault, due: float) -> bytes:
+    def _pack(self, packet: Packet, due: float) -> bytes:
         flight = self._flight
-        if flight is None or not math.isfinite(due):
-            times = (packet.sent, self._period, math.nan)
-            return packets.answer(packet, fault, Motion.NONE, self._reason, times, _NOTHING)
+        if flight is None:
+            return self._encode(packet, due)
+        due = max(due, flight.start)
         motion = Motion.PLAN if due < flight.contact else Motion.SAFE
-        is_plan = motion is Motion.PLAN
-        times = due, self._period, flight.contact if is_plan else math.nan
-        reason = Reason.NONE if is_plan else self._reason
-        return packets.answer(packet, fault, motion, reason, times, self._setpoints(flight, due))
+        contact = flight.contact if motion is Motion.PLAN else math.nan
+        return self._encode(packet, due, motion, contact, self._setpoints(flight, due))
+
+    def _encode(
+        self,
+        packet: Packet,
+        begin: float,
+        motion: Motion = Motion.NONE,
+        contact: float = math.nan,
+        setpoints: np.ndarray = _NOTHING,
+    ) -> bytes:
+        reason = Reason.NONE if motion is Motion.PLAN else self._reason
+        times = begin, self._period, contact
+        return packets.answer(packet, self.fault, motion, reason, times, setpoints)
 
     def _setpoints(self, flight: _Flight[PlanT], due: float) -> np.ndarray:
         times: Any = np.float32(due - flight.start), np.float32(self._period)

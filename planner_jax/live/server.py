@@ -1,6 +1,7 @@
 """UDP server of live planning: it receives packets on localhost and sends the planner's answers."""
 
 import contextlib
+import math
 import socket
 import struct
 import sys
@@ -9,11 +10,13 @@ from collections.abc import Callable
 
 import jax
 
-from planner_jax.live.packets import LONGEST, SILENT, Fault, read_request
+from planner_jax.live.packets import LONGEST, PRINTED, Fault
 from planner_jax.live.planner import LivePlanner
 
 HOST = "127.0.0.1"
 _LISTENED = 0.25  # [s], longest wait for a packet before the server checks whether to stop
+_REPEATED = 60.0  # [s], least time between two lines about the same fault
+_BUFFER = 2**20  # [bytes], requested size of the system's buffer of packets that have arrived
 # Number of Linux's socket option SO_TIMESTAMPNS, and format of its value: seconds, nanoseconds.
 _STAMPS, _STAMP = 35, struct.Struct("@ll")
 
@@ -31,12 +34,13 @@ class Server:
 
     def __init__(self, planner: LivePlanner, port: int) -> None:
         self.planner = planner
-        self._reported: set[Fault] = set()
+        self._printed: dict[Fault, float] = {}  # times [s] of the last lines about faults
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.settimeout(_LISTENED)
         try:
             self._socket.bind((HOST, port))
             self._socket.setsockopt(socket.SOL_SOCKET, _STAMPS, 1)
+            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER)
         except OSError as error:
             self._socket.close()
             raise OSError(error.errno, error.strerror, f"port {port}") from None
@@ -72,8 +76,9 @@ class Server:
 
     def _answer(self, data: bytes, sender: tuple[str, int], received: float) -> None:
         answer = self.planner.answer(data, sender, received)
+        if self.planner.fault in PRINTED:
+            self._warn(self.planner.fault, sender)
         if answer is None:
-            self._warn(data, sender)
             return
         try:
             self._socket.sendto(answer, sender)
@@ -82,14 +87,14 @@ class Server:
             return
         self.planner.record_sent(data, received)
 
-    def _warn(self, data: bytes, sender: tuple[str, int]) -> None:
-        fault = read_request(data)
-        assert isinstance(fault, Fault)
-        if fault in self._reported:
+    def _warn(self, fault: Fault, sender: tuple[str, int]) -> None:
+        now = time.monotonic()
+        if now - self._printed.get(fault, -math.inf) < _REPEATED:
             return
-        self._reported.add(fault)
-        words = f"warning: a packet from {sender[0]}:{sender[1]} {SILENT[fault]}"
-        print(f"planner-jax: {words}; this is not repeated", file=sys.stderr, flush=True)
+        self._printed[fault] = now
+        words = f"warning: a packet from {sender[0]}:{sender[1]} {PRINTED[fault]}"
+        rule = f"such packets are not used; printed once in {_REPEATED:g} s"
+        print(f"planner-jax: {words}; {rule}", file=sys.stderr, flush=True)
 
     def close(self) -> None:
         """Close the socket, and end the planner's thread."""
