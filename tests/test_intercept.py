@@ -7,8 +7,8 @@ import pytest
 from derivatives import double
 
 import planner_jax as pj
+from planner_jax.benchmarks.compilation import record_programs
 from planner_jax.benchmarks.latency import begin_replans
-from planner_jax.cli.compilation import record_programs
 from planner_jax.optimise.levenberg import LevenbergConfig
 from planner_jax.robot.car import pose_at
 from planner_jax.robot.car_motion import Quadratic, by_unknowns, motion

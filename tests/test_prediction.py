@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from convergence import observed_order
 from derivatives import assert_gradient_matches_differences
+from planner_jax.ball.prediction_kernel import table_kernel
 from serve import DRAG, GRAVITY, assert_close, float64, serve
 
 from planner_jax.ball import prediction
 from planner_jax.ball.flight import BallState, drag_free_flight, rk4_step
-from planner_jax.ball.prediction_kernel import table_kernel
 
 HORIZON, NUM_NODES = 1.5, 13  # ten intervals of 0.15 s between time 0 and the horizon
 RESOLUTION = 0.15

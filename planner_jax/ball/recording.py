@@ -12,7 +12,7 @@ deviations and the correlation of neighbouring errors.
 import functools
 import math
 from collections.abc import Callable
-from dataclasses import astuple, dataclass
+from dataclasses import astuple, dataclass, fields
 from typing import Any, Self
 
 import numpy as np
@@ -30,7 +30,7 @@ from planner_jax.ball.recording_program import (
     unpack,
 )
 from planner_jax.core import GRAVITY
-from planner_jax.core.checks import require_number, shape_of
+from planner_jax.core.checks import numbers_of, require_number, shape_of
 from planner_jax.core.choices import require, require_one_of
 from planner_jax.core.errors import CaseError, format_value
 from planner_jax.core.rules import POSITIVE
@@ -65,9 +65,10 @@ class Ball:
     density: float = 0.01  # [m^2/s^3], power spectral density of accelerations not in the model
 
     def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            for each in np.atleast_1d(value):
-                require_number(name, float(each), POSITIVE)
+        for field in fields(self):
+            value = numbers_of(field.name, vars(self)[field.name], (), np.shape(field.default))
+            for each in value.flat:
+                require_number(field.name, each, POSITIVE)
 
     @classmethod
     def sphere(cls, mass: float, diameter: float, *, air: float = 1.2) -> Self:

@@ -51,7 +51,9 @@ def require_switch(name: str, value: object) -> None:
 
 def require_numbers(name: str, value: object) -> None:
     """Raise `ArgumentTypeError` unless an argument is a tuple of numbers."""
-    if not isinstance(value, tuple) or any(numeric(each) is None for each in value):
+    if not isinstance(value, tuple) or any(
+        (number := numeric(each)) is None or number.shape for each in value
+    ):
         raise ArgumentTypeError(name, "a tuple of numbers", value)
 
 
@@ -123,7 +125,7 @@ def floating(dtype: object) -> np.dtype:
     """Return `dtype` if it is a floating-point type that JAX has enabled, or raise an error."""
     try:
         kind = np.dtype(dtype)  # type: ignore[call-overload]
-    except TypeError:
+    except (TypeError, ValueError):
         kind = None
     if kind is None or not jnp.issubdtype(kind, np.floating):
         raise ArgumentTypeError("dtype", "a type of floating-point numbers", dtype)

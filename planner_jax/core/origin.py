@@ -53,6 +53,8 @@ def find_origin(
 
     By default it is the multiple of 100 m next to the first position `start`.
     """
+    if 0 in batch:
+        raise ArgumentError("cases", "at least one", shown=f"the batch shape {batch}")
     first = numbers_of("start", start, batch, (3,)).reshape(-1, 3)[0, :2].astype(np.float64)
     if origin is not None:
         first = numbers_of("origin", origin, (), (2,)).astype(np.float64)

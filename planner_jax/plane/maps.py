@@ -10,7 +10,13 @@ from pathlib import Path
 
 import numpy as np
 
-from planner_jax.core.checks import numbers_of, numeric, require_number
+from planner_jax.core.checks import (
+    numbers_of,
+    numeric,
+    require_number,
+    require_path_name,
+    require_switch,
+)
 from planner_jax.core.choices import require, require_one_of, require_size
 from planner_jax.core.errors import ArgumentError, ArgumentTypeError, PlannerJaxError
 from planner_jax.core.rules import FINITE, POSITIVE, Rule, within
@@ -178,6 +184,8 @@ def read_map(path: str | os.PathLike, *, unknown_is_free: bool = False) -> Occup
         MapError: a field is missing, unknown or invalid, or the image cannot be read.
         OSError: the YAML file cannot be read.
     """
+    require_path_name("path", path)
+    require_switch("unknown_is_free", unknown_is_free)
     place = Path(path)
     try:
         return _read_map(place, read_fields(place), unknown_is_free)

@@ -18,7 +18,9 @@ from numpy.typing import DTypeLike
 from scipy.spatial.transform import Rotation
 
 from planner_jax.core.arithmetic import host_leaf
+from planner_jax.core.checks import numbers_of, require_number, require_numeric
 from planner_jax.core.choices import require
+from planner_jax.core.rules import NOT_NEGATIVE, POSITIVE
 from planner_jax.referee import solids
 from planner_jax.robot.arm import Arm, ArmLimits
 from planner_jax.robot.arm_chain import BASE, DENSITY, OUTSIDE, ArmModel, Frame
@@ -60,9 +62,12 @@ class Shield:
         if not given:
             object.__setattr__(self, "half", (0.15, 0.15))
         if self.half is not None:
-            require(min(self.half) > 0.0, "shield.half", "> 0", self.half)
+            half = numbers_of("shield.half", self.half, (), (2,))
+            require(bool((half > 0.0).all()), "shield.half", "> 0", self.half)
         if self.radius is not None:
-            require(self.radius > 0.0, "shield.radius", "> 0", self.radius)
+            require_number("shield.radius", self.radius, POSITIVE)
+        numbers_of("shield.position", self.position, (), (3,))
+        turn = numbers_of("shield.turn", self.turn, (), (4,))
         corners = self.outline
         turns = corners[:, 0] + 1j * corners[:, 1]
         sides = np.roll(turns, -1) - turns
@@ -71,8 +76,8 @@ class Shield:
         is_convex = all(bool(np.all(x > 1e-9)) and np.sum(x) < 6.3 for x in angles)
         rule = "corners of a convex polygon around (0, 0), in their order"
         require(bool(is_convex), "shield.corners", rule, self.corners)
-        require(self.mass >= 0.0, "shield.mass", ">= 0", self.mass)
-        require(any(self.turn), "shield.turn", "a quaternion other than zero", self.turn)
+        require_number("shield.mass", self.mass, NOT_NEGATIVE)
+        require(bool(turn.any()), "shield.turn", "a quaternion other than zero", self.turn)
 
     @property
     def outline(self) -> np.ndarray:
@@ -82,7 +87,7 @@ class Shield:
         if self.radius is not None:
             angles = np.arange(_SIDES) * (2.0 * np.pi / _SIDES)
             return self.radius * np.stack([np.cos(angles), np.sin(angles)], axis=1)
-        corners = np.array(self.corners, float)
+        corners = np.array(require_numeric("shield.corners", self.corners), float)
         is_list = corners.ndim == 2 and corners.shape[1] == 2 and len(corners) > 2
         rule = "at least three corners (y, z)"
         is_sound = is_list and bool(np.isfinite(corners).all())

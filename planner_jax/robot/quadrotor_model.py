@@ -8,7 +8,7 @@ the plane of the propellers. SI units. This module imports no JAX.
 
 import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -184,8 +184,15 @@ class QuadrotorModel:
     drag: RotorDrag | None = None  # None: plans and simulated flights have no drag
 
     def __post_init__(self) -> None:
+        parts = {"rotors": Rotors, "tool": Tool, "limits": FlightLimits}
+        parts |= {} if self.drag is None else {"drag": RotorDrag}
+        for name, kind in parts.items():
+            if not isinstance(vars(self)[name], kind):
+                raise ArgumentTypeError(name, f"a {kind.__name__}", vars(self)[name])
         _require("mass", self.mass, *_POSITIVE)
-        require(np.shape(self.inertia) in ((3,), (6,)), "inertia", "3 or 6 numbers", self.inertia)
+        is_sequence = isinstance(self.inertia, Sequence | np.ndarray)
+        is_shaped = is_sequence and len(self.inertia) in (3, 6)
+        require(is_shaped, "inertia", "3 or 6 numbers", self.inertia)
         for k, axis in enumerate(self.inertia):
             _require("inertia", axis, *(_POSITIVE if k < 3 else _FINITE))
         moments = np.linalg.eigvalsh(self.inertia_matrix)

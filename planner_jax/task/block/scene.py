@@ -16,9 +16,10 @@ from scipy.spatial.transform import Rotation
 from planner_jax.ball.flight import BallState, drag_free_fall_time, drag_free_flight
 from planner_jax.core import rules
 from planner_jax.core.arithmetic import host_leaf
+from planner_jax.core.checks import numbers_of, require_number, require_switch
 from planner_jax.core.choices import require
 from planner_jax.core.errors import ArgumentError
-from planner_jax.core.rules import Field, Table
+from planner_jax.core.rules import POSITIVE, Field, Table
 from planner_jax.robot.capsule_fit import cover, enclosing_box, hull_of, measure_excess
 
 INNER_HALF, INNER_HEIGHT = 0.4, 1.35  # [m], half side and height of the protected box
@@ -123,7 +124,9 @@ def paper_scene(*, has_pole: bool = True, pole: Sequence[float] = POLE, size: fl
     stands at x and y `pole` [m], unless `has_pole` is false. All lengths are multiplied by `size`
     > 0, which suits arms with another reach than the authors' arm.
     """
-    require(size > 0.0, "size", "> 0", size)
+    require_number("size", size, POSITIVE)
+    require_switch("has_pole", has_pole)
+    x, y = numbers_of("pole", pole, (), (2,))
 
     def leaf(value: ArrayLike) -> Array:
         return host_leaf(size * np.asarray(value), np.float32)
@@ -138,7 +141,7 @@ def paper_scene(*, has_pole: bool = True, pole: Sequence[float] = POLE, size: fl
             pair[:, along] = -0.5 * RIG_LENGTH, 0.5 * RIG_LENGTH
             pair[:, 1 - along] = side
             ends.append(pair)
-    axis = size * np.array([[*pole, FLOOR], [*pole, POLE_TOP]])
+    axis = size * np.array([[x, y, FLOOR], [x, y, POLE_TOP]])
     rods = [(axis, size * (POLE_RADIUS if has_pole else ABSENT))]
     return Scene(
         inner=box(INNER_HALF, INNER_HEIGHT),

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from planner_jax.core.arithmetic import host_leaf
+from planner_jax.core.checks import require_path_name
 from planner_jax.core.errors import ArgumentError
 from planner_jax.host.yaml_files import read_fields
 from planner_jax.robot.arm import Arm
@@ -25,6 +26,7 @@ def read_scene(path: str | os.PathLike) -> Scene:
     Raises:
         ArgumentError: a field is unknown or wrong. The line names the file and the element.
     """
+    require_path_name("path", path)
     source, scene = os.fspath(path), {}
     for name, value in _fields("scene", source).items():
         if name in _SINGLE:

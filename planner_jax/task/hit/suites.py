@@ -74,6 +74,7 @@ def generate_serves(
     The `scenarios` are names in court.SCENARIOS, by default all.
     """
     require_draw(num, seed, first)
+    num, first = int(num), int(first)  # small integers of NumPy would overflow
     if not isinstance(scenarios, Sequence | None):
         raise ArgumentTypeError("scenarios", "a sequence of names", scenarios)
     names = court.SCENARIOS if scenarios is None else tuple(scenarios)
