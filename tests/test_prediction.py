@@ -139,37 +139,3 @@ def somewhere_on_the_path(point):
 def test_the_gradient_in_ball_drag_gravity_and_time_matches_finite_differences(position):
     point = (serve(), DRAG, GRAVITY, position * HORIZON / 2.0)
     assert_gradient_matches_differences(somewhere_on_the_path, point, step=1e-6, rtol=1e-6)
-
-
-def kernel_arguments(lanes=32):
-    random = np.random.default_rng(5)
-    pos, vel = random.uniform(-3.0, 3.0, (2, 3, lanes))
-    vel[:, 3] = 0.0  # a ball at rest
-    numbers = random.uniform(0.01, 0.1, lanes), random.uniform(0.0, 0.3, lanes)
-    return [jnp.asarray(x, jnp.float32) for x in (pos, vel, *numbers, np.full(lanes, 9.8))]
-
-
-def table_of_lane(nodes):
-    def table(pos, vel, step, drag, gravity):
-        ball = BallState(pos, vel)
-        path = prediction.predict_path(ball, step * (nodes - 3), drag, gravity, num_nodes=nodes)
-        return path.pos, path.vel
-
-    return table
-
-
-def test_the_kernel_gives_the_same_table():
-    args, nodes = kernel_arguments(), 12
-    found = table_kernel(nodes, interpret=True)(jax.tree.structure(args), args)
-    expected = jax.vmap(table_of_lane(nodes), in_axes=-1, out_axes=-1)(*args)
-    assert_close(tuple(found), expected, rtol=1e-5, atol=1e-5)
-
-
-@pytest.mark.slow
-def test_the_kernel_gives_the_same_derivatives_of_the_table():
-    args, nodes, moving = kernel_arguments(), 6, (1, 3)
-    args[1] = args[1].at[:, 3].set(1.0)
-    found = table_kernel(nodes, moving, interpret=True)(None, args)
-    slopes = jax.vmap(jax.jacrev(table_of_lane(nodes), argnums=moving), in_axes=-1, out_axes=-1)
-    expected = jax.tree.leaves(jax.jit(slopes)(*args))
-    assert_close(list(found), expected, rtol=1e-4, atol=1e-5)

@@ -1,8 +1,8 @@
 """The initial velocity with which a ball reaches a target in a specified time, and its apex.
 
 The planner of hits computes the ball's return with this module. Drag is K_D () [1/m], quadratic in
-the speed; gravity is a magnitude () [m/s^2]; positions are (3,) [m]. Custom rules differentiate the
-velocity and the apex by all arguments in forward mode, which stores no integration steps.
+the speed; gravity is a magnitude () [m/s^2]; positions are (3,) [m]. A custom rule differentiates
+the velocity by all arguments in forward mode, which stores no integration steps.
 """
 
 from collections.abc import Sequence
@@ -37,7 +37,7 @@ def aim_with_drag(
     """Return the initial velocity (3,) [m/s] with which a ball with quadratic drag meets a target.
 
     The ball starts at `pos` (3,) [m], and is at `target` after `flight_time` > 0 [s]; the drag is
-    K_D [1/m]. Two Newton steps from the drag-free velocity integrate the flight coarsely; two more
+    K_D [1/m]. Two Newton steps from a first guess integrate the flight coarsely; two more
     integrate it finely and reuse the last Jacobian. Derivatives are implicit.
     """
     return _aim(target - pos, jnp.asarray(flight_time), jnp.asarray(drag), jnp.asarray(gravity))
@@ -103,22 +103,4 @@ def apex_with_drag(ball: BallState, flight_time: Array, drag: Array, gravity: Ar
 
     A falling ball is highest at time 0.
     """
-    numbers = jnp.asarray(flight_time), jnp.asarray(drag), jnp.asarray(gravity)
-    return ball.pos[2] + _climb(ball.vel, *numbers)
-
-
-def _compute_climb(vel: Array, flight_time: Array, drag: Array, gravity: Array) -> Array:
-    return fly_out(vel, flight_time, drag, gravity, _FLIGHT_NODES).highest()
-
-
-_climb = jax.custom_jvp(_compute_climb)
-
-
-def _climb_jvp(primals: Sequence[Array], tangents: Sequence[Tangent]) -> tuple[Array, Array]:
-    moving = _changing(tangents)
-    slopes = jax.jacfwd(_compute_climb, moving)(*primals)
-    changes = [jnp.sum(slope * tangents[k]) for k, slope in zip(moving, slopes, strict=True)]
-    return _climb(*primals), sum(changes[1:], changes[0])
-
-
-_climb.defjvp(_climb_jvp, symbolic_zeros=True)
+    return ball.pos[2] + fly_out(ball.vel, flight_time, drag, gravity, _FLIGHT_NODES).highest()

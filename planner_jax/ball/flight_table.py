@@ -1,7 +1,7 @@
 """Tables of a ball's flight: states at times whose spacing grows as the ball slows down.
 
 Quadratic drag K_D slows a ball of initial speed v_0 down like 1 / (1 + K_D v_0 t). Equal steps of
-ln(1 + p t), with the pace p = K_D v_0 [1/s], therefore change the velocity by similar factors. The
+ln(1 + p t), with a pace p [1/s] near K_D v_0, therefore change the velocity by similar factors. The
 states are integrated at a fixed number of such times, and a quintic Hermite polynomial interpolates
 position, velocity and acceleration. The number of steps is fixed because reverse-mode derivatives
 need it; the times depend on the ball. World frame, z up, SI units.
@@ -31,10 +31,9 @@ SHORTEST = 0.01  # [s], least duration of a table; a ball on the ground lands at
 _LEAST_GROWTH = 1e-2  # of pace times duration; with less the times are equally spaced
 _SMALL = 1e-6  # smaller arguments of quotients such as atan(x) / x count as this number
 _ERROR = 1e-4  # [m], greatest error of a table that `is_resolved` permits
-_ERROR_UNIT = 5e-4  # error of a table, divided by the fourth power of its steps, times K_D
+_ERROR_UNIT = 3e-4  # error of a table, divided by the fourth power of its steps, times K_D
 _LASTING = 3.0  # time constants after which a falling ball has its terminal velocity
-# Greatest last steps, in time constants of the drag at terminal velocity, at which the integration
-# is stable with a factor 2 to spare, and in units of the rotation by lift [rad].
+# Greatest last steps: in time constants of the drag (then Runge-Kutta is stable), and by lift [rad]
 _LONGEST_STEP, _WIDEST_TURN = 4.0, 0.3
 
 
@@ -91,7 +90,7 @@ def longest_flight(ball: BallState, drag: Numbers, gravity: Numbers) -> Numbers:
     ends. For a fast horizontal motion, which slows the fall, 80 % more are added. Without drag the
     result is 1.1 times the exact time. `ball` has leaves (..., 3), the numbers shape (...).
     """
-    xp, speed = numpy_of(drag), _speed(ball)
+    xp, speed = numpy_of(ball.pos, ball.vel, drag, gravity), _speed(ball)
     rise, fall = xp.maximum(ball.vel[..., 2], 0.0), xp.maximum(-ball.vel[..., 2], 0.0)
     braked = xp.maximum(drag * speed * rise / gravity, _SMALL)
     root = xp.sqrt(braked)
@@ -115,8 +114,10 @@ def is_resolved(ball: BallState, drag: Numbers, gravity: Numbers, turn: Numbers 
     flights, with K_D up to 1,000 /m and speeds up to 1,000 m/s. `turn` (...) [1/s] is the rate at
     which lift turns the velocity.
     """
-    xp, horizon = numpy_of(drag), longest_flight(ball, drag, gravity)
-    growth = xp.maximum(drag * _speed(ball) * horizon, _LEAST_GROWTH)
+    horizon = longest_flight(ball, drag, gravity)
+    xp = numpy_of(horizon)
+    pace = pace_of(_speed(ball) ** 2, drag, gravity)
+    growth = xp.maximum(pace * horizon, _LEAST_GROWTH)
     share, rate = xp.log1p(growth) / (NODES - 1), xp.sqrt(gravity * drag)
     last = share * (horizon / growth + horizon)
     curved = share * (rate * horizon / growth + xp.minimum(rate * horizon, _LASTING))
@@ -129,16 +130,23 @@ def _speed(ball: BallState) -> Numbers:
     return numpy_of(ball.vel).sqrt((ball.vel * ball.vel).sum(axis=-1))
 
 
+def pace_of(squared_speed: Numbers, drag: Numbers, gravity: Numbers) -> Numbers:
+    """Return a rate (...) [1/s] at which drag and gravity change a velocity at first."""
+    return numpy_of(squared_speed, drag, gravity).sqrt(
+        drag * (drag * squared_speed + 0.25 * gravity)
+    )
+
+
 def graded_times(pace: Array, duration: Array, num: int) -> tuple[Array, Array]:
     """Return times (num,) [s] from 0 to the duration () [s], and their growth: pace * duration.
 
     Between two times ln(1 + pace t) grows equally. `pace` () [1/s] is a rate at which the velocity
-    changes at time 0. The times are constants in derivatives.
+    changes at time 0. The times are constant fractions of the duration in derivatives.
     """
     growth = lax.stop_gradient(jnp.maximum(pace * duration, _LEAST_GROWTH))
-    shares = jnp.asarray(np.arange(num) / (num - 1), growth.dtype)
-    unit = lax.stop_gradient(duration) / growth
-    return unit * jnp.expm1(shares * jnp.log1p(growth)), growth
+    equal = jnp.asarray(np.arange(num) / (num - 1), growth.dtype)
+    shares = jnp.expm1(equal * jnp.log1p(growth)) * reciprocal(growth)
+    return duration * lax.stop_gradient(shares), growth
 
 
 def integrate_at(
@@ -165,33 +173,28 @@ def tabulate_flight(ball: BallState, horizon: Array, drag: Array, gravity: Array
 
     The table is right to 0.1 mm where `is_resolved` holds. Its times are constants in derivatives.
     """
-    times, growth = graded_times(drag * _safe_speed(ball.vel), horizon, NODES)
+    pace = pace_of(jnp.sum(ball.vel**2), drag, gravity)
+    times, growth = graded_times(pace, lax.stop_gradient(horizon), NODES)
     pos, vel = _nodes(ball.pos, ball.vel, times, drag, gravity)
-    return table_of(pos, vel, times, growth, drag, gravity)
+    return _table_of(pos, vel, times, growth, drag, gravity)
 
 
 def fly_out(vel: Array, duration: Array, drag: Array, gravity: Array, num: int) -> FlightTable:
     """Return the table, of `num` states, of a flight from the origin in a duration () [s]."""
-    times, growth = graded_times(drag * _safe_speed(vel), duration, num)
+    times, growth = graded_times(pace_of(jnp.sum(vel**2), drag, gravity), duration, num)
     ball = BallState(jnp.zeros_like(vel), vel)
     nodes = integrate_at(lambda now, h: rk4_step(now, h, drag, gravity), ball, times, 1)
-    return table_of(nodes.pos, nodes.vel, times, growth, drag, gravity)
+    return _table_of(nodes.pos, nodes.vel, times, growth, drag, gravity)
 
 
-def table_of(
+def _table_of(
     pos: Array, vel: Array, times: Array, growth: Array, drag: Array, gravity: Array
 ) -> FlightTable:
     acc = jax.vmap(lambda each: ball_acceleration(each, drag, gravity))(vel)
     return FlightTable(pos, vel, acc, times, growth)
 
 
-def _safe_speed(vel: Array) -> Array:
-    return jnp.sqrt(jnp.maximum(jnp.sum(lax.stop_gradient(vel) ** 2), _SMALL))
-
-
-def _integrate(
-    pos: Array, vel: Array, times: Array, drag: Array, gravity: Array
-) -> tuple[Array, Array]:
+def _integrate(pos: Array, vel: Array, times: Array, drag: Array, gravity: Array) -> tuple:
     step = lambda now, h: rk4_step(now, h, drag, gravity)  # noqa: E731
     nodes = integrate_at(step, BallState(pos, vel), times, SUBSTEPS)
     return nodes.pos, nodes.vel
@@ -211,12 +214,10 @@ def _nodes_jvp(primals: tuple, tangents: tuple) -> tuple:
     changes = [jnp.zeros_like(leaf) for leaf in nodes]
     if 0 in moving:  # a displacement of the initial position displaces the whole path
         changes[0] = changes[0] + tangents[0][None]
-    further = tuple(k for k in moving if k not in (0, 2))  # the times are constants
-    if further:
+    if further := tuple(k for k in moving if k not in (0, 2)):  # the times are constants
         for k, by in enumerate(_slopes(further)(*primals)):
             for argument, slope in zip(further, by, strict=True):
-                change = tangents[argument]
-                scaled = slope * change if change.ndim == 0 else slope * change[None, None]
+                scaled = slope * tangents[argument]  # a velocity is on the slope's last axis
                 changes[k] = changes[k] + scaled.reshape(*nodes[k].shape, -1).sum(axis=-1)
     return nodes, tuple(changes)
 

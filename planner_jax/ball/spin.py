@@ -15,7 +15,7 @@ from jax import Array, lax
 from jaxtyping import PyTree
 
 from planner_jax.ball.flight import BallState, rk4_step
-from planner_jax.ball.flight_table import FlightTable, graded_times, integrate_at
+from planner_jax.ball.flight_table import FlightTable, graded_times, integrate_at, pace_of
 from planner_jax.core.arithmetic import at_least, components, reciprocal
 
 _LEAST_SPEED = 1e-3  # [m/s], smaller speeds count as this speed in divisions
@@ -75,8 +75,8 @@ def tabulate_spin(
     ball: SpinningBall, duration: Array, air: Surroundings, num: int, substeps: int
 ) -> FlightTable:
     """Return the table of a flight without bounces in a duration () [s], of `num` states."""
-    push = jnp.sqrt(at_least(jnp.sum((ball.vel - air.wind) ** 2), _LEAST_SPEED**2))
-    times, growth = graded_times(ball.drag * push, duration, num)
+    pace = pace_of(jnp.sum((ball.vel - air.wind) ** 2), ball.drag, air.gravity)
+    times, growth = graded_times(pace, duration, num)
     nodes = integrate_at(lambda now, h: spin_step(now, h, air), ball, times, substeps)
     acc = jax.vmap(lambda each: spin_acceleration(each, air))(nodes)
     return FlightTable(nodes.pos, nodes.vel, acc, times, growth)

@@ -28,7 +28,7 @@ def prepare_hit(case: HitCase) -> HitContext:
     The table extends until the ball has landed, by `longest_flight`.
     """
     if case.lift is None:
-        horizon = lax.stop_gradient(longest_flight(case.ball, case.drag, case.gravity))
+        horizon = longest_flight(case.ball, case.drag, case.gravity)
         path = tabulate_flight(case.ball, horizon, case.drag, case.gravity)
     else:
         from planner_jax.task.hit.spin import predict_spin
