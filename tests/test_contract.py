@@ -45,10 +45,9 @@ OF_THEIR_OWN = ("hit exact", "intercept spacetime")
 
 def assert_close(ours, theirs, tolerance=1e-3):
     np.testing.assert_array_equal(ours.status, theirs.status)
-    sizes = jax.tree.map(
-        lambda leaf: np.max(np.abs(leaf), initial=1e-3, where=np.isfinite(leaf)), theirs
-    )
-    ours, theirs = (jax.tree.map(np.divide, plans, sizes) for plans in (ours, theirs))
+    ours, theirs = (jax.tree.map(lambda x: np.asarray(x, float), tree) for tree in (ours, theirs))
+    sizes = jax.tree.map(lambda x: np.max(np.abs(x), initial=1e-3, where=np.isfinite(x)), theirs)
+    ours, theirs = (jax.tree.map(np.divide, tree, sizes) for tree in (ours, theirs))
     chex.assert_trees_all_close(ours, theirs, rtol=0.0, atol=tolerance)
 
 

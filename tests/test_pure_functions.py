@@ -52,8 +52,8 @@ def of_polynomial(coeffs, time):
 
 
 def after_parabola(a, b):  # of samples of a t - b t^2, which is greatest at t = a / (2 b)
-    nodes = jnp.asarray(NODES, a.dtype)
-    return penalty.greatest_by_parabolas(a * nodes - b * nodes**2, NODES)
+    nodes = NODES.astype(a.dtype)
+    return penalty.greatest_by_parabolas(jnp.asarray(a * nodes - b * nodes**2), nodes)
 
 
 def after_lines(height, slope):  # of a roof whose sides rise and fall by `slope`

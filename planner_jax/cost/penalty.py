@@ -54,7 +54,7 @@ def greatest_by_parabolas(values: Array, times: np.ndarray) -> Array:
     chex.assert_rank(values, 1)
     before, after = np.diff(times)[:-1], np.diff(times)[1:]
     rise = peak_above(values[:-2], values[1:-1], values[2:], before, after)
-    return jnp.max(values + jnp.pad(rise.astype(values.dtype), 1))
+    return jnp.max(values + jnp.pad(rise, 1))
 
 
 def peak_above(
