@@ -55,7 +55,7 @@ FLOODS = {
     "lies": Flood("lies about the ball", 95, lambda k, now: _ball(NUMBER, k, now)),
     "future": Flood("the ball, dated 0.9 s ahead", 5, lambda k, now: _ball(NUMBER, k, now, 0.9)),
     "robot": Flood("lies about the robot", 49, _robot),
-    "robot ahead": Flood("the robot, dated 0.99 s ahead", 20, lambda k, now: _robot(k, now, 0.99)),
+    "robot-ahead": Flood("the robot, dated 0.99 s ahead", 20, lambda k, now: _robot(k, now, 0.99)),
     "clock": Flood("another clock", 96, lambda k, now: _ball(98, k, now, 1000.0)),
 }
 

@@ -1,6 +1,6 @@
 """Measure `pj.ball.fit` on recorded flights of table-tennis balls: errors, intervals and time.
 
-    python -m benchmarks.recorded_flights --flights DIR [--half 0] [--batch 1000] [--out DIR]
+    python -m benchmarks.recorded_flights --flights DIR [--batch 1000] [--out DIR]
 
 Each folder in DIR is a collection of flights, and each of its CSV files is one flight, with rows of
 time [s], x, y and z [m], separated by commas or semicolons. Flights are cut into arcs at bounces,

@@ -216,6 +216,8 @@ class Soak:
             # it follows the setpoints in the answers.
             if answer is None or (state_now is None and known is None):
                 continue
+            if not len(answer.setpoints):  # the packet is refused
+                continue
             state_now = answer.setpoints[0, :9].astype(float).reshape(3, 3)
             planned = answer if answer.motion is Motion.PLAN else planned
             if planned is not None and time.monotonic() > planned.contact:

@@ -1,5 +1,6 @@
 """The live planner, which receives packets with observations and answers with setpoints."""
 
+import json
 import re
 import signal
 import socket
@@ -15,6 +16,8 @@ import numpy as np
 import pytest
 
 import planner_jax as pj
+from planner_jax.benchmarks import serve_floods
+from planner_jax.benchmarks.floods import FLOODS, NUMBER
 from planner_jax.benchmarks.serve_soak import distance_off
 from planner_jax.cli.main import main
 from planner_jax.live import planner as live_planner
@@ -192,6 +195,43 @@ def test_bad_packets_are_counted_by_name_without_an_effect(warm, path):
     assert abs(contacts[0] - contacts[1]) < 0.05
 
 
+def test_floods_from_other_addresses_do_not_change_the_setpoints(warm, path):
+    def disturb(step, data):
+        for name, flood in FLOODS.items():
+            rate = min(flood.rate, 2000) * STEP
+            for k in range(int(rate * step), int(rate * (step + 1))):
+                sender = (name, k) if flood.is_moving else name
+                answer = warm.answer(flood.make(k, throw.now), sender, throw.now)
+                refused.append(answer is not None and not len(read_answer(answer).setpoints))
+        return [data]
+
+    clean, refused = Throw(warm, path, NUMBER).fly(130), []
+    before = warm.report.faults.copy()
+    throw = Throw(warm, path, NUMBER, disturb)
+    flooded = throw.fly(130)
+    assert [answer.motion for answer in flooded] == [answer.motion for answer in clean]
+    positions = [first_column(answers, "pos") for answers in (clean, flooded)]
+    np.testing.assert_allclose(*positions, rtol=0, atol=2e-3)
+    found = warm.report.faults - before
+    assert {Fault.OTHER_CLOCK, Fault.OTHER_SENDER, Fault.CROWDED, Fault.NOT_FINITE} <= {*found}
+    assert sum(refused) <= 64 < 5000 < len(refused)  # 32 answers in each second
+
+
+def test_setpoints_are_dated_by_the_answered_request(warm):
+    throw = Throw(warm, None, 70)
+    throw.send(throw.packet(ROBOT, [*HOME, *[0.0] * 6]))
+    throw.now += 0.02
+    throw.send(throw.packet(BALL, HOME))
+    # Another sender's ball that is measured and sent 15 ms earlier, but arrives later.
+    sent = throw.now - 0.015
+    late = warm.answer(request(BALL, 1, sent, sent, (1.0, 1.0, 1.0), 71), "other", throw.now)
+    assert read_answer(late).begin == sent
+    # A sender whose clock is 15 ms ahead gets setpoints for the current time.
+    sent = throw.now + 0.015
+    early = warm.answer(request(BALL, 2, sent, sent, (1.0, 1.0, 1.0), 71), "other", throw.now)
+    assert read_answer(early).begin == pytest.approx(throw.now, abs=1e-6)
+
+
 def test_throws_are_caught_by_plans_with_recoveries(warm):
     random, before = np.random.default_rng(1), warm.report.counts.copy()
     for number in range(20, 24):
@@ -359,6 +399,36 @@ def test_foreign_packets_get_one_warning_a_kind_and_no_answer(server, capsys):
     start = "planner-jax: warning: a packet from 127.0.0.1:9 "
     assert [line.startswith(start) for line in lines] == [True] * 3
     assert "PJLV" in lines[0] and "length" in lines[1] and "version" in lines[2]
+
+
+def test_a_refused_client_is_printed_once_and_answered_without_setpoints(server, capsys):
+    server.planner._forget()
+    server.planner._arrivals.__init__()
+    now, state = time.perf_counter(), (*HOME, *[0.0] * 6)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as second:
+        second.bind(("127.0.0.1", 0))
+        for k in range(1, 5):
+            server._answer(request(ROBOT, k, 1.0 + k, 1.0 + k, state), ("127.0.0.1", 9), now + k)
+            server._answer(
+                request(ROBOT, k, 1.5 + k, 1.5 + k, state), second.getsockname(), now + k + 0.5
+            )
+        second.settimeout(1.0)
+        answer = read_answer(second.recv(2048))
+    assert answer.fault is Fault.OTHER_SENDER and not len(answer.setpoints)
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "belongs to another address" in line
+
+
+@pytest.mark.slow
+def test_all_throws_of_the_first_client_are_planned_during_floods(tmp_path, monkeypatch):
+    names = ["nan", "numbers", "ports", "lies", "future", "robot", "robot-ahead", "clock"]
+    words = ["--floods", ",".join(names), "--throws", "2", "--out", str(tmp_path / "run")]
+    monkeypatch.setattr(sys, "argv", ["serve_floods", *words])
+    serve_floods.main()
+    rows = json.loads((tmp_path / "run" / "rows.json").read_text())
+    assert [row["flood"] for row in rows] == ["none", *names]
+    for row in rows:
+        assert row["planned"] == row["thrown"] == 2 and row["step"] <= 0.05, row
 
 
 def test_a_robot_is_selected_by_name_and_must_carry_the_tool():

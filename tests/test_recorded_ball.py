@@ -201,6 +201,54 @@ def test_a_fit_through_an_observed_bounce_predicts_the_flight_after_it():
     assert np.sqrt(found.covariance[12, 12]) < 0.02
 
 
+@pytest.mark.parametrize(
+    "turn",
+    [
+        lambda p: p * [1.0, 1.0, -1.0],
+        lambda p: p[..., [0, 2, 1]],
+        lambda p: p[..., [2, 0, 1]] * [-1.0, 1.0, 1.0],
+    ],
+    ids=["z down", "y up", "x down"],
+)
+def test_recordings_in_another_frame_are_refused(turn):
+    times, seen, *_ = flights()
+    rule = "positions must be of (one|a) flight .*"
+    with pytest.raises(pj.CaseError, match=rule):
+        pj.ball.fit(times, turn(seen), ball=BALL)
+    seen[5] = turn(seen[5])  # a single wrong lane
+    with pytest.raises(pj.CaseError, match=f"{rule}in lane 5$"):
+        pj.ball.fit(times, seen, ball=BALL)
+
+
+@pytest.mark.slow
+def test_recordings_of_slow_balls_in_feet_are_refused():
+    times, seen, *_ = flights(noise=0.002, span=0.6)
+    with pytest.raises(pj.CaseError, match="one flight in one frame in metres") as caught:
+        pj.ball.fit(times, seen / 0.3048)
+    assert caught.value.more > 0.5 * LANES
+    pj.ball.fit(times, seen)
+
+
+@pytest.mark.slow
+def test_a_prediction_ends_at_the_bounce_after_the_last_simulated_one():
+    # A ball without drag falls from 0.5 m, and keeps 0.8 of its speed at each bounce.
+    speed, end, at = np.sqrt(9.81), 1.0 / np.sqrt(9.81), np.linspace(0.0, 0.6, 61)
+    later = at - end
+    height = np.where(later < 0.0, 0.5 - 4.905 * at**2, 0.8 * speed * later - 4.905 * later**2)
+    seen = np.stack([0.5 * at, 0.0 * at, height], axis=1)
+    seen += np.random.default_rng(0).normal(0.0, 5e-4, seen.shape)
+    ball = pj.ball.Ball(drag=1e-3, friction=(1e-3, 1e-3))
+    found = pj.ball.fit(at, seen, ball=ball, floor=0.0, noise=5e-4)
+    third = end + 2.0 * (0.8 + 0.64) * speed / 9.81
+    then = found.predict([third - 0.1, third + 0.1])
+    assert then.is_known.tolist() == [True, False]
+    assert np.isfinite(then.pos[0]).all() and np.isnan(then.interval(0.9)).all(axis=(0, 2))[1]
+    since = third - 0.1 - (end + 1.6 * speed / 9.81)
+    assert then.pos[0, 2] == pytest.approx(0.64 * speed * since - 4.905 * since**2, abs=0.03)
+    with pytest.raises(pj.ArgumentError, match="positions must be finite, got nan"):
+        pj.table_path([0.0, third + 0.1], found.predict([0.0, third + 0.1]).pos)
+
+
 def test_fit_refuses_what_is_no_recording_of_one_flight():
     times, seen, *_ = flights()
     t, p = times[0], seen[0]
@@ -222,7 +270,19 @@ def test_fit_refuses_what_is_no_recording_of_one_flight():
         pj.ball.fit(times, seen)
     with pytest.raises(pj.ArgumentError, match="ball must be one of unknown, table tennis"):
         pj.ball.fit(t, p, ball="golf")
-    with pytest.raises(pj.ArgumentError, match="times must be at or after the first one"):
-        pj.ball.fit(t, p).predict([-1.0])
+    found = pj.ball.fit(t, p)
+    for late, rule in (
+        (-1.0, "at or after the first one, got -1 s"),
+        (np.inf, "finite, got inf s"),
+        (np.nan, "finite, got nan s"),
+        (1e6, "at most .* s after the first one, got 1000000 s"),
+    ):
+        with pytest.raises(pj.ArgumentError, match=f"times must be {rule}"):
+            found.predict([0.3, late])
+    for floor in (2.0, 20.0):
+        with pytest.raises(pj.CaseError, match=f"floor must be below .* got {floor:g}"):
+            pj.ball.fit(t, p, floor=floor)
+    with pytest.raises(pj.ArgumentError, match="wind must be finite"):
+        pj.ball.fit(t, p, wind=(np.nan, 0.0, 0.0))
     with pytest.raises(pj.ArgumentError, match="mass must be finite and > 0"):
         pj.ball.Ball.sphere(0.0, 0.04)

@@ -43,7 +43,7 @@ _FRAMES = ((1.0, 3, -1), (1.0, 1, 1), (1.0, 1, -1), (1.0, 2, 1), (1.0, 2, -1), (
 # Ratio of errors to the assumed noise, and length of the lift vector in standard deviations, above
 # which other frames are compared.
 _DOUBT = 1.5
-_FAR_BETTER = 100.0  # Bayes factor for another frame, above which a recording is refused
+_FAR_BETTER = 20.0  # Bayes factor for another frame, above which a recording is refused
 
 
 @dataclass(frozen=True)
@@ -267,8 +267,8 @@ def fit(
     _require(verdict > 0.0, batch, "positions", rule)
     still = _pack(ball, (float(gravity), 0.0, 0.0, 0.0, float(noise)))
     rows[..., 1:] -= air * rows[..., :1]  # the flight beside an observer who moves with the air
-    explained = ~_is_turned(rows, fitted, program, still)
-    _require(explained, batch, "positions", "of one flight in one frame in metres with z up")
+    is_best = _compare_frames(rows, fitted, program, still) <= math.log(_FAR_BETTER)
+    _require(is_best, batch, "positions", "of one flight in one frame in metres with z up")
     start, origin = first[:, 0].reshape(batch), first[:, 1:].reshape((*batch, 3))
     freedom = (3.0 * counts - 9.0 + WEIGHT).reshape(batch)
     pos, drag, errors = state[..., :3] + origin, np.exp(state[..., 6]), np.sqrt(others[..., :2])
@@ -291,20 +291,21 @@ def _pad(rows: np.ndarray, lanes: int) -> np.ndarray:
     return padded
 
 
-def _is_turned(
+def _compare_frames(
     rows: np.ndarray, fitted: np.ndarray, program: Callable, numbers: np.ndarray
 ) -> np.ndarray:
-    """Test whether flights in another frame explain recordings (B, N, 4) far better.
+    """Return log Bayes factors (B,) of the best other frame of recordings (B, N, 4).
 
-    Each frame is a hypothesis, and the ratio of two probabilities of a recording is the Bayes
-    factor, by Laplace's method. Recordings with small errors and small lift need no comparison.
+    The Bayes factor is the ratio of the probabilities of a recording, by Laplace's method.
+    Recordings with small errors and a small lift need no comparison, and get -inf.
     """
     others = unpack(fitted[: len(rows)].astype(np.float64))[2]
     is_clear = (others[:, 0] <= (_DOUBT * numbers[17]) ** 2) & (others[:, 6] <= _DOUBT)
     doubtful = np.flatnonzero(~is_clear)
+    others = others[doubtful]
     gains = np.full(len(rows), -np.inf)
     if not doubtful.size:
-        return gains > 0.0
+        return gains
     padded, below = _pad(rows[doubtful], len(fitted)), np.full(len(fitted), -1e6, np.float32)
     count = 3.0 * np.isfinite(rows[doubtful, :, 0]).sum(axis=-1)
     for unit, axis, sign in _FRAMES:
@@ -313,11 +314,13 @@ def _is_turned(
         turned[..., 3] *= sign
         found = np.asarray(program(turned, below, numbers), np.float64)[: doubtful.size]
         overlap, fits, likely = np.moveaxis(unpack(found)[2][:, -3:], -1, 0)
-        # Densities of positions, and of the initial position and velocity, are per unit.
-        gain = overlap * (fits - others[doubtful, -2] + count * math.log(unit))
-        gain += likely - others[doubtful, -1] - 6.0 * math.log(unit)
+        fits = fits - others[:, 8] + count * math.log(unit)  # densities are per unit
+        # Only independent errors count in favour of a frame, but all of them against it. Position
+        # and velocity at the start have six unknowns.
+        gain = np.minimum(fits, overlap * fits) + likely - others[:, 9]
+        gain += 3.0 * np.log(overlap / others[:, 7]) - 6.0 * math.log(unit)
         gains[doubtful] = np.fmax(gains[doubtful], gain)
-    return gains > math.log(_FAR_BETTER)
+    return gains
 
 
 def _require(

@@ -178,9 +178,13 @@ def estimate(rows: Array, floor: Array, numbers: Array, counts: tuple[int, int])
             factor = jax.scipy.linalg.cho_factor(normal * jnp.outer(unit, unit))
             covariance = jax.scipy.linalg.cho_solve(factor, jnp.diag(unit)) * unit[:, None]
             change = covariance @ (errors @ matrix - prior @ known)
-            # Volume of the unknowns that the rows leave, by Laplace's method.
-            volume = jnp.sum(jnp.log(unit)) - jnp.sum(jnp.log(jnp.diag(factor[0])))
             left = (errors - matrix @ change).reshape(-1, 3)
+            # Log likelihood of the rows, and volume of the unknowns (Laplace's method).
+            squares = jnp.sum(left * left, axis=1) / (weight * overlap)
+            each = 0.5 * (_TAIL + 3.0) * jnp.log1p(squares / _TAIL) + 0.5 * jnp.log(variance)
+            each = jnp.where(present, each + jnp.log(scales[0]), 0.0)
+            fits = -jnp.sum(each) - 0.5 * WEIGHT * (jnp.log(scales[0]) + noise**2 / scales[0])
+            volume = jnp.sum(jnp.log(unit)) - jnp.sum(jnp.log(jnp.diag(factor[0])))
             ahead = jnp.sum(left * direction[..., 0], axis=1) ** 2
             # Numbers of unknowns that all errors, and errors along the path, determine.
             spent = free - jnp.sum(prior * covariance)
@@ -198,7 +202,7 @@ def estimate(rows: Array, floor: Array, numbers: Array, counts: tuple[int, int])
             )
             scales = jnp.stack([across, jnp.maximum(variance - across, 0.0) / mean_squared])
             far = jnp.sum(present & (distance > _FAR), dtype=num.dtype) / num
-            return (change, scales, (1.0 - alike) / (1.0 + alike)), (covariance, far, volume)
+            return (change, scales, (1.0 - alike) / (1.0 + alike)), (covariance, far, fits, volume)
 
         begun = (jnp.zeros_like(state[:free]), *weights)
         (change, *weights), found = lax.scan(weigh, begun, None, length=_WEIGHINGS)
@@ -206,7 +210,7 @@ def estimate(rows: Array, floor: Array, numbers: Array, counts: tuple[int, int])
 
     scales = jnp.stack([jnp.maximum(0.6 * error, noise**2), jnp.zeros_like(noise)])
     begun = state, scales, jnp.ones_like(noise)
-    (state, scales, overlap), (covariance, far, volume) = lax.scan(
+    (state, scales, overlap), (covariance, far, fits, volume) = lax.scan(
         linearise, begun, None, length=_ROUNDS[counts[0] > 0 or not is_short]
     )
     size = jnp.linalg.norm(scaled @ state[7:10])
@@ -220,21 +224,11 @@ def estimate(rows: Array, floor: Array, numbers: Array, counts: tuple[int, int])
     sound &= jnp.isfinite(jnp.sum(covariance)) & (far[-1] <= _MOST_OUTLIERS)
     # Spin that the prior excludes leaves smooth errors; another frame leaves errors that alternate.
     verdict = jnp.where(sound, 1.0, jnp.where(overlap < 0.5, -1.0, 0.0)).astype(rows.dtype)
-    # Log likelihood by Student's t distribution, and by the assumed noise; log prior probability.
-    pos, (_, vel) = _positions(state, *others)
-    squared = at_least(jnp.sum(vel * vel, axis=1), 1e-6)
-    ahead = jnp.sum((seen - pos) * vel, axis=1) ** 2 / squared
-    beside, variance = jnp.sum((seen - pos) ** 2, axis=1) - ahead, scales[0] + scales[1] * squared
-    distance = beside / scales[0] + ahead / variance
-    each = jnp.log(scales[0]) + 0.5 * jnp.log(variance)
-    each += 0.5 * (_TAIL + 3.0) * jnp.log1p(distance / _TAIL)
-    assumed = 0.5 * WEIGHT * (jnp.log(scales[0]) + noise**2 / scales[0])
-    fits = -jnp.sum(jnp.where(present, each, 0.0)) - assumed
     known = (state - jnp.concatenate([jnp.zeros(6), means])).at[:6].set(0.0)[:free]
     likely = volume[-1] - 0.5 * known @ prior @ known - jnp.sum(jnp.log(spreads))
     scales = scales.at[1].add(state[10] ** 2 * delay)
     results = jnp.stack(
-        [*scales, last, floor, far[-1], verdict, size, overlap, fits, likely]
+        [*scales, last, floor, far[-1], verdict, size, overlap, fits[-1], likely]
     ).astype(rows.dtype)
     return jnp.concatenate([state, covariance.reshape(-1), results])
 
