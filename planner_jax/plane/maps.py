@@ -28,6 +28,8 @@ _SHARE = within(0.0, 1.0, "from 0 to 1")
 _MOST_PIXELS = 1 << 24  # greatest number of pixels of a map, as 4096 x 4096
 _MOST_NUMBERS = 1 << 20  # greatest number of pixels of a PGM file in text (P2)
 _HEADER = 1 << 12  # [B] in which the header of a PGM file ends, with its comments
+_NUMBER = rb"\s+(?:#[^\r\n]*[\r\n]\s*)*\d+"  # of the header, after comments
+_PGM = re.compile(rb"P(?:[14](?:%b){2}|[2356](?:%b){3})\s" % (_NUMBER, _NUMBER))
 MOST_WALLS = 10_000  # greatest number of rectangles that cover a grid
 
 
@@ -233,12 +235,12 @@ def _read_image(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     most, bombs = _MOST_PIXELS, (Image.DecompressionBombError, Image.DecompressionBombWarning)
     try:
         with open_plain(path) as file, warnings.catch_warnings(action="error", category=bombs[1]):
-            # Pillow skips comments byte by byte, and reads texts (P2) slowly.
+            # Pillow skips comments byte by byte, and reads texts (P1 to P3) slowly.
             start = file.read(_HEADER)
-            if start.startswith((b"P2", b"P5")):
-                if not re.match(rb"P[25](?:\s+(?:#[^\r\n]*[\r\n]\s*)*\d+){3}\s", start):
+            if start.startswith(b"P"):
+                if not _PGM.match(start):
                     raise ValueError(f"its header is incomplete or longer than {_HEADER} bytes")
-                most = _MOST_NUMBERS if start.startswith(b"P2") else most
+                most = _MOST_NUMBERS if start[1:2] in b"123" else most
             file.seek(0)
             with Image.open(file, formats=("PPM", "PNG")) as image:
                 if math.prod(image.size) > most:
