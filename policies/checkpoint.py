@@ -116,7 +116,7 @@ def _require_weights(arrays: dict[str, np.ndarray], network: Any, name: str) -> 
     except (TypeError, ValueError) as error:
         shown = f"{' '.join(str(error).split())[:100]} in {name!r}"
         raise ArgumentError("checkpoint", "of a network that exists", shown=shown) from None
-    expected = traverse_util.flatten_dict(shapes, sep="/")
+    expected: Any = traverse_util.flatten_dict(shapes, sep="/")
     for key in sorted(expected.keys() ^ arrays.keys()):
         verb = "hold" if key in expected else "not hold"
         raise ArgumentError("checkpoint", f"the weight {key:.60}", name, verb=verb)

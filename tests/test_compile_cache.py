@@ -26,13 +26,7 @@ jax.jit(lambda x: x + 3)(1.0)
 print(pj.keep_compiled_programs(), "/jax/compilation_cache/cache_hits" in hits)
 """
 
-# Options of the compressor and contents: several blocks, one block, a run of equal bytes, nothing.
-FRAMES = (
-    ({}, np.random.default_rng(1).bytes(300_000)),
-    ({"write_checksum": True}, b"short"),
-    ({"write_content_size": False}, bytes(100_000)),
-    ({}, b""),
-)
+CONTENTS = (np.random.default_rng(1).bytes(300_000), b"short", bytes(100_000))
 
 
 def run(**environment):
@@ -66,13 +60,17 @@ def test_without_a_cache_because_of_a_switch_or_its_folder_a_process_goes_on(tmp
     assert run(XDG_CACHE_HOME=str(tmp_path / "file")) == "None False"
 
 
-def test_programs_that_were_used_least_recently_are_deleted(tmp_path):
+def test_programs_that_were_used_least_recently_are_deleted(tmp_path, monkeypatch):
+    monkeypatch.setattr(compile_cache, "LIMIT", 250)
     for age, name in enumerate(("new", "middle", "old", "oldest")):
         (tmp_path / name).write_bytes(bytes(100))
         os.utime(tmp_path / name, times=(1e9 - age, 1e9 - age))
-    compile_cache._tidy(tmp_path, 250)
+    compile_cache._tidy(tmp_path)
+    assert len(list(tmp_path.iterdir())) == 5, "a folder of the user has no limit"
+    monkeypatch.setattr(compile_cache, "cache_folder", lambda: tmp_path)
+    compile_cache._tidy(tmp_path)
     assert {path.name for path in tmp_path.iterdir()} == {"new", "middle", "checked"}
-    compile_cache._tidy(tmp_path / "missing", 250)
+    compile_cache._tidy(tmp_path / "missing")
 
 
 def damage(path, content):
@@ -82,10 +80,9 @@ def damage(path, content):
 
 
 def test_programs_that_are_not_whole_are_deleted_and_no_other_files(tmp_path):
-    wholes = [zstandard.ZstdCompressor(**options).compress(data) for options, data in FRAMES]
-    cuts = [whole[:size] for whole in wholes for size in (0, 3, 4, 5, 8, len(whole) - 1)]
-    cuts += [wholes[0][: len(wholes[0]) // 2], wholes[0] + b"more"]
-    kept = [*wholes, zlib.compress(b"of JAX without Zstandard")]
+    compressors = (zstandard.ZstdCompressor().compress, zlib.compress)
+    kept = [compress(content) for compress in compressors for content in CONTENTS]
+    cuts = [whole[:size] for whole in kept for size in (0, 3, 8, len(whole) // 2, len(whole) - 1)]
     for number, each in enumerate((*cuts, *kept)):
         damage(tmp_path / f"jit_f-{number:02d}-cache", each)
     (tmp_path / "jit_f-written-cache").write_bytes(b"")  # by another process, at this moment

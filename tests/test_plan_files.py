@@ -1,6 +1,7 @@
 """Files of plans: written whole, read bit for bit, and rejected in one line if damaged."""
 
 import json
+import struct
 import zipfile
 
 import jax
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 
 import planner_jax as pj
+from planner_jax.core import plan_files
 from planner_jax.core.plan_files import PlanFileError
 from planner_jax.robot.quadrotor import QuadrotorPlan
 from tests.trees import assert_same
@@ -137,6 +139,35 @@ def test_a_missing_field_and_an_unknown_array_are_named(path, name):
     assert_rejected(path, "path must not hold wind, got")
     rewrite(path, lambda arrays: arrays.pop(name))
     assert_rejected(path, f"path must hold {name}, got")
+
+
+def test_arrays_and_files_above_a_size_are_neither_written_nor_decoded(plans, path, monkeypatch):
+    large = plans.replace(cost=np.zeros(1 << 20, np.float32))
+    before = path.read_bytes()
+    with path.open("wb") as file:
+        header = np.array(json.dumps({"version": 1, "class": "HitPlan"}))
+        np.savez_compressed(file, header=header, cost=large.cost)
+    assert path.stat().st_size < 1 << 14
+    monkeypatch.setattr(plan_files, "LARGEST", 1 << 21)
+    assert_rejected(path, r"whole file of plans, got .*its arrays are larger than 2097152 bytes")
+    with pytest.raises(
+        pj.ArgumentError, match="^plans must be of at most 1048576 bytes; save parts"
+    ):
+        large.save(path.with_name("large"))
+    monkeypatch.setattr(plan_files, "LARGEST", 1 << 10)
+    path.write_bytes(before)
+    assert_rejected(path, r"whole file of plans, got .*it is larger than 1024 bytes")
+
+
+def test_a_directory_of_millions_of_members_is_not_read(path):
+    content = path.read_bytes()
+    start, end = content.index(b"PK\1\2"), content.index(b"PK\5\6")
+    entries = 2_000_000 * (end - start)
+    for second in (b"", struct.pack("<LLQL", 0x07064B50, 0, start, 1)):  # a hidden directory
+        size = entries if not second else 9
+        last = struct.pack("<4s4H2LH", b"PK\5\6", 0, 0, 9, 9, size, start, 0)
+        path.write_bytes(content[:end] + second + last)
+        assert_rejected(path, f"{DAMAGED} .*BadZipFile")
 
 
 class Trap:

@@ -36,7 +36,6 @@ from jaxtyping import PyTree
 
 from planner_jax.core.compiled import Options, Treedef, trace_for
 from planner_jax.host.compile_cache import is_on
-from planner_jax.host.files import read_plain
 
 _LEAF, _NONE = map(jax.tree.structure, (0, None))
 MOST = 300  # number of stored programs above which the oldest are deleted; each has about 0.5 MB
@@ -201,7 +200,7 @@ def _export(function: Wrapped, layout: Layout, platform: str) -> bytes:
 
 def _read(path: Path, results: Results) -> bytes | None:
     try:
-        head, _, content = read_plain(path).partition(b"\n")
+        head, _, content = path.read_bytes().partition(b"\n")
         described = json.loads(head)
         if described["sha256"] != hashlib.sha256(content).hexdigest():
             return None

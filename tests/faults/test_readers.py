@@ -3,6 +3,7 @@
 import json
 import os
 import shutil
+import socket
 import uuid
 import zlib
 
@@ -11,6 +12,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from planner_jax.core.errors import ArgumentError
+from planner_jax.host.files import read_plain
 from planner_jax.runs.manifest import parse_object
 from planner_jax.runs.run_folder import LOCK, RunFolder
 from planner_jax.sweep.hit.sweep import HitSweep
@@ -166,6 +168,22 @@ def test_a_pipe_in_the_place_of_the_lock_is_not_waited_for(tmp_path):
     os.mkfifo(tmp_path / ".lock")
     with pytest.raises(ArgumentError, match="out must be a folder that can be written"):
         RunFolder(tmp_path).require_new()
+
+
+def test_only_regular_files_of_a_bounded_size_are_opened(tmp_path):
+    plain, link = tmp_path / "plain", tmp_path / "link"
+    plain.write_bytes(b"four")
+    link.symlink_to(plain)
+    assert read_plain(link, 4) == b"four"
+    for path in (plain, "/proc/self/status"):  # files of /proc have no size before they are read
+        with pytest.raises(OSError, match="it is larger than 3 bytes"):
+            read_plain(path, 3)
+    os.mkfifo(tmp_path / "pipe")
+    with socket.socket(socket.AF_UNIX) as bound:
+        bound.bind(str(tmp_path / "socket"))
+        for path in (tmp_path, tmp_path / "pipe", tmp_path / "socket", "/dev/zero"):
+            with pytest.raises(OSError):
+                read_plain(path)
 
 
 @pytest.mark.parametrize("make", ["symlink_to", "hardlink_to", "write_bytes"])

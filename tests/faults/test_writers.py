@@ -60,7 +60,7 @@ def test_a_sweep_killed_before_any_of_its_writes_is_resumed_to_the_same_rows(
 def test_a_folder_without_its_first_manifest_is_new(runs, tmp_path, monkeypatch):
     out = tmp_path / "run"
     out.mkdir()
-    (out / LOCK).write_text("{")  # left by a killed process
+    (out / LOCK).write_text("4711 on host, since 2026-01-01T00:00:00+00:00")  # of a killed process
     (out / ".4711.tmp.manifest.json").write_text("{")
     start_sweep(TASK, SETTINGS, out, progress=False)
     assert rows_of(out) == rows_of(runs / "whole")
