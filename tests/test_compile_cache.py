@@ -62,14 +62,16 @@ def test_without_a_cache_because_of_a_switch_or_its_folder_a_process_goes_on(tmp
 
 def test_programs_that_were_used_least_recently_are_deleted(tmp_path, monkeypatch):
     monkeypatch.setattr(compile_cache, "LIMIT", 250)
-    for age, name in enumerate(("new", "middle", "old", "oldest")):
-        (tmp_path / name).write_bytes(bytes(100))
+    content = zlib.compress(np.random.default_rng(0).bytes(89))
+    assert len(content) == 100
+    for age, name in enumerate(("new-cache", "middle-cache", "old-cache", "oldest-cache")):
+        (tmp_path / name).write_bytes(content)
         os.utime(tmp_path / name, times=(1e9 - age, 1e9 - age))
     compile_cache._tidy(tmp_path)
     assert len(list(tmp_path.iterdir())) == 5, "a folder of the user has no limit"
     monkeypatch.setattr(compile_cache, "cache_folder", lambda: tmp_path)
     compile_cache._tidy(tmp_path)
-    assert {path.name for path in tmp_path.iterdir()} == {"new", "middle", "checked"}
+    assert {path.name for path in tmp_path.iterdir()} == {"new-cache", "middle-cache", "checked"}
     compile_cache._tidy(tmp_path / "missing")
 
 
@@ -99,6 +101,7 @@ def test_a_program_that_is_cut_is_compiled_and_stored_again(tmp_path):
     assert run(**chosen) == f"{tmp_path} False"
     for path in tmp_path.glob("*-cache"):
         damage(path, path.read_bytes()[:-9])
+    os.utime(tmp_path / "checked", (0.0, 0.0))  # the time of the last check
     assert [run(**chosen) for _ in range(2)] == [f"{tmp_path} False", f"{tmp_path} True"]
 
 

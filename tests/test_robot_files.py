@@ -4,6 +4,7 @@ import copy
 import dataclasses
 import json
 import math
+import os
 import re
 from pathlib import Path
 
@@ -232,7 +233,7 @@ XML = (DATA / "quadrotor.xml").read_text()
         ('ctrllimited="true"', 'ctrllimited="false"', "actuator 1 must have a ctrlrange"),
         ("0.1 2.25", "-1 2.25", "ctrlrange must be the same for all rotors"),
         ("<general", '<general biastype="affine" biasprm="1 0 0"', "actuator 1 must have a fixed"),
-        ("</mujoco>", "", "must be MJCF, "),
+        ("</mujoco>", "", "the model must be accepted by MuJoCo: no XML"),
     ],
 )
 def test_mjcf_of_something_else_is_refused_in_one_line(old, new, rule, tmp_path):
@@ -300,6 +301,36 @@ def test_a_model_with_products_of_inertia_and_missing_pictures_is_read(tmp_path)
     place.write_text(place.read_text().replace('<geom mass="0"/>', ""))
     with pytest.raises(RobotError, match="mine.xml: must be MJCF, Error.*hull.obj"):
         pj.read_robot(place, tool=TOOL, limits=LIMITS)
+
+
+@pytest.mark.parametrize("name", ["none/hull.obj", "none/skin.png", "part.xml", "mine.xml"])
+def test_a_pipe_in_the_place_of_a_file_of_a_model_is_not_waited_for(tmp_path, name):
+    (tmp_path / "none").mkdir()
+    (tmp_path / "mine.xml").write_text(
+        PICTURED.format(arms='<include file="part.xml"/>', motors="")
+    )
+    (tmp_path / "part.xml").write_text("<mujocoinclude/>")
+    (tmp_path / name).unlink(missing_ok=True)
+    os.mkfifo(tmp_path / name)
+    with pytest.raises(
+        (RobotError, OSError), match=f"plain file.*{name}|{name}.*plain file"
+    ) as error:
+        pj.read_robot(tmp_path / "mine.xml", tool=TOOL, limits=LIMITS)
+    assert "\n" not in str(error.value)
+
+
+def test_a_model_that_needs_much_memory_is_refused_in_one_line(tmp_path):
+    place = tmp_path / "mine.xml"
+    for asset, rule in (
+        ('<hfield name="a" nrow="40000" ncol="40000" size="1 1 1 1"/>', "element hfield must have"),
+        ('<replicate count="20000000"><geom/></replicate>', "the model must have at most 20000"),
+        ('<include file="mine.xml"/>', ".*mine.xml"),
+        ('<include file="gone.xml"/>', 'include "gone.xml" must have the file'),
+    ):
+        place.write_text(f"<mujoco><asset>{asset}</asset></mujoco>")
+        with pytest.raises(RobotError, match=f"^{place}: {rule}") as error:
+            pj.read_robot(place, tool=TOOL, limits=LIMITS)
+        assert "\n" not in str(error.value)
 
 
 def test_a_model_of_one_thrust_and_three_moments_needs_the_rotors_diagonal(tmp_path):

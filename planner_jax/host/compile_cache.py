@@ -65,9 +65,7 @@ def _tidy(folder: Path) -> None:
     checked = folder / "checked"  # its time of change is the time of the last check
     with contextlib.suppress(OSError):  # the folder is read-only, or another process deletes files
         last = checked.stat().st_mtime if checked.exists() else 0.0
-        files = [
-            (each.path, each.stat()) for each in os.scandir(folder) if each.name[-6:] == "-cache"
-        ]
+        files = [(str(each), each.stat()) for each in folder.glob("*-cache")]
         checked.touch()
         excess = sum(stat.st_size for _, stat in files) - LIMIT if folder == cache_folder() else 0
         for path, stat in sorted(files, key=lambda file: max(file[1].st_atime, file[1].st_mtime)):

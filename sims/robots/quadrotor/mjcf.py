@@ -9,6 +9,8 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from planner_jax.core.errors import ArgumentError
+from planner_jax.robot.arm_text import ArmText
 from planner_jax.robot.quadrotor_file import RobotError, Value
 from planner_jax.robot.quadrotor_model import COUNTS
 
@@ -31,6 +33,8 @@ def describe_mjcf(path: Path, over: Mapping[str, Value]) -> dict[str, Value]:
     """
     try:
         model = _compile(path)
+    except ArgumentError as error:
+        raise RobotError(str(error.with_names({"arm": str(path)}))) from None
     except ValueError as error:
         raise RobotError(f"{path}: must be MJCF, {' '.join(str(error).split())}") from None
     data = mujoco.MjData(model)
@@ -63,7 +67,9 @@ def describe_mjcf(path: Path, over: Mapping[str, Value]) -> dict[str, Value]:
 
 def _compile(path: Path) -> _Mj:
     """Compile a model without meshes and pictures that do not matter, whose files may miss."""
-    spec, kinds = mujoco.MjSpec.from_file(str(path)), mujoco.mjtInertiaFromGeom
+    source, kinds = ArmText(path), mujoco.mjtInertiaFromGeom
+    spec = mujoco.MjSpec.from_string(source.text, include=source.includes)
+    spec.modelfiledir = str(path.absolute().parent)
     for each in (*spec.geoms, *spec.sites):
         each.material = ""
     for geom in spec.geoms:
