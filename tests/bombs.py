@@ -211,8 +211,8 @@ ROADS = Kind(read_commonroad, write_text("a.xml", (DATA / "commonroad.xml").read
 PLAN_HEADER = '{"version": 1, "class": "QuadrotorPlan"}'
 BOMBS: dict[str, tuple[Kind, Callable[[Path], Path]]] = {
     "YAML of 20,000 keys": (ROBOT, write_text("b.yaml", write_keys(20_000))),
-    "YAML of 7,000 keys": (ROBOT, write_text("b.yaml", write_keys(7_000))),
-    "YAML of a long list": (ROBOT, write_text("b.yaml", "a: [" + "1," * 32_000 + "]")),
+    "YAML of 5,000 keys": (ROBOT, write_text("b.yaml", write_keys(5_000))),
+    "YAML of a long list": (ROBOT, write_text("b.yaml", "a: [" + "1," * 24_000 + "]")),
     "sparse YAML": (ROBOT, write_sparse("b.yaml", b"a: 1\n")),
     "plan of zeros": (PLAN, write_archive("header", PLAN_HEADER)),
     "plan of two million members": (PLAN, write_members),

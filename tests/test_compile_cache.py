@@ -62,16 +62,17 @@ def test_without_a_cache_because_of_a_switch_or_its_folder_a_process_goes_on(tmp
 
 def test_programs_that_were_used_least_recently_are_deleted(tmp_path, monkeypatch):
     monkeypatch.setattr(compile_cache, "LIMIT", 250)
-    content = zlib.compress(np.random.default_rng(0).bytes(89))
+    content, own = zlib.compress(np.random.default_rng(0).bytes(89)), tmp_path / "own"
     assert len(content) == 100
-    for age, name in enumerate(("new-cache", "middle-cache", "old-cache", "oldest-cache")):
-        (tmp_path / name).write_bytes(content)
-        os.utime(tmp_path / name, times=(1e9 - age, 1e9 - age))
-    compile_cache._tidy(tmp_path)
-    assert len(list(tmp_path.iterdir())) == 5, "a folder of the user has no limit"
-    monkeypatch.setattr(compile_cache, "cache_folder", lambda: tmp_path)
-    compile_cache._tidy(tmp_path)
-    assert {path.name for path in tmp_path.iterdir()} == {"new-cache", "middle-cache", "checked"}
+    monkeypatch.setattr(compile_cache, "cache_folder", lambda: own)
+    for folder in (own, tmp_path / "other"):
+        folder.mkdir()
+        for age, name in enumerate(("new-cache", "middle-cache", "old-cache", "oldest-cache")):
+            (folder / name).write_bytes(content)
+            os.utime(folder / name, times=(1e9 - age, 1e9 - age))
+        compile_cache._tidy(folder)
+    assert {path.name for path in own.iterdir()} == {"new-cache", "middle-cache", "checked"}
+    assert len(list(folder.iterdir())) == 5, "a folder of the user has no limit"
     compile_cache._tidy(tmp_path / "missing")
 
 

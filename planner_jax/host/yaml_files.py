@@ -8,7 +8,7 @@ import yaml
 
 from planner_jax.host.files import read_plain
 
-LARGEST = 1 << 16  # [B] greatest size of a file
+LARGEST = 3 << 14  # [B] greatest size of a file
 
 Value = Any  # a field's value: text, number, list of texts and numbers, dictionary, or None
 
