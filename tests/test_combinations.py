@@ -34,6 +34,13 @@ def test_an_option_that_a_task_lacks_is_refused_by_the_same_line(tmp_path, monke
     assert faults_of(firsts.values()) == []
 
 
+def test_a_plan_without_a_search_is_made_and_judged(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (row,) = [each for each in TABLE["plan hit"] if each.words[-1] == "juggle"]
+    quick = row._replace(words=(*row.words, "--recovery", "none"), must=RUNS)
+    assert faults_of([quick]) == []
+
+
 def test_a_new_task_or_suite_is_in_the_table(monkeypatch):
     planners = {"first": "planner_jax.baselines.hit.juggle:JuggleHit"}
     new = Task("meet", "robots meet", "no_module", planners, {"still": "S.", "fast": "F."})

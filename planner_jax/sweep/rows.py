@@ -38,7 +38,7 @@ def read_plan(folder: RunFolder, row: int | None) -> tuple[Plan, str]:
         shown = "nothing" if row is None else row
         raise ArgumentError("row", f"from 0 to {last}", shown=str(shown))
     if sweep.plan_of_row is None:
-        rule = "a sweep of a task whose rows are read back as plans"
+        rule = "a file of plan.save, as rows of this task are not read back as plans"
         raise ArgumentError(folder.name, rule, shown=f"a {sweep.kind}")
     with folder.reading_rows():
         (found,) = folder.plans.pick([row])
