@@ -2,9 +2,11 @@
 
 import re
 
+import numpy as np
 import pytest
 
 from planner_jax.baselines.protocols import BY_ROW, PUBLISHED
+from planner_jax.benchmarks.hit_agreement import kappa
 from planner_jax.task.hit import court
 from tests.citations import read_words
 from tests.tracked import ROOT, tracked_files
@@ -86,3 +88,11 @@ def test_numbers_are_printed_with_their_sign_spread_and_unit():
         ("Natarajan2024", "Table II", "RRT-Connect joint 2"): "130.2 ± 49 N m",
     }
     assert {key: str(BY_ROW[key]) for key in printed} == printed
+
+
+def test_kappa_is_one_for_equal_outcomes_and_zero_for_independent_ones():
+    one, other = np.array([True, True, False, False]), np.array([True, False, True, False])
+    assert kappa(one, one) == 1.0 and kappa(one, other) == 0.0 and kappa(one, ~one) == -1.0
+    # Both succeed on 2 of 5 cases, and on 1 case together: 3 of 5 agree, 13 of 25 by chance.
+    few = np.array([[1, 1, 0, 0, 0], [1, 0, 1, 0, 0]], bool)
+    assert kappa(*few) == pytest.approx((3 / 5 - 13 / 25) / (1 - 13 / 25))
