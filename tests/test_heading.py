@@ -142,6 +142,25 @@ def test_rotors_agree_with_the_referee_and_slow_the_yaw_down():
 
 
 @float64
+def test_rotors_keep_their_limits_where_the_recovery_begins():
+    """Let the snap, and with it a rotor's thrust, rise steeply up to the end of the first piece."""
+    case, plan = case_of(([0.0, 2.0], [0.4, 3.0]), rotors=True), plan_of()
+    coeffs, end = np.zeros((2, 16, 3)), 1.1007
+    coeffs[0, 15, 0] = 60.0 / 32760.0 / end**11
+    first, then = (
+        PiecewisePolynomial(coeffs[k : k + 1], np.array([time])) for k, time in ((0, end), (1, 0.9))
+    )
+    plan = plan.replace(trajectory=first, recovery=then)
+    flown = [sampled(first, np.array([end]), order) for order in (2, 3, 4)]
+    rotors = case.limits.rotors
+    most = np.max(rotor_thrusts(*flown, plan.gravity, rotors))
+    tight = rotors.replace(max_thrust=np.array(most * 1.0002))
+    heading = planned(plan, case.replace(limits=case.limits.replace(rotors=tight)))
+    turn = [evaluate(heading, np.array(end), order) for order in range(3)]
+    assert np.max(rotor_thrusts(*flown, plan.gravity, rotors, None, tuple(turn))) <= most * 1.0005
+
+
+@float64
 def test_the_referee_names_headings_that_start_elsewhere_jump_or_turn_too_fast():
     case, plan = case_of(([0.0, 0.5], [0.3, 1.5])), plan_of()
     heading = planned(plan, case)

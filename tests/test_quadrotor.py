@@ -9,8 +9,11 @@ from derivatives import assert_gradient_matches_differences
 from flown_plans import matrices
 
 import planner_jax as pj
+from planner_jax.cost.quadrotor import overturn_excess
 from planner_jax.robot import quadrotor
+from planner_jax.robot.attitude import tilt_quaternion
 from planner_jax.runs.timing import CompileClock
+from planner_jax.trajectory.polynomial import PiecewisePolynomial
 
 GRAVITY = 9.81
 UP = np.array([0.0, 0.0, 1.0])
@@ -19,6 +22,7 @@ FIELDS = ("pos", "vel", "acc", "jerk", "quat_wxyz", "body_rate", "thrust")
 
 float64 = pytest.mark.usefixtures("float64")
 
+tilt, overturn = jax.jit(tilt_quaternion), jax.jit(overturn_excess)
 rate_squared = jax.jit(quadrotor.body_rate_squared)
 axis = jax.jit(quadrotor.body_z)
 basis = jax.jit(jax.vmap(quadrotor.tangent_basis))
@@ -262,3 +266,30 @@ def test_setpoints_of_a_planned_hit_begin_at_the_head_and_end_at_the_impact():
     np.testing.assert_allclose(found.pos[0], case.head_state[0], atol=1e-5)
     assert plan.stroke.time - 2e-3 < found.time[-1] <= plan.stroke.time + 1e-6
     np.testing.assert_allclose(found.thrust[0], case.gravity, rtol=1e-5)
+
+
+@pytest.mark.parametrize("attitude", [(0, 1, 0, 0), (0, 0.6, 0.8, 0), (0, -1, 0, 0)])
+def test_a_start_exactly_upside_down_is_sampled_with_its_given_attitude(attitude):
+    case = pj.hit.case((4, 0.5, 2), (-7, 0, 6), (3, 0, 0), start_attitude=attitude)
+    acc = np.asarray(case.head_state)[2]
+    np.testing.assert_allclose(acc, [0.0, 0.0, -2.0 * case.gravity], atol=1e-4)
+    found = np.asarray(tilt(acc, case.gravity))
+    np.testing.assert_allclose(found * np.sign(found @ attitude), attitude, atol=1e-5)
+
+
+@float64
+def test_a_passage_near_upside_down_between_samples_exceeds_the_limit_of_the_body_rate():
+    """Let the thrust pass the downward vertical at the distance 1e-3 rad, at 0.5 rad/s."""
+    acc, jerk = np.array([0.01, -1.85, -10.0 - GRAVITY]), np.array([0.0, 5.0, 0.0])
+    limits = pj.hit.draw(1, dtype=np.float64)
+    limits = jax.tree.map(lambda leaf: leaf[0], limits).limits
+
+    def found(acc):
+        coeffs = np.zeros((1, 8, 3))
+        coeffs[0, 2:4] = acc / 2.0, jerk / 6.0
+        return overturn(PiecewisePolynomial(coeffs, np.ones(1)), GRAVITY, limits)
+
+    exact = np.sqrt(rate_squared(acc + 0.37 * jerk, jerk, GRAVITY))
+    assert exact == pytest.approx(1000.0, rel=1e-3)
+    assert found(acc) == pytest.approx(exact / limits.body_rate - 1.0, rel=1e-2)
+    assert found(acc * [1.0, 1.0, 0.0]) == found(acc + [60.0, 0.0, 0.0]) == -1.0
