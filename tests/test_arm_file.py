@@ -652,7 +652,7 @@ def test_a_disc_and_a_triangle_have_the_inertia_of_their_outlines(folder, six):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"radius": 0.0}, "shield.radius must be > 0, got 0"),
+        ({"radius": 0.0}, "shield.radius must be finite and > 0, got 0"),
         (
             {"radius": 0.1, "half": (0.1, 0.1)},
             "the shield must be described by one of half, radius",

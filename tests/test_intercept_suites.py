@@ -293,8 +293,8 @@ def test_observations_are_positions_of_the_target_with_noise():
     ("options", "message"),
     [
         ({"count": 0}, "count must be >= 1, got 0"),
-        ({"interval": 0.0}, "interval must be > 0, got 0"),
-        ({"until": -1.0}, "until must be >= 0, got -1"),
+        ({"interval": 0.0}, "interval must be finite and > 0, got 0"),
+        ({"until": -1.0}, "until must be finite and >= 0, got -1"),
     ],
 )
 def test_bad_arguments_of_observations_are_named_in_one_line(options, message):

@@ -215,7 +215,7 @@ TWO = np.stack([SEEN, np.full_like(SEEN, np.nan)])
         ((TIMES, SEEN[:0]), r"times must be"),
         ((TIMES[:0], SEEN[:0]), "positions must be of at least one observation, got none"),
         ((TIMES, SEEN + np.inf), "positions must be finite, or NaN if absent, got inf"),
-        ((TIMES, SEEN, 0.0), "noise must be > 0 and finite, got 0"),
+        ((TIMES, SEEN, 0.0), "noise must be finite and > 0, got 0"),
     ],
 )
 def test_wrong_arguments_are_named(arguments, message):
@@ -226,7 +226,7 @@ def test_wrong_arguments_are_named(arguments, message):
 def test_times_and_shares_out_of_range_are_named():
     with pytest.raises(ArgumentError, match="now must be finite, got nan"):
         predict(TIMES, SEEN, now=np.nan)
-    with pytest.raises(ArgumentError, match="speed must be > 0 and finite, got 0"):
+    with pytest.raises(ArgumentError, match="speed must be finite and > 0, got 0"):
         predict(TIMES, SEEN, speed=0.0)
     with pytest.raises(ArgumentError, match="share must be > 0 and < 1, got 1"):
         predict(TIMES, SEEN).radius(1.0, share=1.0)

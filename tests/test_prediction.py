@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from convergence import observed_order
 from derivatives import assert_gradient_matches_differences
-from planner_jax.ball.prediction_kernel import table_kernel
 from serve import DRAG, GRAVITY, assert_close, float64, serve
 
 from planner_jax.ball import prediction

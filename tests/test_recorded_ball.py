@@ -4,11 +4,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from planner_jax.cli.compilation import record_programs
 
 import planner_jax as pj
 from planner_jax.ball import spin
 from planner_jax.ball.spin import SpinningBall, Surroundings
+from planner_jax.benchmarks.compilation import record_programs
 
 NUM, LANES = 20, 64  # Observations and recordings: all fits share two compiled programs.
 spin_flight = jax.jit(spin.spin_flight, static_argnames=("bounces", "steps"))

@@ -238,6 +238,11 @@ def case(
     shift = _find_origin(start, tolerance, origin, dtype)
 
     leaf = functools.partial(array_of, batch=batch, dtype=dtype)
+
+    def corner(name: str, value: ArrayLike) -> np.ndarray:
+        both = value if shape_of(name, value) else np.full(2, value, np.float64)
+        return numbers_of(name, both, batch, (2,)).astype(np.float64) - shift
+
     is_bare = require_path("target", target, batch, 2)
     is_free = end_heading is None
     around = leaf("heading_tolerance", heading_tolerance)
@@ -265,8 +270,8 @@ def case(
         heading_tolerance=jnp.full_like(around, np.pi) if is_free else around,
         walls=moved("walls", walls),
         movers=moved("movers", movers, **movement),
-        lower=leaf("lower", numbers_of("lower", lower, batch, (2,)) - shift, 2),
-        upper=leaf("upper", numbers_of("upper", upper, batch, (2,)) - shift, 2),
+        lower=leaf("lower", corner("lower", lower), 2),
+        upper=leaf("upper", corner("upper", upper), 2),
         body=CarBody(*map(leaf, _BODY, body)),
         limits=CarLimits(**{name: leaf(name, value) for name, value in limits.items()}),
         region=_make_region(region, batch, dtype),
