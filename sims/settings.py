@@ -210,7 +210,7 @@ class CatchFly(BallFly):
         Raises:
             ArgumentError: the file of the policy `decide` cannot be read.
         """
-        from planner_jax.task.arguments import find_decision
+        from planner_jax.task.decisions import find_decision
 
         find_decision(DECISIONS, self.decide, TRAINED)
         return super().flight()

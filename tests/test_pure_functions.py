@@ -24,6 +24,7 @@ from planner_jax.ball.estimation import (
     solve_definite,
 )
 from planner_jax.ball.flight import BallState
+from planner_jax.ball.linear_drag import linear_drag_flight
 from planner_jax.cost import penalty
 from planner_jax.plane.target import PolynomialPath, TurningPath
 
@@ -73,7 +74,7 @@ ROWS = {
         lambda vel: flight.ball_acceleration(vel, DRAG, GRAVITY), (VEL,), DOWN - DRAG * 13.0 * VEL
     ),
     "linear drag": Row(
-        lambda pos, vel: flight.linear_drag_flight(BallState(pos, vel), TIME, DRAG, GRAVITY),
+        lambda pos, vel: linear_drag_flight(BallState(pos, vel), TIME, DRAG, GRAVITY),
         (POS, VEL),
         BallState(
             POS + (VEL - DOWN / DRAG) * (1.0 - DECAY) / DRAG + DOWN / DRAG * TIME,

@@ -11,6 +11,7 @@ from planner_jax.ball.aim import aim_with_drag, apex_with_drag
 from planner_jax.ball.flight import BallState, solve_impact
 from planner_jax.core.protocol import is_solved
 from planner_jax.referee import hit as referee
+from planner_jax.referee.return_flight import return_in_air
 from planner_jax.referee.spin import rub_ball
 from planner_jax.task.hit.spin import meet_spin, predict_spin
 from tests.trees import as_numpy
@@ -66,7 +67,7 @@ def test_the_referee_returns_the_ball_to_the_target_with_and_without_slip_at_the
     slides = np.linalg.norm(rub) > 0.999 * of.around.friction * push[0]
     assert slides == bool(options)
     state = np.concatenate([BALL.pos, after])[:, None]
-    top, _, landing, time = referee.return_in_air(state, np.zeros(1), air)
+    top, _, landing, time = return_in_air(state, np.zeros(1), air)
     np.testing.assert_allclose(landing[:, 0], of.target, atol=1e-3)
     assert time[0] == pytest.approx(TIME, abs=1e-3) and top[0] == pytest.approx(apex, abs=1e-3)
 

@@ -11,7 +11,8 @@ from flax import struct
 from jax import Array, lax
 from jaxtyping import Float
 
-from planner_jax.ball.flight import BallState, linear_drag_flight
+from planner_jax.ball.flight import BallState
+from planner_jax.ball.linear_drag import linear_drag_flight
 
 # A flight model, such as `rk4_step`: a function (ball, duration, drag, gravity) -> ball.
 Flight = Callable[[BallState, Array, Array, Array], BallState]

@@ -12,7 +12,8 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
-from planner_jax.ball.flight import BallState, linear_drag_flight
+from planner_jax.ball.flight import BallState
+from planner_jax.ball.linear_drag import linear_drag_flight
 from planner_jax.core.rules import NOT_NEGATIVE, Field, Table
 
 

@@ -3,14 +3,13 @@
 import dataclasses
 import enum
 import os
-from collections.abc import Callable
 from typing import Protocol, Self, TypeVar, runtime_checkable
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jax import Array, lax
+from jax import Array
 from jaxtyping import PyTree
 
 from planner_jax.core.arithmetic import Numbers, numpy_of
@@ -343,21 +342,3 @@ def index_of_best(plans: PyTree, cost: PyTree = None) -> PyTree:
     by_cost = xp.where(good, plans.cost if cost is None else cost, xp.inf)
     by_violation = xp.where(finite, plans.violation, xp.inf)
     return xp.where(good.any(axis=0), by_cost, by_violation).argmin(axis=0)
-
-
-def select_first_solved(plan_of: Callable[[Array], PlanT], num: Array | int, best: PlanT) -> PlanT:
-    """Return the first solved plan in a sequence of plans of one case, or else the best; pure.
-
-    `plan_of` makes the plan at a position () int32 below `num`. If the existing plan `best` is
-    solved already, no other plan is made.
-    """
-
-    def next_one(state: tuple[Array, PlanT]) -> tuple[Array, PlanT]:
-        position, best = state
-        return position + 1, select(plan_of(position), best)
-
-    def is_open(state: tuple[Array, PlanT]) -> Array:
-        position, best = state
-        return (position < num) & ~is_solved(best.status)
-
-    return lax.while_loop(is_open, next_one, (jnp.zeros((), jnp.int32), best))[1]

@@ -18,7 +18,8 @@ from jax.typing import ArrayLike
 from jaxtyping import Float, PyTree
 
 from planner_jax.ball.estimation import Flight
-from planner_jax.ball.flight import BallState, linear_drag_flight, rk4_step
+from planner_jax.ball.flight import BallState, rk4_step
+from planner_jax.ball.linear_drag import linear_drag_flight
 from planner_jax.ball.target import BallPath
 from planner_jax.core import GRAVITY
 from planner_jax.optimise.planner import OptimisedPlanner

@@ -39,8 +39,6 @@ _SPIN_SHAPES = {"lift": (3,), "around.wind": (3,)}
 _SPIN_SHAPES |= {"around.friction": (), "around.grip": (), "around.reach": ()}
 
 _INCOMING_STEPS = 60  # number of Runge-Kutta steps of the ball's flight up to the impact
-# [s] Step and greatest duration of the integrated flight of the ball after the impact.
-_OUTGOING_STEP, _LONGEST_FLIGHT = 0.01, 20.0
 RIM = 0.9  # fraction of the racket's radius within which the ball must meet the racket
 
 
@@ -134,7 +132,7 @@ def _judge(
     return judging.first_failures(tests | impact_tests, LIMITS, finite) | measured | at_impact
 
 
-def _ball_acc(vel: np.ndarray, air) -> np.ndarray:
+def ball_acc(vel: np.ndarray, air) -> np.ndarray:
     """Return the accelerations g - K_D |v| v of balls; `air` has rows K_D and g, or also spin."""
     if len(air) > 2:
         from planner_jax.referee.spin import spin_acc  # the spin of few balls is known
@@ -148,60 +146,12 @@ def _ball_acc(vel: np.ndarray, air) -> np.ndarray:
 def ball_step(state: np.ndarray, step: np.ndarray, air) -> np.ndarray:
     """Return the states (6, ...) of balls after one Runge-Kutta step of order 4."""
     half, vel = 0.5 * step, state[3:]
-    acc_1 = _ball_acc(vel, air)
-    acc_2 = _ball_acc(vel + half * acc_1, air)
-    acc_3 = _ball_acc(vel + half * acc_2, air)
-    acc_4 = _ball_acc(vel + step * acc_3, air)
+    acc_1 = ball_acc(vel, air)
+    acc_2 = ball_acc(vel + half * acc_1, air)
+    acc_3 = ball_acc(vel + half * acc_2, air)
+    acc_4 = ball_acc(vel + step * acc_3, air)
     pos = state[:3] + step * vel + step**2 / 6.0 * (acc_1 + acc_2 + acc_3)
     return np.concatenate([pos, vel + step / 6.0 * (acc_1 + 2.0 * (acc_2 + acc_3) + acc_4)])
-
-
-def _step_down_to(state, entry: int, level, air) -> tuple[np.ndarray, np.ndarray]:
-    """Find the time (B,) [s] within a step at which height or vertical speed falls to `level`.
-
-    `entry` is 2 for the height and 5 for the vertical speed in the states (6, B) of B balls. Also
-    returns the states then. Newton's method starts at the end of the step, so that it converges to
-    the last crossing.
-    """
-    step = np.full(state.shape[1], _OUTGOING_STEP)
-    for _ in range(6):
-        ahead = ball_step(state, step, air)
-        slope = np.concatenate([ahead[3:], _ball_acc(ahead[3:], air)])[entry]
-        step = np.clip(step - (ahead[entry] - level) / slope, 0.0, _OUTGOING_STEP)
-    return step, ball_step(state, step, air)
-
-
-def return_in_air(state, height, air) -> tuple:
-    """Integrate the flights of B balls in `air` until they fall to `height` (B,) [m].
-
-    Returns the greatest heights (B,) [m] and their times, and the points (3, B) at which the balls
-    fall to `height` and their times. Times [s] count from `state`, the start of the flights.
-    """
-    before_top, before_end, state = state.copy(), state.copy(), state.copy()
-    top_time, end_time = np.zeros_like(height), np.zeros_like(height)
-    flying = np.arange(len(height))
-    for i in range(round(_LONGEST_FLIGHT / _OUTGOING_STEP)):
-        now = state[:, flying]
-        step = np.full(len(flying), _OUTGOING_STEP)
-        ahead = ball_step(now, step, air[:, flying])
-        rising = now[5] > 0.0
-        before_top[:, flying[rising]] = now[:, rising]
-        top_time[flying[rising]] = i * _OUTGOING_STEP
-        before_end[:, flying], end_time[flying] = now, i * _OUTGOING_STEP
-        state[:, flying] = ahead
-        aloft = (ahead[5] >= 0.0) | (ahead[2] >= height[flying])
-        flying = flying[aloft & np.isfinite(ahead[2])]
-        if not flying.size:
-            break
-    step, top = _step_down_to(before_top, 5, 0.0, air)
-    rises = before_top[5] > 0.0
-    apex = np.where(rises, top[2], before_top[2])
-    apex_time = np.where(rises, top_time + step, 0.0)
-    step, end = _step_down_to(before_end, 2, height, air)
-    down = apex >= height
-    down[flying] = False
-    landing = np.where(down, end[:3], np.nan)
-    return apex, apex_time, landing, np.where(down, end_time + step, np.nan)
 
 
 def _return_in_vacuum(state, height, gravity) -> tuple:
@@ -245,6 +195,8 @@ def _judge_impact(case: dict, drag_after_impact: bool, tolerances: dict) -> tupl
         after[3:] += rub
     target = case["target"].T
     if drag_after_impact or spins:
+        from planner_jax.referee.return_flight import return_in_air  # else in closed form
+
         returned = return_in_air(after, target[2], air)
     else:
         returned = _return_in_vacuum(after, target[2], case["gravity"])

@@ -12,7 +12,8 @@ import functools
 import numpy as np
 
 from planner_jax.referee import judging, quadrotor
-from planner_jax.referee.hit import RIM, ball_step, return_in_air
+from planner_jax.referee.hit import RIM, ball_step
+from planner_jax.referee.return_flight import return_in_air
 
 _SENTENCES = {
     "not finite": judging.NOT_FINITE,

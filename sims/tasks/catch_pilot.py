@@ -16,12 +16,12 @@ from planner_jax.planning.replan import Replanning
 from planner_jax.robot.heading import continue_heading
 from planner_jax.sims.loop_state import Outlook, shapes_of_plans
 from planner_jax.sims.scoring import passage
-from planner_jax.task.arguments import find_decision
 from planner_jax.task.catch.case import CatchCase
 from planner_jax.task.catch.default_planner import ExactCatch
 from planner_jax.task.catch.plan import CatchPlan
 from planner_jax.task.catch.replan import ReplanCatch
 from planner_jax.task.catch.spec import DECISIONS, TRAINED
+from planner_jax.task.decisions import find_decision
 
 _TABLE_NODES = 36  # number of nodes at which a ball's predicted trajectory is tabulated
 BORNE = 0.1  # greatest relative violation of a limit by a plan that is flown

@@ -6,16 +6,17 @@ the ball and touches nothing.
 """
 
 import dataclasses
+from collections.abc import Callable
 from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
+from jax import Array, lax
 
 from planner_jax.baselines.parts.bang_bang import bang_bang
 from planner_jax.core.planner import Planner
-from planner_jax.core.protocol import Attempt, require_settings, select_first_solved, status_of
+from planner_jax.core.protocol import Attempt, is_solved, require_settings, select, status_of
 from planner_jax.robot.arm_dynamics import measure_torques
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.clearance import least_clearances
@@ -49,6 +50,26 @@ def poses_in_time(case: BlockCase, points: int) -> tuple[EndPoses, Array]:
 
 
 @jax.tree_util.register_static
+def select_first_solved(
+    plan_of: Callable[[Array], BlockPlan], num: Array | int, best: BlockPlan
+) -> BlockPlan:
+    """Return the first solved plan in a sequence of plans of one case, or else the best; pure.
+
+    `plan_of` makes the plan at a position () int32 below `num`. If the existing plan `best` is
+    solved already, no other plan is made.
+    """
+
+    def next_one(state: tuple[Array, BlockPlan]) -> tuple[Array, BlockPlan]:
+        position, best = state
+        return position + 1, select(plan_of(position), best)
+
+    def is_open(state: tuple[Array, BlockPlan]) -> Array:
+        position, best = state
+        return (position < num) & ~is_solved(best.status)
+
+    return lax.while_loop(is_open, next_one, (jnp.zeros((), jnp.int32), best))[1]
+
+
 @dataclasses.dataclass(frozen=True)
 class DirectBlock(Planner):
     """The planner `direct`: bang-bang joint motions to end poses; the cost is the duration [s]."""

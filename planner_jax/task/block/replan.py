@@ -16,7 +16,8 @@ from numpy.typing import ArrayLike
 
 from planner_jax.ball.flight import BallState, drag_free_flight
 from planner_jax.core.arithmetic import host_leaf
-from planner_jax.core.checks import require_beginning, require_kind
+from planner_jax.core.checks import require_kind
+from planner_jax.core.paths import require_beginning
 from planner_jax.core.planner import Drive, Planner
 from planner_jax.core.protocol import Attempt, is_unsolved
 from planner_jax.optimise.levenberg import LevenbergConfig

@@ -11,10 +11,11 @@ from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import Decision
 from planner_jax.planning.decided import DecidedPlanner
 from planner_jax.referee.catch import CatchVerdict, referee_catches
-from planner_jax.task.arguments import find_decision, judge_by
+from planner_jax.task.arguments import judge_by
 from planner_jax.task.catch.case import CatchCase
 from planner_jax.task.catch.plan import CatchPlan
 from planner_jax.task.catch.spec import DECISIONS, TASK, TRAINED
+from planner_jax.task.decisions import find_decision
 
 _HALF_STEP = 1e-4  # [s], half the interval of the central differences that estimate velocities
 

@@ -15,9 +15,10 @@ from jaxtyping import PyTree
 from planner_jax.ball.target import TargetPath
 from planner_jax.core import GRAVITY
 from planner_jax.core.arithmetic import Numbers
-from planner_jax.core.checks import floating, require_path, require_switch, shape_of
+from planner_jax.core.checks import floating, require_switch, shape_of
 from planner_jax.core.errors import ArgumentError, ArgumentTypeError
 from planner_jax.core.origin import NEAR, Located, find_origin, move
+from planner_jax.core.paths import require_path
 from planner_jax.core.rules import PERMUTATION, POSITIVE, Field, Rule, Table, require_sound, within
 from planner_jax.cost.extras import Extra, for_batch
 from planner_jax.robot.quadrotor import QuadrotorLimits

@@ -19,11 +19,11 @@ from jax.typing import ArrayLike
 from planner_jax.core.checks import require_kind
 from planner_jax.core.choices import require
 from planner_jax.core.protocol import Status, is_unsolved, require_settings
-from planner_jax.task.arguments import require_orders
 from planner_jax.task.catch import estimate
 from planner_jax.task.catch.case import CatchCase, CatchChoice
 from planner_jax.task.catch.estimate import Timetable, timetable
 from planner_jax.task.catch.plan import CatchPlan
+from planner_jax.task.decisions import require_orders
 
 LENGTHS = 3  # number of variants of each order of optional targets, with ever fewer catches
 MOST_PERMUTED = 6  # greatest number of targets for which all orders are estimated

@@ -15,7 +15,7 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from planner_jax.ball.target import TargetPath
-from planner_jax.core.checks import require_path
+from planner_jax.core.paths import require_path
 from planner_jax.optimise.chain_remainder import evaluate_pieces, fit_offsets
 from planner_jax.optimise.planner import OptimisedPlanner
 from planner_jax.optimise.settings import Evaluation, LbfgsConfig, Round

@@ -4,7 +4,8 @@ from planner_jax.core.protocol import Decision
 from planner_jax.planning.decided import DecidedPlanner
 from planner_jax.referee.intercept import InterceptVerdict, referee_intercepts
 from planner_jax.referee.intercept_group import referee_groups
-from planner_jax.task.arguments import find_decision, judge_by, require_settings
+from planner_jax.task.arguments import judge_by, require_settings
+from planner_jax.task.decisions import find_decision
 from planner_jax.task.group.case import InterceptGroup
 from planner_jax.task.group.plan import GroupPlan
 from planner_jax.task.group.spec import DECISIONS, TASK

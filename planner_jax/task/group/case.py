@@ -10,8 +10,9 @@ from flax import struct
 from jax import Array
 from numpy.typing import ArrayLike
 
-from planner_jax.core.checks import numeric, require_path, shape_of
+from planner_jax.core.checks import numeric, shape_of
 from planner_jax.core.errors import ArgumentError
+from planner_jax.core.paths import require_path
 from planner_jax.core.rules import PERMUTATION, Field, Table
 from planner_jax.plane.obstacles import move_on
 from planner_jax.plane.target import LaterPath, PlanePath

@@ -10,8 +10,9 @@ from jax import Array
 from jax.typing import DTypeLike
 from jaxtyping import Float
 
-from planner_jax.core.checks import require_kind, require_number, require_path
+from planner_jax.core.checks import require_kind, require_number
 from planner_jax.core.choices import require_size
+from planner_jax.core.paths import require_path
 from planner_jax.core.planner import Planner
 from planner_jax.core.registry import suite_named
 from planner_jax.core.rules import NOT_NEGATIVE, POSITIVE

@@ -15,14 +15,9 @@ from numpy.typing import ArrayLike
 
 from planner_jax.ball.prediction import PathTable
 from planner_jax.core import rules
-from planner_jax.core.checks import (
-    floating,
-    numbers_of,
-    require_numeric,
-    require_path,
-    shape_of,
-)
+from planner_jax.core.checks import floating, numbers_of, require_numeric, shape_of
 from planner_jax.core.errors import ArgumentError
+from planner_jax.core.paths import require_path
 from planner_jax.core.rules import Field, Table, require_sound
 from planner_jax.plane.make_obstacles import Circle, obstacles
 from planner_jax.plane.obstacles import Obstacles

@@ -15,8 +15,8 @@ from jax import Array
 from jaxtyping import PyTree
 from numpy.typing import ArrayLike
 
-from planner_jax.core.checks import require_beginning, require_path
 from planner_jax.core.errors import ArgumentTypeError
+from planner_jax.core.paths import require_beginning, require_path
 from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import Attempt
 from planner_jax.plane.obstacles import Obstacles, move_on

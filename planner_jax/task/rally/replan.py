@@ -14,7 +14,8 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from planner_jax.ball.flight import BallState
-from planner_jax.core.checks import require_beginning, require_kind
+from planner_jax.core.checks import require_kind
+from planner_jax.core.paths import require_beginning
 from planner_jax.optimise.chain_remainder import evaluate_pieces, fit_offsets
 from planner_jax.optimise.planner import OptimisedPlanner
 from planner_jax.optimise.settings import Evaluation, Round, Settings

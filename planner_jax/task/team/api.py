@@ -5,9 +5,10 @@ from planner_jax.planning.decided import DecidedPlanner
 from planner_jax.recovery.with_recovery import add_recovery
 from planner_jax.referee.catch import referee_catches
 from planner_jax.referee.team import TeamVerdict, referee_teams
-from planner_jax.task.arguments import find_decision, judge_by, require_settings
+from planner_jax.task.arguments import judge_by, require_settings
 from planner_jax.task.catch.api import target_setting
 from planner_jax.task.catch.spec import DECISIONS, TRAINED
+from planner_jax.task.decisions import find_decision
 from planner_jax.task.team.case import TeamCase
 from planner_jax.task.team.default_planner import ExactTeam
 from planner_jax.task.team.plan import TeamPlan

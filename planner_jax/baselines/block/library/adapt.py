@@ -20,13 +20,14 @@ from flax import struct
 from jax import Array, lax
 
 from planner_jax.ball.flight import drag_free_flight
+from planner_jax.baselines.block.direct import select_first_solved
 from planner_jax.baselines.block.library.cells import Face, cells_around
 from planner_jax.baselines.block.library.file import load_library
 from planner_jax.baselines.block.library.planner import LibraryBlock
 from planner_jax.baselines.block.library.table import pieces_of, unpack_rows
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.planner import Planner
-from planner_jax.core.protocol import Attempt, Status, select_first_solved
+from planner_jax.core.protocol import Attempt, Status
 from planner_jax.optimise.levenberg import LevenbergConfig
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.clearance import clearances, num_of_obstacles
