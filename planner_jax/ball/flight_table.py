@@ -81,7 +81,7 @@ class FlightTable:
         return self.at(lax.stop_gradient(time)).pos[2]  # at the top the slope by time is zero
 
 
-def longest_flight(ball: BallState, drag: Numbers, gravity: Numbers) -> Numbers:
+def longest_flight(ball: BallState, drag: Numbers, gravity: Numbers) -> PyTree:
     """Return a time (...) [s] at which the ball is below the ground z = 0, at least `SHORTEST`.
 
     A rising ball has at least the ratio of speed and vertical speed that it has at first, so that
@@ -106,7 +106,9 @@ def longest_flight(ball: BallState, drag: Numbers, gravity: Numbers) -> Numbers:
     return xp.maximum((up + down) * (1.1 + 0.8 * aside / (1.0 + aside)), SHORTEST)
 
 
-def is_resolved(ball: BallState, drag: Numbers, gravity: Numbers, turn: Numbers = 0.0) -> Numbers:
+def is_resolved(
+    ball: BallState, drag: Numbers, gravity: Numbers, turn: Numbers | float = 0.0
+) -> Numbers:
     """Return whether a table of a ball's flight to the ground is right to 0.1 mm, bool (...).
 
     The steps of a table are measured in the time constant 1 / sqrt(g K_D) of the drag, and in
@@ -130,7 +132,7 @@ def _speed(ball: BallState) -> Numbers:
     return numpy_of(ball.vel).sqrt((ball.vel * ball.vel).sum(axis=-1))
 
 
-def pace_of(squared_speed: Numbers, drag: Numbers, gravity: Numbers) -> Numbers:
+def pace_of(squared_speed: Numbers, drag: Numbers, gravity: Numbers) -> PyTree:
     """Return a rate (...) [1/s] at which drag and gravity change a velocity at first."""
     return numpy_of(squared_speed, drag, gravity).sqrt(
         drag * (drag * squared_speed + 0.25 * gravity)

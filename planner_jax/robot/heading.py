@@ -138,12 +138,12 @@ def plan_heading(plan: PyTree, case: PyTree) -> PiecewisePolynomial:
     at_joints = joint.vel, joint.acc, joint.jerk, joint.snap
     joint_times = jnp.stack([ends - path.durations, ends], axis=1).ravel()
 
-    def greatest(flown: Sequence[Array], turn: tuple[Array, Array, Array]) -> Array:
-        loads, rotors = _loads(limits.air, flown), limits.rotors
+    def greatest(flown: Sequence[Array], turn: PyTree) -> Array:
+        (load, jerk, snap), rotors = _loads(limits.air, flown), limits.rotors
         pull = None
         if limits.air is not None:
-            pull = thrust_in_air(limits.air, flown[0], loads[0], gravity)
-        thrusts = jnp.stack(rotor_thrusts(*loads, gravity, rotors, pull, turn))
+            pull = thrust_in_air(limits.air, flown[0], load, gravity)
+        thrusts = jnp.stack(rotor_thrusts(load, jerk, snap, gravity, rotors, pull, turn))
         beyond = jnp.maximum(thrusts - rotors.max_thrust, rotors.min_thrust - thrusts)
         return jnp.max(beyond) / rotors.max_thrust
 
