@@ -14,7 +14,7 @@ from jaxtyping import PyTree
 from planner_jax.core.checks import require_numeric
 from planner_jax.core.choices import EFFORTS, require_one_of
 from planner_jax.core.planner import CaseT, Planner, PlanT
-from planner_jax.optimise.multistart import solve_batch, solve_divided, solve_round
+from planner_jax.optimise.multistart import solve_batch, solve_round
 from planner_jax.optimise.settings import (
     Curvature,
     Evaluation,
@@ -136,7 +136,11 @@ class OptimisedPlanner(Planner[CaseT, PlanT], abc.ABC):
 
     def solve_lanes(self, cases: PyTree, attempt: Round) -> PyTree:
         """Return the plans that one attempt (round of searches) finds for a batch of cases."""
-        return (solve_divided if attempt.is_divided else solve_batch)(self, attempt, cases)
+        if attempt.is_divided:
+            from planner_jax.optimise.divided import solve_divided  # few cases need it
+
+            return solve_divided(self, attempt, cases)
+        return solve_batch(self, attempt, cases)
 
     def divides(self, attempt: Round) -> bool:
         """Return whether each starting point of a case becomes a separate problem of the batch."""

@@ -12,10 +12,9 @@ from collections.abc import Callable, Hashable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.sharding import Mesh, PartitionSpec
+from jax.sharding import Mesh
 from jaxtyping import PyTree
 
 from planner_jax.core.checks import require_scalar
@@ -23,30 +22,23 @@ from planner_jax.core.errors import ArgumentError, ArgumentTypeError
 from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import (
     Attempt,
-    Status,
     is_resident,
     is_unsolved,
     mark_bad_input,
     mark_out_of_time,
-    select,
     select_into,
 )
 from planner_jax.planning.programs import (
     FEW,
-    LANES,
     Sizes,
     compiled,
     count_lanes,
     is_one_cpu,
     lane_sharding,
     on_devices,
-    place_lanes,
     program_key,
-    put_number,
-    run_per_device,
     sizes_of,
     solve_on_devices,
-    with_unsolved,
 )
 
 _QUIET = 1.0  # [s] least time between two progress reports of one round
@@ -144,12 +136,14 @@ def plan_batch(
     """
     planner, mesh = on_devices(planner, devices)
     resident, num = is_resident(cases), count_lanes(cases)
-    batch = _Batch(planner, chunk, mesh, watch, is_one_cpu(mesh) and num <= FEW)
+    batch = Batch(planner, chunk, mesh, watch, is_one_cpu(mesh) and num <= FEW)
     # On one CPU, one thread for each core plans a part of the batch. NumPy divides the batch and
     # joins the plans, because JAX would compile a program for every new batch size.
     is_small = is_one_cpu(mesh) and num != batch.sizes(attempts[0]).next(num)
     if resident and not is_small and not planner.divides(attempts[0]):
-        return batch.plan_resident(attempts, cases)
+        from planner_jax.planning.resident import ResidentBatch  # NumPy arrays do not need it
+
+        return ResidentBatch(**vars(batch)).plan(attempts, cases)
     cases = jax.tree.map(np.asarray, cases)
     plans, unsolved = _try_in_turn(attempts, num, watch, functools.partial(batch.try_lanes, cases))
     return (jax.device_put(plans, lane_sharding(mesh)) if resident else plans), unsolved
@@ -199,7 +193,9 @@ def _try_in_turn(
 
 
 @dataclasses.dataclass(frozen=True)
-class _Batch:
+class Batch:
+    """A planner and the devices on which it plans batches of cases."""
+
     planner: Planner
     chunk: int | None
     mesh: Mesh
@@ -208,11 +204,13 @@ class _Batch:
     compiles_quickly: bool  # for a batch of few cases on a CPU
 
     def sizes(self, attempt: Attempt) -> Sizes:
+        """Return the numbers of cases that one compiled call of an attempt may solve."""
         return sizes_of(self.planner, attempt, self.chunk, self.mesh)
 
     def try_lanes(
         self, cases: PyTree, attempt: Attempt, lanes: np.ndarray, plans: PyTree
     ) -> PyTree:
+        """Return the plans after an attempt at the cases in NumPy arrays with indices `lanes`."""
         calls = self._calls(attempt, lanes)
         found, tried = [], 0
         self.watch.report(self.planner, attempt, 0, lanes.size)
@@ -292,132 +290,3 @@ class _Batch:
         from planner_jax.planning.searches import divide_batch  # few cases need it
 
         return divide_batch(self.planner, attempt, self.mesh, cases)
-
-    def _divide_resident(self, attempt: Attempt, cases: PyTree, is_case: np.ndarray) -> PyTree:
-        found = self._divide(attempt, jax.tree.map(lambda leaf: np.asarray(leaf)[is_case], cases))
-        row = np.maximum(np.cumsum(is_case) - 1, 0)  # repeats a plan for the padding
-        found = jax.tree.map(lambda leaf: leaf[row], found)
-        return jax.device_put(found, lane_sharding(self.mesh))
-
-    def plan_resident(self, attempts: Sequence[Attempt], cases: PyTree) -> tuple[PyTree, Array]:
-        """Return plans of cases in jax arrays, and the number of unsolved cases of each device.
-
-        Only these numbers are copied to the host.
-        """
-        planner, mesh, watch, num = self.planner, self.mesh, self.watch, count_lanes(cases)
-        if num % mesh.size:  # repeat the last case until all devices have equally many cases
-            cases = _take(cases, np.arange(-(-num // mesh.size) * mesh.size))
-        cases = place_lanes(cases, mesh)
-        first, *others = attempts
-        share = count_lanes(cases) // mesh.size
-        watch.report(planner, first, 0, num)
-        plans, unsolved = self._first_plans(first, cases)
-        for attempt in others:
-            before, due = plans.status, unsolved
-            if attempt.within is not None or attempt.improves:
-                before, due = _mark_due(mesh, attempt, plans)
-            due.copy_to_host_async()  # the copy starts as soon as the number is computed
-            most = np.asarray(due).max()  # greatest number of due cases on one device
-            if most == 0:
-                continue
-            if watch.is_over:
-                plans = mark_out_of_time(plans, attempt.is_due(plans))
-                break
-            watch.report(planner, attempt, 0, np.asarray(due).sum())
-            for begin, size in self.sizes(attempt).cuts(most):
-                part, lanes = _cut_unsolved(mesh, size, cases, before, put_number(mesh, begin))
-                if planner.divides(attempt):
-                    later = self._divide_resident(attempt, part, np.asarray(lanes) < share)
-                else:
-                    later, _ = self._solve(attempt, part)
-                plans, unsolved = _select_locally(mesh, plans, later, lanes)
-        if num % mesh.size:  # JAX cannot shard an axis into unequal parts
-            plans = _take(jax.device_put(plans, mesh.devices[0]), np.arange(num))
-        return plans, unsolved
-
-    def _first_plans(self, attempt: Attempt, cases: PyTree) -> tuple[PyTree, Array]:
-        mesh, sizes, share = self.mesh, self.sizes(attempt), count_lanes(cases) // self.mesh.size
-        if share == sizes.next(share):
-            return self._solve(attempt, cases)
-        cuts = list(sizes.cuts(share))
-
-        def solve(begin: int, size: int) -> PyTree:
-            part = _cut(mesh, size, cases, put_number(mesh, begin))
-            return self._solve(attempt, part)[0]
-
-        firsts = {size: begin for begin, size in reversed(cuts)}
-        keys = {self._key(attempt, size, cases) for size in firsts}
-        found: dict[int, PyTree] = {}
-        if len(keys - compiled) > 1:  # compile several programs at the same time
-            from planner_jax.host.machine import as_here  # small batches do not need it
-
-            with ThreadPoolExecutor(len(firsts)) as pool:
-                plans = pool.map(as_here(solve), firsts.values(), firsts)
-                found = dict(zip(firsts.values(), plans, strict=True))
-            compiled.update(keys)
-        parts = [found[begin] if begin in found else solve(begin, size) for begin, size in cuts]
-        return _join_locally(mesh, parts, share)
-
-
-@jax.jit
-def _take(tree: PyTree, lanes: PyTree) -> PyTree:
-    return jax.tree.map(lambda leaf: leaf[jnp.minimum(lanes, leaf.shape[0] - 1)], tree)
-
-
-@functools.partial(jax.jit, static_argnames=("mesh", "size"))
-def _cut(mesh: Mesh, size: int, tree: PyTree, begin: PyTree) -> PyTree:
-    """Return cases `begin` to `begin + size` of each device, padded with the device's last case."""
-
-    def cut(tree: PyTree, begin: Array) -> PyTree:
-        return _take(tree, begin + jnp.arange(size))
-
-    return run_per_device(mesh, cut, LANES, PartitionSpec())(tree, begin)
-
-
-@functools.partial(jax.jit, static_argnames=("mesh", "size"))
-def _cut_unsolved(
-    mesh: Mesh, size: int, tree: PyTree, status: Array, begin: PyTree
-) -> tuple[PyTree, Array]:
-
-    def cut(tree: PyTree, status: Array, begin: Array) -> tuple[PyTree, Array]:
-        (num,) = status.shape
-        (unsolved,) = jnp.nonzero(is_unsolved(status), size=num, fill_value=num)
-        lanes = _take(unsolved, begin + jnp.arange(size))
-        return _take(tree, lanes), lanes
-
-    return run_per_device(mesh, cut, LANES, LANES, PartitionSpec())(tree, status, begin)
-
-
-@functools.partial(jax.jit, static_argnames=("mesh", "attempt"))
-def _mark_due(mesh: Mesh, attempt: Attempt, plans: PyTree) -> tuple[Array, Array]:
-    """Return statuses that are unsolved where a search is due, and their number."""
-
-    def due(plans: PyTree) -> tuple[Array, Array]:
-        is_due = attempt.is_due(plans)
-        status = jnp.where(is_due, Status.INFEASIBLE, Status.FEASIBLE).astype(jnp.int32)
-        return status, jnp.sum(is_due, keepdims=True)
-
-    return run_per_device(mesh, due)(plans)
-
-
-@functools.partial(jax.jit, static_argnames=("mesh", "share"))
-def _join_locally(mesh: Mesh, parts: list[PyTree], share: int) -> tuple[PyTree, Array]:
-
-    def join(*parts: PyTree) -> tuple[PyTree, Array]:
-        return with_unsolved(jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[:share], *parts))
-
-    return run_per_device(mesh, join)(*parts)
-
-
-@functools.partial(jax.jit, static_argnames="mesh")
-def _select_locally(mesh: Mesh, plans: PyTree, later: PyTree, lanes: Array) -> tuple[PyTree, Array]:
-
-    def merge(plans: PyTree, later: PyTree, lanes: Array) -> tuple[PyTree, Array]:
-        kept = select(later, _take(plans, lanes))
-
-        def replace(old: Array, new: Array) -> Array:
-            return old.at[lanes].set(new, mode="drop")
-
-        return with_unsolved(jax.tree.map(replace, plans, kept))
-
-    return run_per_device(mesh, merge)(plans, later, lanes)

@@ -15,7 +15,7 @@ from planner_jax.core.compiled import QUICK_OPTIONS, Fixed
 from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import Attempt, mark_bad_input
 from planner_jax.core.rules import require_shapes
-from planner_jax.optimise.multistart import Searches, count_guesses, divide_round, run_searches
+from planner_jax.optimise.divided import Searches, count_guesses, divide_round, run_searches
 from planner_jax.optimise.planner import OptimisedPlanner
 from planner_jax.optimise.settings import Round, Stage, load_stage
 from planner_jax.planning.programs import (
