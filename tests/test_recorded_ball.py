@@ -283,6 +283,6 @@ def test_fit_refuses_what_is_no_recording_of_one_flight():
         with pytest.raises(pj.CaseError, match=f"floor must be below .* got {floor:g}"):
             pj.ball.fit(t, p, floor=floor)
     with pytest.raises(pj.ArgumentError, match="wind must be finite"):
-        pj.ball.fit(t, p, wind=(np.nan, 0.0, 0.0))
+        pj.ball.fit(t, p, wind=np.array([np.nan, 0.0, 0.0]))
     with pytest.raises(pj.ArgumentError, match="mass must be finite and > 0"):
         pj.ball.Ball.sphere(0.0, 0.04)
