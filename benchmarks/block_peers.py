@@ -73,6 +73,14 @@ WARM = 2  # Number of throws, drawn with another seed, that are planned before t
 PAPERS = ("theirs", "RRT-Connect", "ePA*SE")  # planners in the tables of [Natarajan2024]
 
 
+def leave_out_missing(bench: Bench, names: list[str]) -> list[str]:
+    """Return the names of planners whose packages are installed; say so if some are missing."""
+    if all(importlib.util.find_spec(name) for name in ("ompl", "toppra")):
+        return names
+    bench.say(PEERS, "")
+    return [name for name in names if PLANNERS[name][0] not in NEED_PEERS]
+
+
 @struct.dataclass
 class Torques:
     """RMS and greatest torques of the arm's six joints during a motion."""
@@ -285,9 +293,7 @@ def main() -> None:
             f"jax {jax.__version__}, load average {os.getloadavg()[0]:.1f}",
             "",
         )
-        if any(importlib.util.find_spec(name) is None for name in ("ompl", "toppra")):
-            bench.say(PEERS, "")
-            names = [name for name in names if PLANNERS[name][0] not in NEED_PEERS]
+        names = leave_out_missing(bench, names)
         outcomes = {}
         for name in names:
             kind, changes = PLANNERS[name]

@@ -178,8 +178,8 @@ class OnlineBlock(Planner):
     samples: int = 32  # samples of a motion at which least squares compute distances
     worst: int = 8  # samples with the least distances, at which least squares compute derivatives
     checked: int = 96  # samples of the returned plan at which limits are checked
-    # [m], least distance of the arm from all obstacles and itself. A motion that starts nearer has
-    # half of the distance at the start as its margin.
+    # [m], least distance of the arm from all obstacles and itself. If the arm starts nearer, half of
+    # the distance at the start is the margin.
     margin: float = 0.003
     # [m], least distance from capsules, boxes and cylinders; covers gaps between samples
     obstacle_margin: float = 0.012
@@ -262,8 +262,7 @@ class OnlineBlock(Planner):
             return dataclasses.replace(plan, status=explain_status(poses, plan.status))
         flight, poses, order = self._rank(case)
         goals, goal_order, straight = self._rank_straight(case, poses, _EVERY, attempt)
-        margin = self._margin(case)
-        model = lambda point: self.model(point, case, flight, margin)  # noqa: E731
+        model = lambda point: self.model(point, case, flight)  # noqa: E731
         solver, tries = attempt.solver, jnp.where(flight.comes, attempt.tries, 0)
         kept = jnp.where(attempt.in_turn, 0, jnp.minimum(attempt.kept, tries))
 
@@ -332,8 +331,6 @@ class OnlineBlock(Planner):
         is_left = (~is_solved(best.status)) | bool(self.settling)
         slots, num, dtype = kept + 1, orders.shape[0], cases.angles.dtype
 
-        margins = jax.vmap(self._margin)(cases)
-
         def advance(search: LevenbergState, most: Array, given: tuple) -> LevenbergState:
             return continue_search(lambda x: self.model(x, *given), search, solver, most)
 
@@ -354,7 +351,7 @@ class OnlineBlock(Planner):
             some = jax.tree.map(lambda leaf: leaf.at[lanes].get(mode="clip"), searches)
             some = jax.tree.map(lambda a, b: jnp.where(is_trial, a, b), begun, some)
             own = jnp.minimum(lanes // slots, num - 1)
-            given = jax.tree.map(lambda leaf: leaf[own], (cases, flights, margins))
+            given = jax.tree.map(lambda leaf: leaf[own], (cases, flights))
             later = jnp.minimum(some.steps + _TURN, solver.max_steps)
             some = jax.vmap(advance)(some, jnp.where(is_trial, solver.trial, later), given)
             searches = jax.tree.map(lambda a, b: a.at[lanes].set(b, mode="drop"), searches, some)
@@ -400,9 +397,8 @@ class OnlineBlock(Planner):
         poses, order, num = self._rank_straight(case, poses, 1, attempt)
         shares, coarse = self._shares(), min(_COARSE, self.checked)
         few = tuple(np.arange(1, coarse + 1) / coarse)
-        margin = self._margin(case)
         block = max(1, len(shares) // coarse)  # number of motions that are checked together first
-        blocks = (num + block - 1) // block
+        blocks, start = (num + block - 1) // block, (block - 1) * coarse
 
         def sample(k: Array, at: tuple[float, ...]) -> Array:
             index = order[jnp.minimum(k, len(order) - 1)]
@@ -414,11 +410,13 @@ class OnlineBlock(Planner):
             is_coarse, k = turn < blocks, jnp.argmax(free)
             first = block * jnp.where(is_coarse, turn, 0)
             several = jax.vmap(lambda k: sample(k, few))(first + jnp.arange(block))
-            several = jnp.resize(several, (len(shares), case.arm.num))
+            # The start replaces a sample of the last motion that is shortly after the start.
+            several = jnp.resize(several, (len(shares), case.arm.num)).at[start].set(case.angles)
             angles = jnp.where(is_coarse, several, sample(k, shares))
             gaps = least_clearances(case.arm, case.scene, angles)
-            least = jnp.min(gaps[: block * coarse].reshape(block, coarse), axis=1)
-            found = (least >= margin) & (first + jnp.arange(block) < num)
+            others = gaps.at[start].set(jnp.inf)[: block * coarse]
+            least = jnp.min(others.reshape(block, coarse), axis=1)
+            found = (least >= self._margin_from(gaps[start])) & (first + jnp.arange(block) < num)
             if case.limits.torque is not None:
                 ranks = jnp.minimum(first + jnp.arange(block), len(order) - 1)
                 points = jax.vmap(lambda k: self.encode_straight(case, poses, order[k]))(ranks)
@@ -438,8 +436,8 @@ class OnlineBlock(Planner):
             return (turn < blocks) | (jnp.any(free) & ~stops)
 
         free = jnp.zeros(block * -(-len(order) // block), bool)
-        start = jnp.zeros((), jnp.int32), free, make_empty_plan(case, self.pieces)
-        return lax.while_loop(goes_on, take_turn, start)[-1], poses
+        first = jnp.zeros((), jnp.int32), free, make_empty_plan(case, self.pieces)
+        return lax.while_loop(goes_on, take_turn, first)[-1], poses
 
     def _settle(self, case: BlockCase, flight: Flight, plan: BlockPlan) -> BlockPlan:
         """Return the plan, or a plan of less cost that least squares find from it."""
@@ -492,9 +490,7 @@ class OnlineBlock(Planner):
         self, case: BlockCase, flight: Flight, start: Array, solver: LevenbergConfig
     ) -> BlockPlan:
         """Return the plan that least squares find from a start: joint rates and time of contact."""
-        margin = self._margin(case)
-        model = lambda point: self.model(point, case, flight, margin)  # noqa: E731
-        end = levenberg.least_squares(model, start, solver)
+        end = levenberg.least_squares(lambda point: self.model(point, case, flight), start, solver)
         return self.finish(case, flight, end.point, end.steps)
 
     def encode_straight(self, case: BlockCase, poses: EndPoses, index: Array) -> Array:
@@ -521,16 +517,11 @@ class OnlineBlock(Planner):
         last = jnp.where(case.ends_at_rest, 0.0, steps[-1])
         return steps.at[-1].set(last), case.rates * duration, duration
 
-    def _margin(self, case: BlockCase) -> Array:
-        """Return the margin () [m] that the start of a case allows."""
-        return self._margin_from(case.clearances(case.angles[None])[0])
-
     def _margin_from(self, gap: Array) -> Array:
+        """Return the margin () [m] of motions that start at a distance () [m] from other bodies."""
         return jnp.where(gap < self.margin, 0.5 * jnp.maximum(gap, 0.0), self.margin)
 
-    def model(
-        self, point: Array, case: BlockCase, flight: Flight, margin: Array | float | None = None
-    ) -> Model:
+    def model(self, point: Array, case: BlockCase, flight: Flight) -> Model:
         """Return the cost, a sum of squares, and its quadratic model by rates and time of contact.
 
         The residuals are the errors of the shield's contact with the ball, excesses over joint
@@ -544,8 +535,7 @@ class OnlineBlock(Planner):
         gaps, slopes_at = clearances_and_slopes(case.arm, case.scene, angles)
         gaps = lax.optimization_barrier(gaps)  # (R, S)
         is_of_scene = np.arange(gaps.shape[0]) < num_of_obstacles(case.arm, case.scene)
-        margin = self.margin if margin is None else margin
-        margins = jnp.where(is_of_scene, self.obstacle_margin, 1.3 * margin)[:, None]
+        margins = np.where(is_of_scene, self.obstacle_margin, 1.3 * self.margin)[:, None]
         near, worst = lax.top_k(jnp.max(margins - gaps, axis=0), self.worst)
         slopes = slopes_at(worst)  # (R, n, W)
         short = jnp.maximum(margins - gaps[:, worst], 0.0) * self.weights.clearance  # (R, W)
@@ -569,7 +559,7 @@ class OnlineBlock(Planner):
         size = case.arm.num * pieces
         ends_free = jnp.where(case.ends_at_rest, 0.0, 1.0)
         free = jnp.ones(size + 1, dtype).at[size - case.arm.num : size].set(ends_free)
-        too_near = near[0] - 0.3 * margin
+        too_near = near[0] - 0.3 * self.margin
         cost = joints.cost + jnp.sum(rows**2) + jnp.sum(short**2)
         joint_excess = joints.excess
         if case.limits.torque is not None:

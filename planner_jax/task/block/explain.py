@@ -5,7 +5,7 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
+from jax import Array, lax
 
 from planner_jax.core.checks import require_kind
 from planner_jax.core.choices import require
@@ -44,18 +44,23 @@ class Prospects:
     torque: float = 0.0
     start: float = np.inf  # [m], least distance between two bodies at the start
 
+    @property
+    def is_impossible(self) -> bool:
+        """Whether no pose of the samples is clear and in time, or the arm starts in a collision."""
+        return self.start < -_TOUCH or not self.clear or self.later > _SURE
+
     def sentence(self) -> str:
         """Describe why the ball cannot be blocked, or that a search for a motion may succeed."""
-        if self.start < 0.0:
-            return f"at the start bodies are {-self.start:.3g} m inside each other"
         near = f", and the arm starts {1e3 * self.start:.2g} mm from a body"
-        return self._of_poses() + (near if self.start < OnlineBlock.margin else "")
+        return self._of_poses() + (near if 0.0 <= self.start < OnlineBlock.margin else "")
 
     def _of_poses(self) -> str:
         if not self.poses:
             return "the shield cannot get to the ball's path between the two boxes"
         if not self.clear:
             return f"the arm touches something in all {self.poses} poses that meet the ball"
+        if self.start < -_TOUCH:
+            return f"at the start bodies are {-self.start:.3g} m inside each other"
         if self.later > _SURE:
             return f"the ball is too early: the arm is ready {self.later:.3f} s after it"
         if self.torque > 1.0:
@@ -99,32 +104,39 @@ def _measure(case: BlockCase) -> tuple[Array, ...]:
     The arrays are whether the pose exists, its least distance [m], the time [s] by which the arm is
     late, and the greatest ratio of a torque to its limit.
     """
-    flight, dtype, key = flight_of(case), case.angles.dtype, jax.random.key(0)
-    evenly = jax.random.uniform(key, (_POINTS, 6), dtype, -1.0, 1.0)
-    evenly = evenly.at[:, 0].set((2.0 * jnp.arange(_POINTS, dtype=dtype) + 1.0) / _POINTS - 1.0)
+    flight, dtype, rng = flight_of(case), case.angles.dtype, np.random.default_rng(0)
+    evenly = rng.uniform(-1.0, 1.0, (_POINTS, 6))
+    evenly[:, 0] = (2.0 * np.arange(_POINTS) + 1.0) / _POINTS - 1.0
+    spread = _SPREAD * _NARROWER ** np.arange(_ROUNDS)
+    steps = spread[:, None, None] * rng.normal(size=(_ROUNDS, _POINTS, 6))
 
-    def sample(state: tuple[Array, ...], turn: tuple[Array, Array]) -> tuple[tuple, tuple]:
-        (shares, best, costs), (spread, key) = state, turn
-        found, gaps, late, torque = _measure_contacts(case, flight, shares)
+    def sample(state: tuple[Array, Array, Array], step: Array) -> tuple[tuple, tuple]:
+        shares, best, costs = state
+        found, gaps, late, torque, start = _measure_contacts(case, flight, shares)
         # Poses that are reached in time are the best; then clear ones, then those that exist.
         cost = jnp.where(gaps >= -_TOUCH, late, 1e2 - gaps)
         cost = jnp.min(jnp.where(found, cost, 1e4).reshape(_POINTS, -1), axis=1)
         every, costs = jnp.concatenate([best, shares]), jnp.concatenate([costs, cost])
         order = jnp.argsort(costs)[:_BEST]
-        best, costs = every[order], costs[order]
-        away = jax.random.normal(key, (_POINTS, 6), dtype)
-        near = jnp.tile(best, (_POINTS // _BEST, 1)) + spread * away
-        return (jnp.clip(near, -1.0, 1.0), best, costs), (found, gaps, late, torque)
+        near = jnp.tile(every[order], (_POINTS // _BEST, 1)) + step
+        return (jnp.clip(near, -1.0, 1.0), every[order], costs[order]), (
+            found,
+            gaps,
+            late,
+            torque,
+            start,
+        )
 
-    first = evenly, evenly[:_BEST], jnp.full(_BEST, jnp.inf, dtype)
-    spread = _SPREAD * _NARROWER ** jnp.arange(_ROUNDS, dtype=dtype)
-    measured = jax.lax.scan(sample, first, (spread, jax.random.split(key, _ROUNDS)))[1]
-    return case.clearances(case.angles[None])[0], *measured
+    shares = jnp.asarray(evenly, dtype)
+    first = shares, shares[:_BEST], jnp.full(_BEST, jnp.inf, dtype)
+    *measured, start = lax.scan(sample, first, jnp.asarray(steps, dtype))[1]
+    return start[0], *measured
 
 
 def _measure_contacts(case: BlockCase, flight: Flight, shares: Array) -> tuple[Array, ...]:
     """Return measurements of the poses at contacts that shares (P, 6) in [-1, 1] describe.
 
+    They are the four arrays of `_measure` for one round, and the least distance () at the start.
     The shares are of the time, the offset (2), the tilt (2) and the last joint's angle.
     """
 
@@ -150,4 +162,5 @@ def _measure_contacts(case: BlockCase, flight: Flight, shares: Array) -> tuple[A
         points = jax.vmap(lambda k: online.encode_straight(case, poses, k))(jnp.arange(len(late)))
         excess = jax.vmap(lambda point: online.torque_excess(case, point))(points)
         torque = USED * (1.0 + excess)
-    return poses.is_found, case.clearances(poses.angles), late, torque
+    gaps = case.clearances(jnp.concatenate([poses.angles, case.angles[None]]))
+    return poses.is_found, gaps[:-1], late, torque, gaps[-1]
