@@ -199,7 +199,7 @@ class ArmModel:
         else:
             path = Path(path).name if spec.strippath else path
             places = [base / (spec.meshdir or "") / path]
-        found = next((place for place in places if place.is_file()), None)
+        found = next(filter(os.path.isfile, places), None)
         element = f'mesh "{mesh.name or Path(path).stem}"'
         if found is None:
             raise self.error(element, f"the file {mesh.file}; put it at {places[0]}")

@@ -71,11 +71,13 @@ class ArmText:
             if name in self.includes:
                 continue  # the compiler refuses a file that is included twice
             place = self.folder / name
-            place = place if place.exists() else folder / name
+            place = place if os.path.exists(place) else folder / name
             element = f'{self.name}: include "{name}"'
             content = self._read(place, element, f"the file {self.folder / name}; put it there")
             self.includes[name] = self._scan(content, place.parent, includes).encode()
         places = {base / folder for base in self._bases for folder in self._meshdirs}
+        if len(places) * len(self._files) > _ELEMENTS:
+            raise self.error("the model", f"at most {_ELEMENTS} files, in all its folders")
         for element, file in self._files:
             for place in {folder / name for folder in places for name in (file, Path(file).name)}:
                 self.check(element, place)
@@ -86,7 +88,7 @@ class ArmText:
 
     def check(self, element: str, place: Path) -> None:
         """Raise if the compiler should not read a file that an element names and that exists."""
-        if place in self._sizes or not place.exists() or place.is_dir():
+        if place in self._sizes or not os.path.exists(place) or os.path.isdir(place):
             return
         try:
             with open_plain(place, LARGEST_MESH) as file:

@@ -178,8 +178,8 @@ class OnlineBlock(Planner):
     samples: int = 32  # samples of a motion at which least squares compute distances
     worst: int = 8  # samples with the least distances, at which least squares compute derivatives
     checked: int = 96  # samples of the returned plan at which limits are checked
-    # [m], least distance of the arm from all obstacles and itself. If the arm starts nearer, half of
-    # the distance at the start is the margin.
+    # [m], least distance of the arm from all obstacles and itself. If the arm starts nearer, the
+    # margin is half of the distance at the start.
     margin: float = 0.003
     # [m], least distance from capsules, boxes and cylinders; covers gaps between samples
     obstacle_margin: float = 0.012
