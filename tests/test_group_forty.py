@@ -121,6 +121,16 @@ def test_a_direct_plan_of_few_targets_is_confirmed():
     assert not pj.are_solved(plan) and not pj.group.judge(late, plan).success
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("trials", [1, 2])
+def test_a_direct_plan_with_too_few_trials_for_its_targets_is_unsolved(trials):
+    group = as_numpy(few(pj.take(pj.group.draw(1, "forty", 1), 0), 3))
+    plan = pj.plan(pj.group.planner("direct", decide="given", trials=trials), group)
+    assert plan.status == pj.Status.MAX_STEPS and plan.legs.time[2] == 0.0
+    verdict = pj.group.judge(group, plan)
+    assert not verdict.success and verdict.num_met == trials
+
+
 def brute_force(places, travel, start, tolerance, step):
     """Return the earliest last meeting of the relaxed point over all orders, on the time grid."""
     best = np.inf

@@ -108,9 +108,7 @@ def _parse(path: Path) -> Element:
     """Return the root of an XML file; count its elements and attributes while it is parsed."""
     parser, depth, num, root = XMLPullParser(("start", "end")), 0, 0, None
     signs = 0  # number of equality signs, which is at least the number of attributes
-    with open_plain(path) as file:
-        if os.fstat(file.fileno()).st_size > LARGEST:
-            raise ValueError(f"must be at most {LARGEST} bytes")
+    with open_plain(path, LARGEST) as file:
         while block := file.read(1 << 16):
             if (signs := signs + block.count(b"=")) > MOST_ATTRIBUTES:
                 raise ValueError(f"must have at most {MOST_ATTRIBUTES} attributes")

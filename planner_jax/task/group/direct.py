@@ -102,15 +102,19 @@ class DirectGroup(Planner[InterceptGroup, GroupPlan]):
         state = (zero, zero, jnp.zeros(num + 1, jnp.int32), case.order, repeat(car, num + 1))
         state += (repeat(none, num + 1), repeat(nothing, num), zero)
         k, _, _, order, _, begins, legs, steps = lax.while_loop(is_open, try_next, state)
-        # The leg `last` is the first unsolved leg. The legs behind it have no duration.
-        last = jnp.clip(k, 0, num - 1)
+        # The leg `last` is the first unsolved leg. The legs behind it have no duration. After the
+        # greatest number of trials it may hold no plan, or one that the next trial would replace.
+        last, is_whole = jnp.clip(k, 0, num - 1), k >= count
+        is_cut = ~is_whole & is_solved(legs.status[last])
+        status = jnp.where(is_cut, Status.MAX_STEPS, legs.status[last])
+        violation = jnp.where(is_cut, jnp.inf, legs.violation[last])
         is_planned = np.arange(num) <= last
         legs = dataclasses.replace(legs, time=jnp.where(is_planned, legs.time, 0.0))
         return GroupPlan(
             cost=begins[jnp.minimum(last + 1, count)],
-            violation=jnp.where(k >= count, jnp.max(legs.violation), legs.violation[last]),
+            violation=jnp.where(is_whole, jnp.max(legs.violation), violation),
             iterations=steps,
-            status=jnp.where(k >= count, Status.CONVERGED, legs.status[last]).astype(jnp.int32),
+            status=jnp.where(is_whole, Status.CONVERGED, status).astype(jnp.int32),
             order=order,
             begins=jnp.where(is_planned, begins[:num], begins[last]),
             legs=legs,
