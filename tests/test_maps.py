@@ -157,7 +157,7 @@ def test_walls_of_a_turned_map_cover_all_points_outside_of_its_grid(yaw):
 
 def test_grids_of_too_many_rectangles_are_refused():
     board = np.indices((200, 200)).sum(axis=0) % 2 == 0
-    with pytest.raises(ArgumentError, match="at most 10,000 rectangles .a greater coarsen"):
+    with pytest.raises(ArgumentError, match="at most 5,000 rectangles .a greater coarsen"):
         pj.intercept.walls_of_grid(board, 0.1)
     assert len(pj.intercept.walls_of_grid(board, 0.1, coarsen=2)) == 1
 

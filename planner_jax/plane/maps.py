@@ -30,7 +30,7 @@ _MOST_NUMBERS = 1 << 20  # greatest number of pixels of a PGM file in text (P2)
 _HEADER = 1 << 12  # [B] in which the header of a PGM file ends, with its comments
 _NUMBER = rb"\s+(?:#[^\r\n]*[\r\n]\s*)*\d+"  # of the header, after comments
 _PGM = re.compile(rb"P(?:[14](?:%b){2}|[2356](?:%b){3})\s" % (_NUMBER, _NUMBER))
-MOST_WALLS = 10_000  # greatest number of rectangles that cover a grid
+MOST_WALLS = 5_000  # greatest number of rectangles that cover a grid
 
 
 class MapError(PlannerJaxError, ValueError):
@@ -100,7 +100,7 @@ def walls_of_grid(
 
     Raises:
         ArgumentTypeError: `occupied` is not a bool array with two axes.
-        ArgumentError: a number is out of its range, `origin` has another shape, or more than 10,000
+        ArgumentError: a number is out of its range, `origin` has another shape, or more than 5,000
             rectangles would be needed.
     """
     cells = numeric(occupied)
