@@ -93,9 +93,9 @@ def cross(command: str, task: Task) -> Iterator[Combination]:
         yield Combination(start, REFUSED, f"'{task.name}' (choose from")
         return
     suites = [("--suite", name) for name in task.all_suites()] if "suite" in names else [()]
+    own = [name for name in task.all_planners() if name not in task.from_file]
     for suite in suites:
         yield Combination((*start, *suite), EITHER if command == "plan" else RUNS)
-        own = [name for name in task.all_planners() if name not in task.from_file]
         yield from (Combination((*start, *suite, "--planner", name)) for name in own)
     for name in task.from_file:
         yield Combination((*start, "--planner", name), REFUSED, "--planner must name its file")

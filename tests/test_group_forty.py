@@ -9,6 +9,7 @@ from closed_forms import positions_on
 
 import planner_jax as pj
 from planner_jax.planning.decided import first_choice
+from planner_jax.sweep.intercept.settings import GroupSettings
 from planner_jax.task.group.decide import Greedy, Search
 from planner_jax.task.group.order import Departure, end_times, improve, make_table, meet
 from planner_jax.task.group.suites import WIDE
@@ -45,6 +46,17 @@ def test_forty_targets_and_movers_stay_on_the_map():
     assert steps.max() <= 0.6 + 1e-4 and np.median(steps) >= 0.1
     gap = np.linalg.norm(poses[:, :, 0, :2] - groups.shared.start[:, None, :2], axis=-1)
     assert (gap - movers.radius).min() >= 0.8
+
+
+def test_suites_of_many_targets_have_a_planner_and_a_decision_of_their_own():
+    task = pj.task_named("group")
+    chosen = [GroupSettings(suite=suite).of(task) for suite in (None, "forty")]
+    assert [(each.planner, each.decide) for each in chosen] == [
+        ("spacetime", "best"),
+        ("direct", "search"),
+    ]
+    own = GroupSettings(suite="forty", planner="spacetime", decide="greedy").of(task)
+    assert (own.planner, own.decide) == ("spacetime", "greedy")
 
 
 def test_a_point_meets_a_target_where_both_arrive():

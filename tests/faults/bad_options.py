@@ -21,6 +21,9 @@ sweep hit --planner exact:file               | --planner must be exact without a
 sweep block --planner library                | --planner must name its file
 sweep block --planner adapt:                 | --planner .. file
 sweep intercept --suite nowhere              | --suite must be one of
+sweep group --suite forty --decide best      | --decide must be search or greedy for suite forty
+sweep rally --decide best                    | --decide best; `planner-jax sweep rally --help`
+bench throughput --task rally --effort good  | --effort must be left out for the task rally
 sweep hit --num 1 --out pipe                 | --out must be
 sweep catch --num 1 --out s3://bucket/x      | --out must be a folder of this machine
 sweep hit --num 1 --workers Ray              | --workers must be ray
