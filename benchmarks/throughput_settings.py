@@ -10,7 +10,7 @@ from typing import ClassVar
 from planner_jax.core.choices import EFFORTS, require
 from planner_jax.core.registry import task_named
 from planner_jax.core.room import require_memory
-from planner_jax.runs.settings import SweepSettings, option
+from planner_jax.runs.settings import Options, SweepSettings, option
 
 _MOST = 100_000  # Maximum of the settings that are counts. Larger counts would take hours.
 
@@ -54,7 +54,7 @@ class ThroughputSettings:
         has_effort = "effort" in {field.name for field in dataclasses.fields(kind)}
         rule = f"left out for the task {self.task}"
         require(has_effort or self.effort is None, "effort", rule, self.effort)
-        effort = {} if self.effort is None else {"effort": self.effort}
+        effort: Options = {} if self.effort is None else {"effort": self.effort}
         sweep = kind(planner=self.planner, suite=self.suite, seed=self.seed, **effort).of(task)
         object.__setattr__(self, "planner", sweep.planner)
         object.__setattr__(self, "suite", sweep.suite)

@@ -158,6 +158,7 @@ def outcomes_figure(figure: Figure, run: RunRows) -> None:
     first = int(iterations.min())
     num = max(int(iterations.max()) - first + 1, _FEWEST_BARS)
     width = -(-num // _MOST_BARS)  # number of values that share a bar
-    axes.hist(iterations, bins=np.arange(first, first + num + width, width) - 0.5)
+    bins = np.arange(first, first + num + width, width) - 0.5
+    axes.hist(iterations, bins=bins.tolist())
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_locator(MaxNLocator(integer=True))
