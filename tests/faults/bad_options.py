@@ -19,7 +19,6 @@ sweep hit --seed -1                          | --seed must be >= 0, got -1
 sweep catch --planner nobody                 | --planner must be one of exact .. got 'nobody'
 sweep hit --planner exact:file               | --planner must be exact without a file
 sweep block --planner library                | --planner must name its file
-sweep block --planner adapt:                 | --planner .. file
 sweep intercept --suite nowhere              | --suite must be one of
 sweep group --suite forty --decide best      | --decide must be search or greedy for suite forty
 sweep rally --decide best                    | --decide best; `planner-jax sweep rally --help`

@@ -2,7 +2,6 @@
 
 from jaxtyping import PyTree
 
-from planner_jax.baselines.block.library.adapt import AdaptBlock
 from planner_jax.baselines.block.library.planner import LibraryBlock
 from planner_jax.core.planner import Planner
 from planner_jax.runs.manifest import Entries
@@ -30,7 +29,7 @@ class BlockSweep(Sweep[BlockSettings]):
     def require_fit(self, settings: BlockSettings, planner: Planner, cases: PyTree) -> None:
         """Raise if the planner is for another task, or its stored motions for another arm."""
         super().require_fit(settings, planner, cases)
-        if isinstance(planner, LibraryBlock | AdaptBlock):
+        if isinstance(planner, LibraryBlock):
             planner.check(cases)
 
     def setting(self, cases: PyTree) -> Entries:

@@ -24,7 +24,6 @@ def planner(
     * `library:FILE`: a motion that is stored in a file of `planner-jax library build`. The faces of
       two boxes around the arm are divided into cells, and the file has a motion for each pair of
       an outer and an inner cell through which a ball can fly.
-    * `adapt:FILE`: motions of such a file, changed to meet the ball and refined by least squares.
     * `direct`: each joint moves as fast as its limits allow, to the end pose that is reached first
       without a collision.
     * `rrt-connect`, `epase`: a path by OMPL's RRT-Connect, or by a weighted A* over steps of the
@@ -39,7 +38,7 @@ def planner(
         name: name of the planner, as listed above.
         effort: "feasible" ends with the first plan that keeps every limit. "good" and "best"
             compare more motions of `online` or `brisk`, for plans of less cost.
-        options: fields of the planner's class: `OnlineBlock`, `LibraryBlock`, `AdaptBlock`,
+        options: fields of the planner's class: `OnlineBlock`, `LibraryBlock`,
             `DirectBlock`, `RrtConnectBlock`, `EpaseBlock` or `InsatBlock`.
 
     Raises:
