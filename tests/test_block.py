@@ -497,5 +497,5 @@ def test_throws_at_another_arm_are_scaled_to_its_reach():
     np.testing.assert_allclose(ends, 0.5 * of_usual, rtol=1e-6)
     flight = jax.jit(jax.vmap(flight_of))(cases)
     assert flight.comes.all()
-    with pytest.raises(ValueError, match="size must be > 0"):
+    with pytest.raises(ValueError, match="size must be finite and > 0"):
         paper_scene(size=0.0)

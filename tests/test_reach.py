@@ -16,7 +16,7 @@ from planner_jax.task.hit.context import prepare_hit
 
 HIT, CATCH = pj.hit.planner("exact"), pj.catch.planner("exact", decide="greedy")
 
-hits_too_far = jax.jit(jax.vmap(lambda case: is_hit_too_far(prepare_hit(case, 36))))
+hits_too_far = jax.jit(jax.vmap(lambda case: is_hit_too_far(prepare_hit(case))))
 catches_too_far = jax.jit(jax.vmap(lambda case: is_catch_too_far(order_targets(case))))
 
 

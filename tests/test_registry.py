@@ -174,6 +174,7 @@ ERRORS = [
     errors.UnknownName("task", "one of hit, catch", "hot"),
     errors.MissingExtra("paper", "numba", "baselines"),
     errors.NoRecovery("no recovery trajectory keeps the limits"),
+    errors.NotOffered("DirectBlock cannot plan again"),
     WorkersFailed("workers must be able to start the run"),
 ]
 

@@ -76,9 +76,13 @@ class FlightTable:
         fall = jnp.maximum(up[last] - up[last + 1], 1e-6)
         step = self.times[last + 1] - self.times[last]
         time = self.times[last] + step * jnp.clip(up[last] / fall, 0.0, 1.0)
-        time = time - self.at(time).vel[2] / jnp.minimum(0.5 * (down[last] + down[last + 1]), -0.1)
-        time = jnp.where(up[0] > 0.0, time, 0.0)
-        return self.at(lax.stop_gradient(time)).pos[2]  # at the top the slope by time is zero
+        time = lax.stop_gradient(time)
+        slope = jnp.minimum(0.5 * (down[last] + down[last + 1]), -0.1)
+        time = lax.stop_gradient(time - self.at(time).vel[2] / slope)
+        # One more step of Newton's method has the derivatives of the time of the top.
+        slope = jax.jvp(lambda t: self.at(t).vel[2], (time,), (jnp.ones_like(time),))[1]
+        time = time - self.at(time).vel[2] / lax.stop_gradient(jnp.minimum(slope, -0.1))
+        return self.at(jnp.where(up[0] > 0.0, time, 0.0)).pos[2]
 
 
 def longest_flight(ball: BallState, drag: Numbers, gravity: Numbers) -> PyTree:
@@ -219,8 +223,9 @@ def _nodes_jvp(primals: tuple, tangents: tuple) -> tuple:
     if further := tuple(k for k in moving if k not in (0, 2)):  # the times are constants
         for k, by in enumerate(_slopes(further)(*primals)):
             for argument, slope in zip(further, by, strict=True):
-                scaled = slope * tangents[argument]  # a velocity is on the slope's last axis
-                changes[k] = changes[k] + scaled.reshape(*nodes[k].shape, -1).sum(axis=-1)
+                by_component = slope.reshape(*nodes[k].shape, -1)
+                change = tangents[argument].reshape(1, 1, -1)
+                changes[k] = changes[k] + (by_component * change).sum(axis=-1)
     return nodes, tuple(changes)
 
 

@@ -225,8 +225,8 @@ def fit(
         for each in (times, positions)
     )
     shape = shape_of("positions", positions)
-    is_shape = len(shape) in (2, 3) and shape[-1] == 3
-    require(is_shape, "positions", "of the shape (N, 3) or (B, N, 3)", shape)
+    is_shape = len(shape) in (2, 3) and shape[-1] == 3 and 0 not in shape
+    require(is_shape, "positions", "of the shape (N, 3) or (B, N, 3), not empty", shape)
     for name, value, rule in (("times", times, shape[:-1]), ("wind", wind, (3,))):
         require(shape_of(name, value) == rule, name, f"of the shape {rule}", np.shape(value))
     require(bool(np.isfinite(np.asarray(wind, np.float64)).all()), "wind", "finite", wind)
