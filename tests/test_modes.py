@@ -22,6 +22,7 @@ from test_task_reach import reach
 
 import planner_jax as pj
 from planner_jax import task
+from planner_jax.core.errors import NotOffered
 from planner_jax.core.protocol import Attempt, Plan, outcome
 from planner_jax.core.registry import all_tasks
 from planner_jax.planning.programs import program_key
@@ -81,7 +82,10 @@ def test_the_program_of_a_float32_batch_is_the_same_under_x64(name):
     programs = []
     for is_double in (False, True):
         with options({"jax_enable_x64": is_double}):
-            programs.append(str(jax.make_jaxpr(pj.solve)(planner, batch)))
+            try:
+                programs.append(str(jax.make_jaxpr(pj.solve)(planner, batch)))
+            except NotOffered:
+                pytest.skip(f"the planner of {name} works on the host")
     assert programs[0] == programs[1]
     assert "f64" not in programs[0]
 

@@ -37,7 +37,7 @@ def air_of(of):
 @float64
 def test_without_spin_and_friction_the_impact_is_that_of_a_ball_with_drag():
     plain = case(np.zeros(3), ball=SMOOTH, wind=np.zeros(3))
-    normal, racket, after, apex = meet(plain, BALL, TIME, SPEEDS)
+    normal, racket, after, apex, _ = meet(plain, BALL, TIME, SPEEDS)
 
     @jax.jit
     def without_spin(after):
@@ -56,7 +56,7 @@ def test_without_spin_and_friction_the_impact_is_that_of_a_ball_with_drag():
 @pytest.mark.parametrize("options", [{}, {"ball": pj.ball.Ball(friction=(0.02, 0.01))}])
 def test_the_referee_returns_the_ball_to_the_target_with_and_without_slip_at_the_end(options):
     of = case(**options)
-    normal, racket, after, apex = (np.asarray(each) for each in meet(of, BALL, TIME, SPEEDS))
+    normal, racket, after, apex, _ = (np.asarray(each) for each in meet(of, BALL, TIME, SPEEDS))
     axes = {"lift": of.lift, **{f"around.{k}": v for k, v in vars(of.around).items()}}
     leaves = {name: np.asarray(leaf, float)[None] for name, leaf in axes.items()}
     slip, up = (BALL.vel - racket)[:, None], normal[:, None]
@@ -124,7 +124,7 @@ def test_the_gradient_of_an_impact_is_that_of_differences():
 
     def everything(args):
         ball, time, speeds, lift = args
-        normal, racket, after, apex = meet_spin(of.replace(lift=lift), ball, time, speeds)
+        normal, racket, after, apex, _ = meet_spin(of.replace(lift=lift), ball, time, speeds)
         return normal @ jnp.arange(3.0) + racket @ jnp.ones(3) + jnp.sum(after**2) + apex
 
     assert_gradient_matches_differences(everything, (BALL, TIME, SPEEDS, np.asarray(of.lift)))

@@ -24,7 +24,7 @@ _LEAF = jax.typing.ArrayLike | jax.ShapeDtypeStruct
 _HINTS = {jax.Array: _LEAF, int: int | np.integer, float: float | int | np.floating}
 # NumPy's protocol of sequences in `ArrayLike` has a method that tuples lack, `__reversed__`.
 _PARTS = [each for each in typing.get_args(npt.ArrayLike) if typing.get_origin(each)]
-_SEQUENCES = [each for each in _PARTS if hasattr(each, "count")]
+_SEQUENCES = [each for each in _PARTS if "_NestedSequence" in str(each)]
 _HINTS |= dict.fromkeys(_SEQUENCES, Sequence)
 _check = beartype(conf=BeartypeConf(hint_overrides=FrozenDict(_HINTS)))
 _subscript = type(jaxtyping.Float).__getitem__

@@ -49,7 +49,6 @@ def poses_in_time(case: BlockCase, points: int) -> tuple[EndPoses, Array]:
     return poses, jnp.where(is_in_time, times, jnp.inf)
 
 
-@jax.tree_util.register_static
 def select_first_solved(
     plan_of: Callable[[Array], BlockPlan], num: Array | int, best: BlockPlan
 ) -> BlockPlan:
@@ -70,6 +69,7 @@ def select_first_solved(
     return lax.while_loop(is_open, next_one, (jnp.zeros((), jnp.int32), best))[1]
 
 
+@jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class DirectBlock(Planner):
     """The planner `direct`: bang-bang joint motions to end poses; the cost is the duration [s]."""

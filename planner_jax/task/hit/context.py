@@ -50,6 +50,7 @@ class Impact:
     stroke: Stroke  # impact, and the ball's flight to the landing point
     tail_state: Array  # (4, 3) position, velocity, acceleration, jerk of the quadrotor at impact
     apex: Array  # () [m], greatest height of the returned ball
+    is_returned: Array | bool = True  # () bool, whether the ball is met and reaches the target
 
 
 def is_too_far(context: HitContext) -> Array:

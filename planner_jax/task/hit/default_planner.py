@@ -273,6 +273,7 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
         """
         impact, limits = self.impact(natural[0], context), context.case.hit_limits
         apex = apex_excess(impact.apex, limits.min_apex, limits.max_apex)
+        apex = jnp.where(impact.is_returned, apex, 1.0)
         speed = hitting_speed_excess(impact.tail_state[1], limits.hitting_speed)
         return ChainEnds(
             durations=impact.stroke.time[None],
@@ -302,8 +303,10 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
         if case.lift is not None:
             from planner_jax.task.hit.spin import meet_spin
 
-            normal, vel, after, apex = meet_spin(case, ball, flight_time, natural[3:5])
+            normal, vel, after, apex, is_returned = meet_spin(case, ball, flight_time, natural[3:5])
+            is_returned &= time <= context.path.times[-1]
         else:
+            is_returned = True
             if self.drag_after_impact:
                 numbers = flight_time, case.drag, case.gravity
                 after = aim_with_drag(ball.pos, case.target, *numbers)
@@ -316,7 +319,7 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
             vel = normal_speed * normal + natural[3] * across_x + natural[4] * across_y
         tail_state = state_at_impact(case, ball.pos, normal, vel, thrust, natural[5:])
         stroke = Stroke(time, ball.pos, ball.vel, after, normal, flight_time)
-        return Impact(stroke=stroke, tail_state=tail_state, apex=apex)
+        return Impact(stroke, tail_state, apex, is_returned)
 
     def rules_out(self, context: HitContext) -> Array:
         """Return whether the ball is provably never within the quadrotor's reach, () bool."""

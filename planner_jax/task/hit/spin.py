@@ -28,6 +28,8 @@ from planner_jax.core.choices import require
 from planner_jax.robot.quadrotor import tangent_basis
 
 _RETURN_NODES = 16  # number of states of the flight after the impact
+_STEPS, _LONGEST = 12, 0.5  # of Newton's method: number, and length relative to the solution
+_REACHED = 1e-5  # distance from the target, relative to the flight's, at which the method ends
 
 
 def with_spin(
@@ -69,13 +71,15 @@ def predict_spin(case: PyTree) -> FlightTable:
 
 def meet_spin(
     case: PyTree, ball: BallState, flight_time: Array, speeds: Array
-) -> tuple[Array, Array, Array, Array]:
+) -> tuple[Array, Array, Array, Array, Array]:
     """Return the racket's normal and velocity, the ball's velocity after the impact, and its apex.
 
     The ball is at the target after `flight_time` [s]; `speeds` (2,) are the racket's speeds across
-    its normal. Newton's method finds the change of the ball's velocity along the normal.
+    its normal. Newton's method finds the change of the ball's velocity along the normal. The last
+    value, () bool, is whether the method has converged, so that the ball reaches the target.
     """
-    air = _around(case)
+    air, away = _around(case), case.target - ball.pos
+    near = _REACHED * jnp.sqrt(at_least(jnp.sum(away * away), 1e-6))
 
     def strike(push: Array) -> tuple[Array, Array, SpinningBall]:
         size = jnp.sqrt(at_least(jnp.sum(push * push), 1e-6))
@@ -95,12 +99,23 @@ def meet_spin(
         return flight(strike(push)[2]).pos[-1] - case.target
 
     def solve(miss: PyTree, push: Array) -> Array:
-        step = lambda _, x: x - solve3(jax.jacfwd(miss)(x), miss(x))  # noqa: E731
-        return lax.fori_loop(0, 5, step, push)
+        def step(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+            count, x, away = state
+            change = solve3(jax.jacfwd(miss)(x), away)
+            lengths = (jnp.sqrt(at_least(jnp.sum(each * each), 1e-6)) for each in (x, change))
+            x = x - change * jnp.minimum(1.0, _LONGEST * next(lengths) / next(lengths))
+            return count + 1, x, miss(x)
+
+        def is_open(state: tuple[Array, Array, Array]) -> Array:
+            return (state[0] < _STEPS) & (jnp.sum(state[2] ** 2) > near**2)
+
+        return lax.while_loop(is_open, step, (jnp.zeros((), jnp.int32), push, miss(push)))[1]
 
     after = aim_with_drag(ball.pos, case.target, flight_time, case.drag, case.gravity)
     push = lax.custom_root(
         miss, after - ball.vel, solve, lambda slope, y: solve3(jax.jacfwd(slope)(y), y)
     )
     normal, racket, top = strike(push)
-    return normal, racket, top.vel, flight(top).highest()
+    path = flight(top)
+    is_reached = jnp.sum((path.pos[-1] - case.target) ** 2) <= (100.0 * near) ** 2
+    return normal, racket, top.vel, path.highest(), is_reached
