@@ -171,7 +171,7 @@ def measure(bench: Bench, options: Any, names: list[str]) -> None:
         solved, refused, wrong = 0, 0, 0
         limits: collections.Counter[str] = collections.Counter()
         judge = pj.rally.judge if name == "rally" else pj.hit.judge
-        planner = pj.rally.planner() if name == "rally" else pj.hit.planner()
+        planner: Any = pj.rally.planner() if name == "rally" else pj.hit.planner()
         for first in range(0, options.num, _BATCH):
             cases = draw(name, min(_BATCH, options.num - first), options.seed + first)
             cases = jax.tree.map(np.asarray, cases)

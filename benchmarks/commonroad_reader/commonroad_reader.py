@@ -106,14 +106,16 @@ def read(path: Path) -> list[Problem]:
 
 def _parse(path: Path) -> Element:
     """Return the root of an XML file; count its elements and attributes while it is parsed."""
-    parser, depth, num, root = XMLPullParser(("start", "end")), 0, 0, None
+    parser, depth, num = XMLPullParser(("start", "end")), 0, 0
+    root: Any = None
     signs = 0  # number of equality signs, which is at least the number of attributes
     with open_plain(path, LARGEST) as file:
         while block := file.read(1 << 16):
             if (signs := signs + block.count(b"=")) > MOST_ATTRIBUTES:
                 raise ValueError(f"must have at most {MOST_ATTRIBUTES} attributes")
             parser.feed(block)
-            for event, element in parser.read_events():
+            events: Any = parser.read_events()
+            for event, element in events:
                 is_start = event == "start"
                 depth, num = depth + (1 if is_start else -1), num + is_start
                 root = element if root is None else root

@@ -32,13 +32,15 @@ def row_of(problem: Problem, plan: CarPlan) -> dict[str, object]:
     return {"file": problem.file, "problem": problem.number, "states": states}
 
 
-def plan_first(planner: Any, problems: list[Problem]) -> tuple[int, Problem, Any, CarPlan]:
+def plan_first(planner: Any, problems: list[Problem]) -> tuple[int, Problem, Any, Any]:
     """Plan alternative goals in turn; return the number tried, and the last with case and plan."""
-    for tried, problem in enumerate(problems, 1):  # noqa: B007
+    last: Any = None
+    for tried, problem in enumerate(problems, 1):
         plan = pj.plan(planner, case := problem.case())
+        last = tried, problem, case, plan
         if pj.are_solved(plan):
             break
-    return tried, problem, case, plan
+    return last
 
 
 def main() -> None:

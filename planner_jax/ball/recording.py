@@ -66,7 +66,8 @@ class Ball:
 
     def __post_init__(self) -> None:
         for field in fields(self):
-            value = numbers_of(field.name, vars(self)[field.name], (), np.shape(field.default))
+            shape = np.shape(getattr(type(self), field.name))  # of the default
+            value = numbers_of(field.name, vars(self)[field.name], (), shape)
             for each in value.flat:
                 require_number(field.name, each, POSITIVE)
 
@@ -101,7 +102,7 @@ class Prediction:
     @property
     def is_known(self) -> np.ndarray:
         """Whether the flight is simulated until each time (T,); all numbers are NaN elsewhere."""
-        return np.isfinite(self.pos).all(axis=-1)
+        return np.asarray(np.isfinite(self.pos).all(axis=-1))
 
     def interval(
         self, probability: float = 0.9, *, observed: bool = False
@@ -309,7 +310,7 @@ def _compare_frames(
     padded, below = _pad(rows[doubtful], len(fitted)), np.full(len(fitted), -1e6, np.float32)
     count = 3.0 * np.isfinite(rows[doubtful, :, 0]).sum(axis=-1)
     for unit, axis, sign in _FRAMES:
-        turned = padded * np.float32([1.0, unit, unit, unit])
+        turned = padded * np.array([1.0, unit, unit, unit], np.float32)
         turned[..., [axis, 3]] = turned[..., [3, axis]]
         turned[..., 3] *= sign
         found = np.asarray(program(turned, below, numbers), np.float64)[: doubtful.size]

@@ -37,7 +37,8 @@ class Published:
 def _rows(*protocol: Any, rows: dict[str, Any], bound: str = "") -> Iterator[Published]:
     for row, value in rows.items():
         pair = value if isinstance(value, tuple) else (value, None)
-        yield Published(*protocol, row, *pair, bound)
+        fields: tuple[Any, ...] = (*protocol, row, *pair, bound)
+        yield Published(*fields)
 
 
 def _rows_of_court() -> Iterator[Published]:

@@ -1,5 +1,6 @@
 """Limits of an arm's joints from its file, a URDF's attributes, and YAML files beside it."""
 
+import contextlib
 import math
 import os
 from collections.abc import Mapping
@@ -115,10 +116,9 @@ def _of_urdf(model: ArmModel, others: Stated) -> Stated:
     for joint in model.joint_names:
         fields = model.source.limits.get(joint, {})
         for kind, name in (("velocity", "velocity"), ("torque", "effort")):
-            try:
-                value: Any = float(text := fields.get(name, "0"))
-            except ValueError:
-                value = text
+            value: Any = fields.get(name, "0")
+            with contextlib.suppress(ValueError):
+                value = float(value)
             if value != 0.0 and joint not in others.get(kind, {}):
                 stated.setdefault(kind, {})[joint] = _number(model.name, kind, joint, value)
     return stated

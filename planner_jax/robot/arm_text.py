@@ -95,7 +95,7 @@ class ArmText:
                 head = file.read(24)
                 self._sizes[place] = os.fstat(file.fileno()).st_size
         except OSError as error:
-            raise self._bad_file(element, place, error.strerror) from None
+            raise self._bad_file(element, place, error.strerror or "") from None
         width, height = (int.from_bytes(head[k : k + 4]) for k in (16, 20))
         if head.startswith(_PNG) and width * height > _PIXELS:
             raise self._bad_file(element, place, f"{width} x {height} pixels")
@@ -129,7 +129,8 @@ class ArmText:
         if "\ufffd" in text:
             raise self.error("the text", "in the encoding that the file declares, or UTF-8", "be")
         self._bases[folder] = None
-        parser, above = expat.ParserCreate(), [("", {}, 1)]  # elements around the next one
+        parser = expat.ParserCreate()
+        above: list[tuple[str, dict[str, str], float]] = [("", {}, 1)]  # around the next element
 
         def start(tag: str, fields: dict[str, str]) -> None:
             parent, of_parent, num = above[-1]

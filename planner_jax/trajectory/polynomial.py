@@ -59,7 +59,7 @@ def evaluate(trajectory: PiecewisePolynomial, time: Array, order: int = 0) -> Ar
     """
     require_kind("trajectory", trajectory, PiecewisePolynomial)
     require_size("order", order, 0)
-    time = require_scalar("time", time)
+    time = jnp.asarray(require_scalar("time", time))
     coeffs, durations = trajectory.coeffs, trajectory.durations
     starts = jnp.concatenate([jnp.zeros_like(durations[:1]), jnp.cumsum(durations)[:-1]])
     piece = jnp.clip(jnp.sum(time >= starts) - 1, 0, durations.shape[0] - 1)

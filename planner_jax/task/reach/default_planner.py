@@ -19,6 +19,7 @@ from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import (
     FEASIBILITY_TOLERANCE,
     Attempt,
+    Plan,
     Status,
     is_solved,
     require_settings,
@@ -51,7 +52,7 @@ class ReachPlan(ArmPlan):
 class Search(Attempt):
     """An attempt: check the fastest and the straight motion to each goal."""
 
-    def is_due(self, plans: "ReachPlan") -> Array:
+    def is_due(self, plans: Plan) -> Array:
         """Return which plans need this search, bool: no search reaches a goal beyond the limits."""
         return super().is_due(plans) & (plans.status != Status.OUT_OF_REACH)
 
