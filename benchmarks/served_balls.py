@@ -51,7 +51,7 @@ class Air:
 def fly(pos: np.ndarray, vel: np.ndarray, air: Air, duration: np.ndarray) -> tuple:
     """Integrate B flights; return times (S + 1, B), and positions, velocities (S + 1, B, 3).
 
-    The steps grow with the time like those of a ball that only drag slows down.
+    The steps grow with the time in proportion to the slowing of a ball by drag alone.
     """
     pace = np.maximum(air.drag[:, 0] * np.linalg.norm(vel, axis=1), 1e-3)
     shares = np.linspace(0.0, 1.0, _STEPS + 1)[:, None]

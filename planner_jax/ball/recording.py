@@ -101,7 +101,7 @@ class Prediction:
 
     @property
     def is_known(self) -> np.ndarray:
-        """Whether the flight is simulated until each time (T,); all numbers are NaN elsewhere."""
+        """True for times (T,) until which the flight is simulated; else all numbers are NaN."""
         return np.asarray(np.isfinite(self.pos).all(axis=-1))
 
     def interval(

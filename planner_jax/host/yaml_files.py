@@ -51,7 +51,7 @@ class _Loader(yaml.SafeLoader):
         return super().construct_mapping(node, deep)
 
 
-# Numbers are those of YAML 1.2 and JSON: 010 is ten, 1e-3 is a number, 1:30 and 1_000 are texts.
+# Numbers are written as in YAML 1.2: 010 is ten, 1e-3 is a number, 1:30 and 1_000 are texts.
 _NUMBERS = ("tag:yaml.org,2002:int", "tag:yaml.org,2002:float")
 _Loader.yaml_implicit_resolvers = {
     first: [each for each in resolvers if each[0] not in _NUMBERS]

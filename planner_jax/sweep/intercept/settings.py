@@ -51,7 +51,7 @@ class GroupSettings(SweepSettings):
 
     @property
     def has_many(self) -> bool:
-        """Whether cases of the suite have too many targets to estimate all their orders."""
+        """True if cases of the suite have too many targets to estimate all their orders."""
         suite = SUITES.get(self.suite or next(iter(SUITES)))
         return suite is not None and suite.num_targets[1] > MOST_PERMUTED
 

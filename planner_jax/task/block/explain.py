@@ -46,7 +46,7 @@ class Prospects:
 
     @property
     def is_impossible(self) -> bool:
-        """Whether no pose of the samples is clear and in time, or the arm starts in a collision."""
+        """True if no sampled pose is clear and in time, or if the arm starts in a collision."""
         return self.start < -_TOUCH or not self.clear or self.later > _SURE
 
     def sentence(self) -> str:
