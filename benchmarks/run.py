@@ -26,6 +26,7 @@ import numpy as np
 
 from planner_jax.benchmarks.cost_gap import gap_figures
 from planner_jax.core.errors import ArgumentError
+from planner_jax.host.files import name_run_folder
 from planner_jax.runs.environment import environment
 from planner_jax.runs.run_folder import RunFolder
 
@@ -103,7 +104,7 @@ class Bench:
 
     def __init__(self, name: str, parameters: Mapping[str, Any], out: Any = None):
         now = datetime.datetime.now().astimezone()
-        self._folder = RunFolder(out or Path("runs", f"bench-{name}-{now:%Y%m%d-%H%M%S}"))
+        self._folder = RunFolder(out or name_run_folder(f"bench-{name}"))
         self._folder.require_new()
         self.path = self._folder.path
         what = {"kind": f"bench {name}", "state": "running", "parameters": plain(parameters)}

@@ -235,7 +235,7 @@ def test_sizes_that_make_no_sense_are_refused(planner, starts):
     rule = r"proportions must be of >= 2 pieces, finite and > 0, got \(1.0,\)"
     with pytest.raises(ValueError, match=rule):
         dataclasses.replace(planner, proportions=(1.0,), scale=())
-    with pytest.raises(ValueError, match="no measured scale for 'exact-5'"):
+    with pytest.raises(pj.ArgumentError, match="scale must be passed, except for .*, got exact-5"):
         dataclasses.replace(planner, proportions=(1.0,) * 5, scale=())
     with pytest.raises(ValueError, match=f"starts must be <= {starts}, got {starts + 1}"):
         planner.guesses(None, starts + 1)

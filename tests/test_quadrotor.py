@@ -278,19 +278,33 @@ def test_a_start_exactly_upside_down_is_sampled_with_its_given_attitude(attitude
     np.testing.assert_allclose(found * np.sign(found @ attitude), attitude, atol=1e-5)
 
 
+def with_jerk(acc, jerk):
+    coeffs = np.zeros((1, 8, 3))
+    coeffs[0, 2:4] = acc / 2.0, jerk / 6.0
+    return PiecewisePolynomial(coeffs, np.ones(1))
+
+
+@float64
+@pytest.mark.parametrize("least", [1e-3, 0.5])
+def test_a_moment_of_little_thrust_between_samples_has_its_body_rate(least):
+    """Let the thrust, of constant jerk, be least at 0.37 s: there it turns at |jerk| / |thrust|."""
+    jerk = np.array([8.0, 3.0, -1.0])
+    thrust = least * np.cross(jerk, [0.0, 0.0, 1.0]) / np.hypot(*jerk[:2])
+    acc = thrust - 0.37 * jerk - np.array([0.0, 0.0, GRAVITY])
+    limits = pj.take(pj.hit.draw(1, dtype=np.float64), 0).limits
+    exact = np.linalg.norm(jerk) / least / float(limits.body_rate) - 1.0
+    assert overturn(with_jerk(acc, jerk), GRAVITY, limits) == pytest.approx(exact, rel=1e-6)
+
+
 @float64
 def test_a_passage_near_upside_down_between_samples_exceeds_the_limit_of_the_body_rate():
     """Let the thrust pass the downward vertical at the distance 1e-3 rad, at 0.5 rad/s."""
     acc, jerk = np.array([0.01, -1.85, -10.0 - GRAVITY]), np.array([0.0, 5.0, 0.0])
-    limits = pj.hit.draw(1, dtype=np.float64)
-    limits = jax.tree.map(lambda leaf: leaf[0], limits).limits
-
-    def found(acc):
-        coeffs = np.zeros((1, 8, 3))
-        coeffs[0, 2:4] = acc / 2.0, jerk / 6.0
-        return overturn(PiecewisePolynomial(coeffs, np.ones(1)), GRAVITY, limits)
-
+    limits = pj.take(pj.hit.draw(1, dtype=np.float64), 0).limits
+    found = lambda acc: overturn(with_jerk(acc, jerk), GRAVITY, limits)  # noqa: E731
     exact = np.sqrt(exact_rate_squared(GRAVITY, acc + 0.37 * jerk, jerk))
     assert exact == pytest.approx(1000.0, rel=1e-3)
     assert found(acc) == pytest.approx(float(exact / limits.body_rate) - 1.0, rel=1e-2)
-    assert max(found(acc * [1.0, 1.0, 0.0]), found(acc + [60.0, 0.0, 0.0])) < -0.9
+    upright = float(5.0 / GRAVITY / limits.body_rate) - 1.0
+    assert found(acc * [0.0, 1.0, 0.0]) == pytest.approx(upright, rel=1e-6)
+    assert found(acc + [60.0, 0.0, 0.0]) < -0.9

@@ -223,10 +223,14 @@ def test_recordings_in_another_frame_are_refused(turn):
 @pytest.mark.slow
 def test_recordings_of_slow_balls_in_feet_are_refused():
     times, seen, *_ = flights(noise=0.002, span=0.6)
-    with pytest.raises(pj.CaseError, match="one flight in one frame in metres") as caught:
-        pj.ball.fit(times, seen / 0.3048)
-    assert caught.value.more > 0.5 * LANES
-    pj.ball.fit(times, seen)
+    pj.ball.fit(times, seen, ball=BALL)
+    refused = 0
+    for lane in range(LANES):
+        try:
+            pj.ball.fit(times[lane], seen[lane] / 0.3048, ball=BALL)
+        except pj.CaseError:
+            refused += 1
+    assert refused >= LANES - 1
 
 
 @pytest.mark.slow

@@ -119,7 +119,9 @@ def test_an_absurd_spin_and_a_planner_without_spin_are_errors_of_one_line():
 
 @pytest.mark.slow
 @float64
-def test_the_gradient_of_an_impact_is_that_of_differences():
+def test_the_gradient_of_an_impact_is_that_of_differences(monkeypatch):
+    # Gradients neglect that the steps of a flight depend on its speed. Many steps make this small.
+    monkeypatch.setattr("planner_jax.task.hit.spin._RETURN_NODES", 64)
     of = case()
 
     def everything(args):

@@ -26,6 +26,8 @@ _HINTS = {jax.Array: _LEAF, int: int | np.integer, float: float | int | np.float
 _PARTS = [each for each in typing.get_args(npt.ArrayLike) if typing.get_origin(each)]
 _SEQUENCES = [each for each in _PARTS if "_NestedSequence" in str(each)]
 _HINTS |= dict.fromkeys(_SEQUENCES, Sequence)
+if not _PARTS:  # later versions of NumPy name the union by a statement `type`
+    _HINTS[npt.ArrayLike] = _LEAF | Sequence
 _check = beartype(conf=BeartypeConf(hint_overrides=FrozenDict(_HINTS)))
 _subscript = type(jaxtyping.Float).__getitem__
 

@@ -62,8 +62,9 @@ def table_path(
         TypeError: an argument does not hold numbers, or `dtype` is not a floating type.
     """
     dtype, times = floating(dtype), _check_times(times)
-    named = [("positions", positions), ("velocities", velocities)]
-    values = [_check_values(name, value, times.size) for name, value in named if value is not None]
+    values = [_check_values("positions", positions, times.size)]
+    if velocities is not None:
+        values.append(_check_values("velocities", velocities, times.size))
     values[0], away = split_far(values[0])
     if len(values) == 2 and np.shape(values[0]) != np.shape(values[1]):
         rule = f"the shape {np.shape(values[0])} of positions"

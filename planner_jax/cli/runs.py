@@ -1,7 +1,6 @@
 """Commands on folders of many planned cases, simulated flights or policies: `sweep`, `fly`, ..."""
 
 import contextlib
-import datetime
 import os
 import pkgutil
 import shlex
@@ -17,7 +16,7 @@ from planner_jax.core.errors import ArgumentError, MissingExtra
 from planner_jax.core.registry import Task
 from planner_jax.host import signals as stopping
 from planner_jax.host.compile_cache import keep_compiled_programs
-from planner_jax.host.files import new_file_problem, replacing
+from planner_jax.host.files import name_run_folder, new_file_problem, replacing
 from planner_jax.runs.environment import require_backend
 from planner_jax.runs.settings import WorkersFailed
 
@@ -45,7 +44,7 @@ def _sweep(task: Task, given: Options) -> None:
     if resume and out is None:
         raise ArgumentError("out", "the folder to resume", verb="name", shown="nothing")
     settings = pkgutil.resolve_name(task.sweep)(**given).of(task)
-    out = out or _name_run_folder(f"{task.name}-{task.split_planner(settings.planner)[0]}")
+    out = out or name_run_folder(f"{task.name}-{task.split_planner(settings.planner)[0]}")
     settings.require_disk_space(out)
     keep_compiled_programs()
     from planner_jax.sweep import run
@@ -88,7 +87,7 @@ def add_fly(task: Task, parser: Parser) -> None:
 
 
 def _fly(task: Task, kind: type, given: Options) -> None:
-    out = pop_out(given) or _name_run_folder(f"fly-{task.name}")
+    out = pop_out(given) or name_run_folder(f"fly-{task.name}")
     recorded = {name: given.pop(name) for name in ("video", "record") if name in given}
     settings = kind(**given)
     keep_compiled_programs()
@@ -199,10 +198,6 @@ def _throughput(given: Options) -> None:
     from planner_jax.benchmarks.throughput import report as report_throughput
 
     report_throughput(out=out, **given)
-
-
-def _name_run_folder(name: str) -> str:
-    return os.path.join("runs", f"{name}-{datetime.datetime.now():%Y%m%d-%H%M%S}")
 
 
 def _repeat_command() -> str:

@@ -112,6 +112,7 @@ def outcome(cost: Array, violation: Array, *, stationary: Array | bool = True) -
     for name, value in (("violation", violation), ("stationary", stationary)):
         if shape_of(name, value) not in ((), shape):
             raise ArgumentError(name, f"the shape of cost, {shape}", np.shape(value), verb="have")
+    cost, violation, stationary = map(jnp.asarray, (cost, violation, stationary))
     return {
         "cost": cost,
         "violation": violation,

@@ -99,6 +99,7 @@ def tilt_excess(acc: Components, gravity: Array, limits: QuadrotorLimits) -> Arr
 
 
 _OVERTURN_NODES = 4  # intervals of a piece, at whose ends `overturn_excess` evaluates the motion
+_WEAK_STEPS = 3  # number of Gauss-Newton steps that minimise the thrust within an interval
 
 
 class QuadrotorCase(Protocol):
@@ -294,14 +295,14 @@ def _groups(limits: QuadrotorLimits) -> tuple[tuple[tuple[int, int], ...], ...]:
 def overturn_excess(
     trajectory: PiecewisePolynomial, gravity: Array, limits: QuadrotorLimits
 ) -> Array:
-    """Return the greatest relative excess of the body rate near upside down, between samples; ().
+    """Return the greatest relative excess of the body rate between samples, where it peaks; ().
 
-    Upside down the Hopf fibration has no attitude: the body turns about the thrust at a rate that
-    grows without limit, for a time shorter than the intervals between samples. From each sample the
-    thrust direction z is followed at its rate w along a great circle. With the vertical component n
-    of the circle's normal, the body rate at the lowest point is  w sqrt(1 + (n / (1 + z_z))^2) ,
-    and there  1 + z_z = 1 - sqrt(1 - n^2) . The result is -1 if no lowest point is within an
-    interval.
+    It peaks upside down and where the thrust is nearly zero (`_weak_thrust_excess`). Upside down
+    the Hopf fibration has no attitude: the body turns about the thrust at a rate that grows without
+    limit, for a time shorter than the intervals between samples. From each sample the thrust
+    direction z is followed at its rate w along a great circle. With the vertical component n of the
+    circle's normal, the body rate at the lowest point is  w sqrt(1 + (n / (1 + z_z))^2) , and there
+    1 + z_z = 1 - sqrt(1 - n^2) . Only lowest points within an interval count.
     """
     load = _load(sample_pieces(trajectory, _OVERTURN_NODES), limits)
     pull = net_thrust(load.acc, gravity)
@@ -318,7 +319,37 @@ def overturn_excess(
     excess = jnp.where(
         is_met & (z[:, 2] < 0.0), top * reciprocal(limits.body_rate) ** 2 - 1.0, -1.0
     )
-    return relative(jnp.max(excess))
+    weak = _weak_thrust_excess(pull, load.jerk, trajectory.durations, limits)
+    return relative(jnp.maximum(jnp.max(excess), weak))
+
+
+def _weak_thrust_excess(
+    pull: Array, jerk: Array, durations: Array, limits: QuadrotorLimits
+) -> Array:
+    """Return w^2 / w_max^2 - 1 for the greatest rate w where the thrust is least between samples.
+
+    The thrust per mass f has the samples `pull`, and between two of them it is the cubic function
+    with the derivatives `jerk`. Gauss-Newton steps minimise |f|; there  w = |f x f'| / |f|^2 .
+    """
+    ends, slopes = (each.reshape(-1, _OVERTURN_NODES + 1, 3) for each in (pull, jerk))
+    slopes = slopes * (durations / _OVERTURN_NODES)[:, None, None]
+    start, way = ends[:, :-1], ends[:, 1:] - ends[:, :-1]
+    first, last = slopes[:, :-1], slopes[:, 1:]
+    square, cube = 3.0 * way - 2.0 * first - last, first + last - 2.0 * way
+
+    def step(share: Array, f: Array, rate: Array) -> Array:
+        change = jnp.sum(f * rate, axis=2) * reciprocal(at_least(jnp.sum(rate**2, axis=2), 1e-6))
+        return jnp.clip(share - change, 0.0, 1.0)
+
+    share = step(jnp.zeros(start.shape[:2], start.dtype), start, way)
+    for _ in range(_WEAK_STEPS):
+        u = share[..., None]
+        f = start + u * (first + u * (square + u * cube))
+        rate = first + u * (2.0 * square + 3.0 * u * cube)
+        share = step(share, f, rate)
+    turn = jnp.sum(jnp.cross(f, rate) ** 2, axis=2) * (_OVERTURN_NODES / durations[:, None]) ** 2
+    size = at_least(jnp.sum(f * f, axis=2), 1e-8)
+    return jnp.max(turn * reciprocal(size * limits.body_rate) ** 2 - 1.0)
 
 
 def greatest_excess(

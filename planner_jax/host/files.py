@@ -1,9 +1,10 @@
-"""Functions that read regular files of bounded size, and write files atomically.
+"""Functions that read regular files of bounded size, name run folders, and write files atomically.
 
 All readers of users' files open them here, so that no pipe blocks and no file fills the memory.
 """
 
 import contextlib
+import datetime
 import errno
 import os
 import stat
@@ -47,6 +48,11 @@ def crc32_of(file: BinaryIO) -> int:
     while block := file.read(1 << 20):
         found = zlib.crc32(block, found)
     return found
+
+
+def name_run_folder(name: str) -> str:
+    """Return runs/NAME-DATE-TIME; microseconds tell runs apart that begin within one second."""
+    return os.path.join("runs", f"{name}-{datetime.datetime.now():%Y%m%d-%H%M%S-%f}")
 
 
 @contextlib.contextmanager

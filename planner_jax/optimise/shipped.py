@@ -20,6 +20,8 @@ import numpy as np
 from flax import struct
 from jax import Array, lax
 
+from planner_jax.core.errors import ArgumentError
+
 REACH = 4.0  # number of standard deviations at which features are clipped
 
 
@@ -56,9 +58,7 @@ def load_scale(package: str, name: str) -> tuple[float, ...]:
     path = importlib.resources.files(package) / "measured_scales.json"
     scales = json.loads(path.read_text("utf-8"))
     if name not in scales:
-        raise ValueError(
-            f"no measured scale for {name!r}: pass `scale`, or use one of {', '.join(scales)}"
-        )
+        raise ArgumentError("scale", f"passed, except for {', '.join(scales)}", shown=name)
     return tuple(scales[name])
 
 

@@ -25,7 +25,7 @@ import numpy as np
 import planner_jax as pj
 from planner_jax.core.registry import all_tasks
 
-LONGEST = 20  # [s] of one call
+LONGEST = 60  # [s] of one call; the first call of a function may compile for half of it
 # Functions that compile programs, and the arguments of which one is always unusable.
 COMPILING = {
     "pj.plan": ("planner", "cases"),

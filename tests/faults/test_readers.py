@@ -12,7 +12,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from planner_jax.core.errors import ArgumentError
-from planner_jax.host.files import read_plain
+from planner_jax.host.files import name_run_folder, read_plain
 from planner_jax.runs.manifest import parse_object
 from planner_jax.runs.run_folder import LOCK, RunFolder
 from planner_jax.sweep.hit.sweep import HitSweep
@@ -168,6 +168,10 @@ def test_a_pipe_in_the_place_of_the_lock_is_not_waited_for(tmp_path):
     os.mkfifo(tmp_path / ".lock")
     with pytest.raises(ArgumentError, match="out must be a folder that can be written"):
         RunFolder(tmp_path).require_new()
+
+
+def test_runs_that_begin_within_one_second_have_folders_of_their_own():
+    assert len({name_run_folder("hit-exact") for _ in range(3)}) == 3
 
 
 def test_only_regular_files_of_a_bounded_size_are_opened(tmp_path):

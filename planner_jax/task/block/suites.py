@@ -80,6 +80,7 @@ def draw(
     if scene is None:
         scene = scene_for(arm, has_pole=own.has_pole)
     else:
+        require_kind("scene", scene, Scene)
         radius = float(scene.inner_radius) * np.array([[-1.0], [1.0]])
         inner = np.array([scene.inner.lower, scene.inner.upper], float) + radius
         outer = np.array([scene.outer.lower, scene.outer.upper], float)

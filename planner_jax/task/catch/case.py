@@ -15,7 +15,7 @@ from jaxtyping import PyTree
 from planner_jax.ball.target import TargetPath
 from planner_jax.core import GRAVITY
 from planner_jax.core.arithmetic import Numbers
-from planner_jax.core.checks import floating, require_switch, shape_of
+from planner_jax.core.checks import floating, numeric, require_switch, shape_of
 from planner_jax.core.errors import ArgumentError, ArgumentTypeError
 from planner_jax.core.origin import NEAR, Located, find_origin, move
 from planner_jax.core.paths import require_path
@@ -218,8 +218,8 @@ def case(
 
 
 def _broadcast_present(present: ArrayLike, shape: tuple[int, ...]) -> Array:
-    array = np.asarray(present)
-    if array.dtype != np.bool_:
+    array = numeric(present)
+    if array is None or array.dtype != np.bool_:
         raise ArgumentTypeError("present", "True or False of each target", present)
     if array.shape not in ((), shape[-1:], shape):
         raise ArgumentError("present", f"the shape {shape}", array.shape, verb="have")

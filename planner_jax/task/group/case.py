@@ -110,9 +110,8 @@ def case(
         TypeError: an argument has a wrong type, or `pj.intercept.case` has no such argument.
         ValueError: a number breaks a rule, a shape is wrong, or edges of an obstacle cross.
     """
-    scalars = [settings.get(name, 0.0) for name in ("initial_speed", "tolerance")]
     shapes = [shape_of("start", settings.get("start", 0.0))[:-1], shape_of("time", time)]
-    shapes += map(np.shape, scalars)
+    shapes += [shape_of(each, settings.get(each, 0.0)) for each in ("initial_speed", "tolerance")]
     axis, leaves = len(max(shapes, key=len)), jax.tree.leaves(targets)
     if not leaves or any(np.ndim(leaf) <= axis or np.shape(leaf)[axis] == 0 for leaf in leaves):
         raise ArgumentError("targets", f"paths with {axis + 1} axes in front", targets)

@@ -29,7 +29,9 @@ from planner_jax.robot.quadrotor import tangent_basis
 
 _RETURN_NODES = 16  # number of states of the flight after the impact
 _STEPS, _LONGEST = 12, 0.5  # of Newton's method: number, and length relative to the solution
-_REACHED = 1e-5  # distance from the target, relative to the flight's, at which the method ends
+# Distance from the target, relative to the flight's, at which the method ends, in single and double
+# precision.
+_REACHED = 1e-5, 1e-10
 
 
 def with_spin(
@@ -79,7 +81,7 @@ def meet_spin(
     value, () bool, is whether the method has converged, so that the ball reaches the target.
     """
     air, away = _around(case), case.target - ball.pos
-    near = _REACHED * jnp.sqrt(at_least(jnp.sum(away * away), 1e-6))
+    near = _REACHED[away.dtype == jnp.float64] * jnp.sqrt(at_least(jnp.sum(away * away), 1e-6))
 
     def strike(push: Array) -> tuple[Array, Array, SpinningBall]:
         size = jnp.sqrt(at_least(jnp.sum(push * push), 1e-6))

@@ -333,7 +333,7 @@ def _make_obstacles(
 
 
 def _make_region(region: ArrayLike, batch: tuple[int, ...], dtype: DTypeLike) -> Array:
-    if not np.size(region):
+    if 0 in shape_of("region", region):
         return jnp.zeros((*batch, 1, 2), dtype)
     try:
         one = obstacles([region], dtype=dtype)

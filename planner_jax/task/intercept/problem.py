@@ -48,7 +48,7 @@ _SETTLING = terms.Weights(effort=10.0)
 _HURRYING = terms.Weights(early=1000.0)
 # Weight of the meeting time in the cost that `pj.gradient` differentiates. It is small, so that the
 # minimum exceeds no limit: penalties on limits start before a limit is reached.
-_EARLY = 30.0
+_EARLY = 80.0
 
 
 @struct.dataclass
@@ -421,7 +421,7 @@ class SmoothIntercept(OptimisedPlanner):
     case_type: ClassVar[type] = StartedCase
     adjoint: ClassVar[str] = "whole"
     problem: MotionProblem = MotionProblem()
-    solver: LevenbergConfig = LevenbergConfig(2000, settled=12, tolerance=1e-9)
+    solver: LevenbergConfig = LevenbergConfig(2000, settled=12, tolerance=0.0)
     # A single attempt (round) without steps of L-BFGS: `guesses` already returns the minimum.
     rounds: tuple[Round, ...] = (Round(solver=LbfgsConfig(max_steps=0)),)
 
