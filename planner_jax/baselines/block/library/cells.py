@@ -122,40 +122,6 @@ def cell_of(faces: tuple[Face, ...], box: Box, point: Sequence[Array]) -> tuple[
     return cell, found
 
 
-def cells_around(
-    faces: tuple[Face, ...], box: Box, point: Sequence[Array]
-) -> tuple[Array, Array, Array]:
-    """Return the four cells whose centres are nearest to a point of a box's surface.
-
-    Args:
-        faces: the faces of the box that are divided into cells.
-        box: the box.
-        point: three coordinates () [m] of a point on the surface.
-
-    Returns:
-        cells: (4,) int32, numbers of the cells; repeated if a face has one cell in a direction.
-        away: (4,), squared distances from the point to the cells' centres, in cell sizes.
-        found: () bool, whether the point's face has cells.
-    """
-    own, found = cell_of(faces, box, point)
-    share = [(point[k] - box.lower[k]) / (box.upper[k] - box.lower[k]) for k in range(3)]
-    cells, away, begin = jnp.zeros(4, jnp.int32), jnp.zeros(4, share[0].dtype), 0
-    for face in faces:
-        places = []
-        for axis, count in zip(face.across, face.cells, strict=True):
-            place = share[axis] * count - 0.5  # in units of cells, from the first cell's centre
-            lower = jnp.clip(jnp.floor(place), 0, max(count - 2, 0))
-            pair = jnp.minimum(jnp.stack([lower, lower + 1.0]), count - 1.0)
-            places.append((pair.astype(jnp.int32), (pair - place) ** 2))
-        (first, first_away), (second, second_away) = places
-        there = (own >= begin) & (own < begin + face.num)
-        of_face = begin + first[:, None] * face.cells[1] + second
-        cells = jnp.where(there, of_face.reshape(-1), cells)
-        away = jnp.where(there, (first_away[:, None] + second_away).reshape(-1), away)
-        begin += face.num
-    return cells, away, found
-
-
 @struct.dataclass
 class Tunnels:
     """The P spaces (tunnels), each from a cell of the outer to a cell of the inner box; float64."""
