@@ -56,7 +56,8 @@ _MESSAGES = {
     Status.FEASIBLE: "every limit holds; more iterations may lower the cost",
     Status.INFEASIBLE: "stationary with a limit exceeded; try more starts, or relax the limit",
     Status.MAX_STEPS: "out of iterations with a limit exceeded; allow more iterations or starts",
-    Status.NON_FINITE: "the cost of the plan is not finite; bring the case's numbers nearer to one",
+    Status.NON_FINITE: "`cost` or `violation` of the plan is not finite; bring the case's numbers "
+    "nearer to one",
     Status.OUT_OF_REACH: "a target never comes within reach; `closest_approach` has the distance",
     Status.NO_PATH: "no path through the obstacles was found in time; allow more time",
     Status.BLOCKED: "the start or the goal lies in an obstacle or off the map; move it",
