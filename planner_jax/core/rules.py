@@ -9,7 +9,7 @@ every case, and `planner_jax.planning` assigns the status `BAD_INPUT` to unsound
 import dataclasses
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
-from typing import Protocol, runtime_checkable
+from typing import Protocol, TypeVar, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -117,6 +117,9 @@ class Case(Protocol):
         ...
 
 
+CaseT = TypeVar("CaseT", bound=Case)
+
+
 def fields_of(tree: PyTree) -> dict[str, PyTree]:
     """Return the fields of a dataclass by name, without copying them."""
     return {field.name: getattr(tree, field.name) for field in dataclasses.fields(tree)}
@@ -184,6 +187,19 @@ def require_rule(
     if index is not None and len(index) == 1:
         (index,) = index
     raise CaseError(name, words, first, index, other=other, more=len(cases) - 1)
+
+
+def require_or_mark(cases: CaseT, name: str, value: Numbers, holds: Numbers, words: str) -> CaseT:
+    """Return the cases if `holds` is true everywhere, and raise `CaseError` as `require_rule` does.
+
+    Where a traced `holds` is false, the gravity becomes NaN, which leads to the status `BAD_INPUT`.
+    """
+    batch = cases.batch_shape
+    if not isinstance(holds, Tracer):
+        require_rule(name, value, holds, words, batch)
+        return cases
+    are_kept = holds.reshape(*batch, -1).all(axis=-1)
+    return dataclasses.replace(cases, gravity=jnp.where(are_kept, cases.gravity, jnp.nan))
 
 
 def require_shapes(cases: PyTree) -> None:

@@ -14,8 +14,8 @@ from jaxtyping import PyTree
 
 from planner_jax.ball.target import TargetPath
 from planner_jax.core import GRAVITY
-from planner_jax.core.arithmetic import Numbers
-from planner_jax.core.checks import floating, require_switch, shape_of
+from planner_jax.core.arithmetic import Numbers, numpy_of, to_host
+from planner_jax.core.checks import floating, numbers_of, numeric, require_switch, shape_of
 from planner_jax.core.errors import ArgumentError, ArgumentTypeError
 from planner_jax.core.origin import NEAR, Located, find_origin, move
 from planner_jax.core.paths import require_path
@@ -198,7 +198,7 @@ def case(
         present=_broadcast_present(present, shape),
         horizon=leaf("horizon", horizon, num),
         order=jnp.asarray(np.broadcast_to(np.arange(num, dtype=np.int32), shape), jnp.int32),
-        times=leaf("horizon", shares * np.asarray(horizon)[..., :1], num),
+        times=leaf("horizon", shares * numbers_of("horizon", horizon, batch, (num,))[..., :1], num),
         head_state=quadrotor.start_state(near("start", start), motion, gravity, batch, dtype),
         gravity=leaf("gravity", gravity),
         net=Net(
@@ -213,14 +213,13 @@ def case(
     )
     cases = quadrotor.add_heading(cases, leaf, heading, max_yaw_rate, start_attitude)
     require_sound(cases, _ARGUMENTS)
-    quadrotor.require_start(cases)
-    return cases
+    return quadrotor.check_start(cases)
 
 
 def _broadcast_present(present: ArrayLike, shape: tuple[int, ...]) -> Array:
-    array = np.asarray(present)
+    array = to_host(numeric(present))
     if array.dtype != np.bool_:
         raise ArgumentTypeError("present", "True or False of each target", present)
     if array.shape not in ((), shape[-1:], shape):
         raise ArgumentError("present", f"the shape {shape}", array.shape, verb="have")
-    return jnp.asarray(np.broadcast_to(array, shape), bool)
+    return jnp.asarray(numpy_of(array).broadcast_to(array, shape), bool)
