@@ -9,7 +9,7 @@ every case, and `planner_jax.planning` assigns the status `BAD_INPUT` to unsound
 import dataclasses
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
-from typing import Protocol, TypeVar, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -117,9 +117,6 @@ class Case(Protocol):
         ...
 
 
-CaseT = TypeVar("CaseT", bound=Case)
-
-
 def fields_of(tree: PyTree) -> dict[str, PyTree]:
     """Return the fields of a dataclass by name, without copying them."""
     return {field.name: getattr(tree, field.name) for field in dataclasses.fields(tree)}
@@ -189,7 +186,7 @@ def require_rule(
     raise CaseError(name, words, first, index, other=other, more=len(cases) - 1)
 
 
-def require_or_mark(cases: CaseT, name: str, value: Numbers, holds: Numbers, words: str) -> CaseT:
+def require_or_mark(cases: PyTree, name: str, value: Numbers, holds: Numbers, words: str) -> PyTree:
     """Return the cases if `holds` is true everywhere, and raise `CaseError` as `require_rule` does.
 
     Where a traced `holds` is false, the gravity becomes NaN, which leads to the status `BAD_INPUT`.

@@ -101,6 +101,9 @@ def resolve_argument(name: str, given: PyTree, own: PyTree, elapsed: Numbers) ->
 def replan(planner: PyTree, cases: PyTree, previous: PlanT, elapsed: PyTree, **news: Any) -> PlanT:
     """Plan again while a plan is executed, by a few iterations from the remainder of that plan.
 
+    Inside compiled functions, cases, plans, times and changes of hits, catches and rallies may be
+    traced. Traced numbers are not checked: an invalid one leads to the status `BAD_INPUT`.
+
     Args:
         planner: a planner with a `replanner`, such as `pj.catch.planner("exact")`, or a re-planner
             with its own settings, such as `ReplanCatch(shortest=0.2)`.

@@ -93,7 +93,8 @@ def add_request(
 
 
 def _has_axes(value: object) -> bool:
-    return np.ndim(numeric(value)) > 0
+    array = numeric(value)
+    return array is not None and array.ndim > 0
 
 
 def with_request(cases: PyTree, heading: Heading) -> PyTree:

@@ -5,12 +5,12 @@ from collections.abc import Callable
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jaxtyping import PyTree
 
 from planner_jax.core import rules
 from planner_jax.core.arithmetic import numpy_of, to_host
 from planner_jax.core.checks import shape_of
 from planner_jax.core.errors import ArgumentError
-from planner_jax.core.rules import CaseT
 from planner_jax.robot.quadrotor import Air, add_drag, thrust_in_air
 from planner_jax.robot.quadrotor_model import QuadrotorModel
 
@@ -29,7 +29,7 @@ def air_of(
     return Air(across, along, leaf("wind", (0.0, 0.0, 0.0) if wind is None else wind, 3))
 
 
-def check_hover(cases: CaseT) -> CaseT:
+def check_hover(cases: PyTree) -> PyTree:
     """Return cases with air; raise `CaseError` if hovering needs more thrust than the limits allow.
 
     Traced cases are marked instead, as by `require_or_mark`.
@@ -43,4 +43,5 @@ def check_hover(cases: CaseT) -> CaseT:
         most = numpy_of(most, lift).minimum(most, lift)
     least = f"{most.min():.3g} m/s^2" if isinstance(most, np.ndarray | np.generic) else "the limit"
     words = f"weak enough to hover within {least} of thrust"
-    return rules.require_or_mark(cases, "wind: thrust at hover", thrust, thrust <= most, words)
+    is_enough = numpy_of(thrust, most).less_equal(thrust, most)
+    return rules.require_or_mark(cases, "wind: thrust at hover", thrust, is_enough, words)

@@ -13,7 +13,7 @@ from planner_jax.core import rules
 from planner_jax.core.arithmetic import numpy_of, to_host
 from planner_jax.core.checks import numbers_of
 from planner_jax.core.errors import ArgumentError, ArgumentTypeError
-from planner_jax.core.rules import CaseT, Field, Table
+from planner_jax.core.rules import Field, Table
 from planner_jax.robot.quadrotor import QuadrotorLimits, RotorLimits
 from planner_jax.robot.quadrotor_model import NET, RECOVERY_TILT, QuadrotorModel, Tool
 
@@ -97,7 +97,7 @@ def start_state(
     return jnp.asarray(numpy_of(*rows).stack(rows, axis=-2), dtype)
 
 
-def check_start(cases: CaseT) -> CaseT:
+def check_start(cases: PyTree) -> PyTree:
     """Return the cases; raise `CaseError` for a start below `min_height` or too strong a wind.
 
     Traced cases are marked instead, as by `require_or_mark`.

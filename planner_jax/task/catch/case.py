@@ -154,6 +154,10 @@ def case(
     the planner first replaces both. `CaseError` is raised for an invalid number, `ValueError` for a
     wrong shape, `TypeError` for a wrong type.
 
+    Inside compiled functions every number may be a traced array. Traced numbers are not checked: an
+    invalid one leads to the status `BAD_INPUT` of the plan. Shapes and types are checked, and a
+    traced `start` has the origin (0, 0) by default.
+
     * `targets`: paths of the targets, such as a `BallPath`; leaves have leading axes (..., N).
     * `horizon`: (..., N) [s], latest time at which each target may be caught.
     * `present`: (..., N) bool, whether each target exists.

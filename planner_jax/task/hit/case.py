@@ -146,6 +146,10 @@ def case(
 ) -> HitCase:
     """Make one case of a hit, or a batch; defaults are the numbers of [Yu2023bat, Section VI-A].
 
+    Inside compiled functions every number may be a traced array. Traced numbers are not checked: an
+    invalid one leads to the status `BAD_INPUT` of the plan. Shapes and types are checked, and a
+    traced `start` has the origin (0, 0) by default.
+
     Args:
         ball_pos: (..., 3) [m], position of the ball at time 0, above the ground at z = 0.
         ball_vel: (..., 3) [m/s], velocity of the ball at time 0.

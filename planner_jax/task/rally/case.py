@@ -81,6 +81,10 @@ def case(
 ) -> RallyCase:
     """Make one case of K hits in a row, or a batch.
 
+    Inside compiled functions every number may be a traced array. Traced numbers are not checked: an
+    invalid one leads to the status `BAD_INPUT` of the plan. Shapes and types are checked, and a
+    traced `start` has the origin (0, 0) by default.
+
     Args:
         ball_pos: (..., 3) [m], position of the ball at `ball_time`, above the ground at z = 0.
         ball_vel: (..., 3) [m/s], velocity of the ball at `ball_time`.

@@ -87,8 +87,8 @@ class ReplanRally(OptimisedPlanner):
         index = index.clip(max=index.shape[-1] - 1)[..., None]
 
         def later(boxes: Array) -> Numbers:
-            boxes = to_host(boxes)
-            return numpy_of(boxes, index).take_along_axis(boxes, index, axis=-2)
+            known = to_host(boxes)
+            return numpy_of(known, index).take_along_axis(known, index, axis=-2)
 
         own = {
             "drag": (drag, cases.drag),
