@@ -154,7 +154,7 @@ def case(
     the planner first replaces both. `CaseError` is raised for an invalid number, `ValueError` for a
     wrong shape, `TypeError` for a wrong type.
 
-    Inside compiled functions every number may be a traced array. Traced numbers are not checked: an
+    Inside compiled functions every number may be a traced array. Values are then not checked: an
     invalid one leads to the status `BAD_INPUT` of the plan. Shapes and types are checked, and a
     traced `start` has the origin (0, 0) by default.
 

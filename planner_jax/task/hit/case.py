@@ -146,7 +146,7 @@ def case(
 ) -> HitCase:
     """Make one case of a hit, or a batch; defaults are the numbers of [Yu2023bat, Section VI-A].
 
-    Inside compiled functions every number may be a traced array. Traced numbers are not checked: an
+    Inside compiled functions every number may be a traced array. Values are then not checked: an
     invalid one leads to the status `BAD_INPUT` of the plan. Shapes and types are checked, and a
     traced `start` has the origin (0, 0) by default.
 

@@ -81,7 +81,7 @@ def case(
 ) -> RallyCase:
     """Make one case of K hits in a row, or a batch.
 
-    Inside compiled functions every number may be a traced array. Traced numbers are not checked: an
+    Inside compiled functions every number may be a traced array. Values are then not checked: an
     invalid one leads to the status `BAD_INPUT` of the plan. Shapes and types are checked, and a
     traced `start` has the origin (0, 0) by default.
 
