@@ -220,8 +220,12 @@ def test_a_scan_plans_and_plans_again(task):
 @tasks
 @pytest.mark.slow
 def test_vmap_plans_every_lane(task):
-    name = "juggle" if task == "hit" else "exact"
-    planner = pj.task_named(task).planner(name)
+    planners = {
+        "hit": pj.hit.planner("juggle"),
+        "catch": pj.catch.planner("exact", decide="greedy", rounds=FEW),
+        "rally": pj.rally.planner("exact", rounds=FEW),
+    }
+    planner = planners[task]
     bad = POSITIONS.copy()
     bad[1] = np.nan
     program = jax.jit(jax.vmap(lambda pos: pj.solve(planner, make(task, pos))))
