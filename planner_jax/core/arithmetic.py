@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
+from jax.core import Tracer
 from numpy.typing import DTypeLike
 
 
@@ -24,6 +25,14 @@ Numbers = Array | np.ndarray
 def numpy_of(*arrays: object) -> ModuleType:
     """Return `jax.numpy` if one of the arrays is a jax array, otherwise `numpy`."""
     return jnp if any(isinstance(each, jax.Array) for each in arrays) else np
+
+
+def to_host(value: object) -> Numbers:
+    """Return a value as a NumPy array; a traced array, which has no values yet, is unchanged.
+
+    `numpy_of` of such arrays is thus `jax.numpy` only if one of them is traced.
+    """
+    return value if isinstance(value, Tracer) else np.asarray(value)
 
 
 @jax.custom_jvp

@@ -13,7 +13,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import PyTree
 
-from planner_jax.core.arithmetic import Numbers
+from planner_jax.core.arithmetic import Numbers, numpy_of, to_host
 from planner_jax.core.errors import ArgumentError, ArgumentTypeError
 from planner_jax.core.rules import FINITE, Rule
 
@@ -75,7 +75,8 @@ _HOSTS = (np.ndarray, np.generic, float)
 def numeric(value: object) -> Numbers | None:
     """Return numbers or bools as an array, jax arrays unchanged; None if the value is neither.
 
-    An array with masked entries is neither, since its masked numbers would count like others.
+    A list or tuple with traced numbers becomes a traced array. An array with masked entries is
+    neither, since its masked numbers would count like others.
     """
     if isinstance(value, np.ma.MaskedArray) and np.ma.is_masked(value):
         return None
@@ -84,26 +85,30 @@ def numeric(value: object) -> Numbers | None:
             array: Numbers = value
         else:
             array = np.asarray(value)
+    except jax.errors.TracerArrayConversionError:  # a list or tuple with traced numbers
+        try:
+            array = jnp.asarray(value)
+        except (TypeError, ValueError):
+            return None
     except ValueError:  # rows of different lengths
         return None
-    if array.dtype.kind in "biuf" or jnp.issubdtype(array.dtype, jnp.floating):
+    if getattr(array.dtype, "kind", "O") in "biuf" or jnp.issubdtype(array.dtype, jnp.floating):
         return array
     return None
 
 
-def numbers_of(
-    name: str, value: object, batch: tuple[int, ...], shape: tuple[int, ...]
-) -> np.ndarray:
+def numbers_of(name: str, value: object, batch: tuple[int, ...], shape: tuple[int, ...]) -> Numbers:
     """Return numbers for every case of a batch, as an array of the shape batch + shape.
 
-    The argument has this shape, or the shape `shape` for numbers that all cases share. Other shapes
-    raise, so that no axis is broadcast by accident. `batch` is () for one case, (B,) for B cases.
+    It is a traced array if the argument is traced, otherwise a NumPy array. The argument has this
+    shape, or the shape `shape` for numbers that all cases share. Other shapes raise, so that no
+    axis is broadcast by accident. `batch` is () for one case, (B,) for B cases.
     """
-    array, whole = np.asarray(require_numeric(name, value)), (*batch, *shape)
+    array, whole = to_host(require_numeric(name, value)), (*batch, *shape)
     if array.shape not in (shape, whole):
         rule = f"{shape}" if whole == shape else f"{shape} or {whole}"
         raise ArgumentError(name, f"the shape {rule}", array.shape, verb="have")
-    return array if array.shape == whole else np.broadcast_to(array, whole)
+    return array if array.shape == whole else numpy_of(array).broadcast_to(array, whole)
 
 
 def shape_of(name: str, value: object) -> tuple[int, ...]:

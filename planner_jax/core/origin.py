@@ -13,10 +13,11 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jax import Array
+from jax.core import Tracer
 from jax.typing import DTypeLike
 from jaxtyping import PyTree
 
-from planner_jax.core.arithmetic import Numbers
+from planner_jax.core.arithmetic import Numbers, numpy_of, to_host
 from planner_jax.core.checks import numbers_of, numeric
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.rules import Rule
@@ -48,16 +49,20 @@ class Located:
 
 def find_origin(
     start: object, origin: object, batch: tuple[int, ...], dtype: DTypeLike
-) -> np.ndarray | None:
+) -> Numbers | None:
     """Return the origin (2,) float64 [m] of a case or batch; None for (0, 0).
 
-    By default it is the multiple of 100 m next to the first position `start`.
+    By default it is the multiple of 100 m next to the first position `start`, and None if `start`
+    is traced. A traced `origin` is never None, since it has no values yet.
     """
     if 0 in batch:
         raise ArgumentError("cases", "at least one", shown=f"the batch shape {batch}")
-    first = numbers_of("start", start, batch, (3,)).reshape(-1, 3)[0, :2].astype(np.float64)
+    first = numbers_of("start", start, batch, (3,)).reshape(-1, 3)[0, :2].astype(float)
     if origin is not None:
-        first = numbers_of("origin", origin, (), (2,)).astype(np.float64)
+        first = numbers_of("origin", origin, (), (2,)).astype(float)
+    if isinstance(first, Tracer):
+        return None if origin is None else first
+    if origin is not None:
         if not (first == first.astype(dtype)).all():
             rule = f"exact in {np.dtype(dtype)}, such as a multiple of 100 m"
             raise ArgumentError("origin", rule, origin)
@@ -69,13 +74,16 @@ def find_origin(
 def move(
     name: str,
     value: PyTree,
-    by: np.ndarray | None,
+    by: Numbers | None,
     dtype: DTypeLike,
     index: tuple[int, ...] = (),
     *,
     is_strict: bool = False,
 ) -> PyTree:
     """Return positions moved by the vectors `by` (..., 2) [m], added in float64; None: unchanged.
+
+    Traced float32 positions are moved in float32. Where they have been rounded by over 1 mm, they
+    become NaN, which leads to the status `BAD_INPUT`.
 
     Args:
         name: name of the argument, for errors.
@@ -111,27 +119,33 @@ def move(
     array, axes = numeric(value), by.shape[:-1]
     if array is None or array.shape[-1:] != (3,) or array.shape[: len(axes)] != axes:
         return value  # the caller's checks name the argument
-    array = np.asarray(array)
+    array = to_host(array)
+    moved = _add(array, by, index)
     if array.dtype.kind == "f":
-        rounding = float(jnp.finfo(array.dtype).eps) * np.abs(array).max(initial=0.0)
-        if rounding > ROUNDING:
+        eps = float(jnp.finfo(array.dtype).eps)
+        if isinstance(array, Tracer):
+            moved = jnp.where(eps * abs(array) > ROUNDING, jnp.nan, moved)
+        elif (rounding := eps * np.abs(array).max(initial=0.0)) > ROUNDING:
             rule = f"in float64 NumPy arrays, as {array.dtype} rounds them by {rounding:.2g} m"
             raise ArgumentError(name, rule, shown="")
-    return jnp.asarray(_add(array, by, index).astype(dtype))
+    return jnp.asarray(moved.astype(dtype))
 
 
-def _add(values: np.ndarray, by: np.ndarray, index: tuple[int, ...] = ()) -> np.ndarray:
-    moved = values.astype(np.float64)
-    part = moved[(..., *index, slice(by.shape[-1]))]
-    part += by.reshape(by.shape[:-1] + (1,) * (part.ndim - by.ndim) + by.shape[-1:])
-    return moved
+def _add(values: Numbers, by: Numbers, index: tuple[int, ...] = ()) -> Numbers:
+    place = (..., *index, slice(by.shape[-1]))
+    moved = numpy_of(values, by).asarray(values).astype(float)
+    by = by.reshape(by.shape[:-1] + (1,) * (moved[place].ndim - by.ndim) + by.shape[-1:])
+    if isinstance(moved, np.ndarray):
+        moved[place] += by
+        return moved
+    return moved.at[place].add(by)
 
 
 def to_world(positions: Numbers, origin: Numbers | None) -> PyTree:
     """Return positions (..., 3) plus the origin (2,) or (B, 2) in float64; None: unchanged."""
     if origin is None:
         return positions
-    return _add(np.asarray(positions), np.asarray(origin, np.float64))
+    return _add(to_host(positions), to_host(origin).astype(float))
 
 
 def without_origin(tree: TreeT) -> TreeT:

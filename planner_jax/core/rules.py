@@ -186,6 +186,19 @@ def require_rule(
     raise CaseError(name, words, first, index, other=other, more=len(cases) - 1)
 
 
+def require_or_mark(cases: PyTree, name: str, value: Numbers, holds: Numbers, words: str) -> PyTree:
+    """Return the cases if `holds` is true everywhere, and raise `CaseError` as `require_rule` does.
+
+    Where a traced `holds` is false, the gravity becomes NaN, which leads to the status `BAD_INPUT`.
+    """
+    batch = cases.batch_shape
+    if not isinstance(holds, Tracer):
+        require_rule(name, value, holds, words, batch)
+        return cases
+    are_kept = holds.reshape(*batch, -1).all(axis=-1)
+    return dataclasses.replace(cases, gravity=jnp.where(are_kept, cases.gravity, jnp.nan))
+
+
 def require_shapes(cases: PyTree) -> None:
     """Raise `ArgumentError` unless each array, traced or not, has its field's shape and type."""
     for place, part in _parts(cases):

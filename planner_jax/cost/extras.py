@@ -18,8 +18,8 @@ from jax import Array
 from jax.typing import DTypeLike
 from jaxtyping import PyTree
 
-from planner_jax.core.arithmetic import Numbers
-from planner_jax.core.checks import format_shapes
+from planner_jax.core.arithmetic import Numbers, numpy_of, to_host
+from planner_jax.core.checks import format_shapes, numeric
 from planner_jax.core.errors import ArgumentError, ArgumentTypeError
 from planner_jax.cost.penalty import greatest_by_tangents
 from planner_jax.trajectory.polynomial import Motion
@@ -62,8 +62,15 @@ def for_batch(extras: object, batch: tuple[int, ...], dtype: DTypeLike) -> tuple
         if isinstance(extra, type) or not isinstance(extra, ExtraLimit | ExtraCost):
             raise ArgumentTypeError("extras", "a method excess or cost", extra, verb="have")
 
+    def read(value: object) -> Numbers:
+        array = numeric(value)
+        return to_host(value if array is None else array)
+
+    def repeat(array: Numbers, lead: tuple[int, ...]) -> Numbers:
+        return numpy_of(array).broadcast_to(array, lead + array.shape)
+
     def spread(place: int, extra: Extra) -> Extra:
-        extra = jax.tree.map(np.asarray, extra, is_leaf=lambda x: isinstance(x, tuple | list))
+        extra = jax.tree.map(read, extra, is_leaf=lambda x: isinstance(x, tuple | list))
         shapes = [leaf.shape for leaf in jax.tree.leaves(extra)]
         sample = np.ones((2 + max((0, *batch, *sum(shapes, ()))), 3))  # longer than any leaf
         methods = [extra.excess] if isinstance(extra, ExtraLimit) else []
@@ -77,7 +84,7 @@ def for_batch(extras: object, batch: tuple[int, ...], dtype: DTypeLike) -> tuple
             found = f"a {type(extra).__name__} with {format_shapes(extra)}"
             raise ArgumentError(f"extras.{place}", rule, shown=found)
         lead = batch if alike else ()
-        return jax.tree.map(lambda x: jnp.asarray(np.broadcast_to(x, lead + x.shape), dtype), extra)
+        return jax.tree.map(lambda x: jnp.asarray(repeat(x, lead), dtype), extra)
 
     return tuple(spread(place, extra) for place, extra in enumerate(extras))
 

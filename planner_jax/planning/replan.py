@@ -3,11 +3,14 @@
 from typing import Any, Generic
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jax import Array
+from jax.core import Tracer
 from jaxtyping import PyTree
 
+from planner_jax.core.arithmetic import Numbers, to_host
 from planner_jax.core.checks import numbers_of, require_kind
 from planner_jax.core.compiled import with_own_precision
 from planner_jax.core.errors import ArgumentError
@@ -15,7 +18,7 @@ from planner_jax.core.origin import Located, move, with_origin, without_origin
 from planner_jax.core.planner import CaseT, PlanT, require_planner
 from planner_jax.core.rules import Case
 from planner_jax.planning.plan import plan
-from planner_jax.trajectory.polynomial import PiecewisePolynomial, states_at
+from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate, states_at
 
 
 @struct.dataclass
@@ -32,16 +35,20 @@ class Replanning(Generic[CaseT, PlanT]):
         return self.case.batch_shape
 
 
-def check_elapsed(cases: Case, elapsed: PyTree) -> np.ndarray:
+def check_elapsed(cases: Case, elapsed: PyTree) -> Numbers:
     """Check and return the time [s] since the plans started: one number, or one for each case.
+
+    A traced time that is negative or infinite becomes NaN.
 
     Raises:
         TypeError: `elapsed` is not a number.
         ValueError: `elapsed` is negative, not finite, or of another shape.
     """
-    dtypes = (np.asarray(leaf).dtype for leaf in jax.tree.leaves(cases))
+    dtypes = (to_host(leaf).dtype for leaf in jax.tree.leaves(cases))
     dtype = next(dtype for dtype in dtypes if dtype.kind == "f")
     elapsed = numbers_of("elapsed", elapsed, cases.batch_shape, ()).astype(dtype)
+    if isinstance(elapsed, Tracer):
+        return jnp.where((elapsed >= 0.0) & (elapsed < np.inf), elapsed, np.nan)
     # For a single number, minimum and maximum take a third of the time that `np.all` takes.
     least = np.minimum.reduce(elapsed, axis=None, initial=np.inf)
     most = np.maximum.reduce(elapsed, axis=None, initial=0.0)
@@ -52,29 +59,40 @@ def check_elapsed(cases: Case, elapsed: PyTree) -> np.ndarray:
     return elapsed
 
 
-def planned_state(trajectory: PiecewisePolynomial, elapsed: np.ndarray) -> np.ndarray:
+def planned_state(trajectory: PiecewisePolynomial, elapsed: Numbers) -> Numbers:
     """Return position, velocity, acceleration and jerk (..., 4, 3) as planned at `elapsed` [s].
 
     After the end of the trajectory, the state is that at the end.
     """
+    if any(isinstance(each, Tracer) for each in (*jax.tree.leaves(trajectory), elapsed)):
+        find = _state_at if elapsed.ndim == 0 else jax.vmap(_state_at)
+        return find(jax.tree.map(jnp.asarray, trajectory), jnp.asarray(elapsed))
     end = np.sum(trajectory.durations, axis=-1)
     return np.asarray(states_at(trajectory, np.asarray(np.minimum(elapsed, end))))
 
 
-def resolve_argument(name: str, given: PyTree, own: PyTree, elapsed: np.ndarray) -> np.ndarray:
+def _state_at(trajectory: PiecewisePolynomial, elapsed: Array) -> Array:
+    time = jnp.minimum(elapsed, jnp.sum(trajectory.durations))
+    return jnp.stack([evaluate(trajectory, time, order) for order in range(4)])
+
+
+def resolve_argument(name: str, given: PyTree, own: PyTree, elapsed: Numbers) -> Numbers:
     """Return an argument's value: `given` by the caller or, if that is None, `own` of the plan.
 
     Both values are for one case, or for each case. The result has the shape and type of `elapsed`.
+    It is NaN where a traced `elapsed` is NaN, which leads to the status `BAD_INPUT`.
 
     Raises:
         TypeError: the argument does not hold numbers.
         ValueError: the argument has another shape, or is not finite.
     """
-    if given is None:
-        return np.asarray(own, elapsed.dtype)
-    batch = elapsed.shape
-    found = numbers_of(name, given, batch, np.shape(own)[len(batch) :]).astype(elapsed.dtype)
-    if not np.isfinite(found).all():
+    batch, shape = elapsed.shape, np.shape(own)
+    found = to_host(own) if given is None else numbers_of(name, given, batch, shape[len(batch) :])
+    found = found.astype(elapsed.dtype)
+    if isinstance(elapsed, Tracer):
+        times = elapsed.reshape(batch + (1,) * (len(shape) - len(batch)))
+        return jnp.where(times == times, found, np.nan)
+    if given is not None and not isinstance(found, Tracer) and not np.isfinite(found).all():
         raise ArgumentError(name, "finite", given)
     return found
 
@@ -82,6 +100,9 @@ def resolve_argument(name: str, given: PyTree, own: PyTree, elapsed: np.ndarray)
 @with_own_precision
 def replan(planner: PyTree, cases: PyTree, previous: PlanT, elapsed: PyTree, **news: Any) -> PlanT:
     """Plan again while a plan is executed, by a few iterations from the remainder of that plan.
+
+    Inside compiled functions, cases, plans, times and changes of hits, catches and rallies may be
+    traced. Traced numbers are not checked: an invalid one leads to the status `BAD_INPUT`.
 
     Args:
         planner: a planner with a `replanner`, such as `pj.catch.planner("exact")`, or a re-planner
@@ -116,7 +137,8 @@ def replan(planner: PyTree, cases: PyTree, previous: PlanT, elapsed: PyTree, **n
         )
     if not isinstance(cases, Located) or cases.origin is None:
         return plan(again, again.begin(cases, previous, elapsed, **news))
-    dtype, by = np.asarray(cases.origin).dtype, -np.asarray(cases.origin, np.float64)
+    origin = to_host(cases.origin)
+    dtype, by = origin.dtype, -origin.astype(float)
     news |= {k: move(k, news[k], by, dtype, at) for k, at in cases.positions.items() if k in news}
     near = again.begin(without_origin(cases), without_origin(previous), elapsed, **news)
     return with_origin(plan(again, near), cases)

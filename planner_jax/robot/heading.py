@@ -19,7 +19,8 @@ from jaxtyping import PyTree
 
 from planner_jax.ball.flight_table import NODES, SUBSTEPS, tabulate_flight
 from planner_jax.ball.target import state_at
-from planner_jax.core.arithmetic import Numbers, numpy_of
+from planner_jax.core.arithmetic import Numbers, numpy_of, to_host
+from planner_jax.core.checks import numeric, shape_of
 from planner_jax.core.choices import require, require_one_of
 from planner_jax.core.rules import POSITIVE, Field, Rule, Table
 from planner_jax.robot.attitude import yaw_at
@@ -73,20 +74,27 @@ def add_request(
     if isinstance(heading, str):
         require_one_of(_FOLLOWED, "heading", heading)
         follows, angles = heading, 0.0
-    if isinstance(heading, tuple | list) and len(heading) == 2 and all(map(np.ndim, heading)):
-        times, angles = heading[0], leaf("heading", heading[1], np.shape(heading[0])[-1])
+    if isinstance(heading, tuple | list) and len(heading) == 2 and all(map(_has_axes, heading)):
+        times, angles = heading[0], leaf("heading", heading[1], shape_of("heading", heading[0])[-1])
     else:
         angles = jnp.repeat(leaf("heading", angles)[..., None], 2, axis=-1)
-    times = leaf("heading", times, np.shape(times)[-1])
-    first = np.vectorize(np.interp, signature="(),(n),(n)->()")(0.0, times, angles)
-    if attitude is not None:
-        w, _, _, z = np.moveaxis(np.asarray(leaf("start_attitude", attitude, 4)), -1, 0)
-        start = 2.0 * np.arctan2(z, w)
-        turns = np.round((start - first) / (2.0 * np.pi))
+    times = leaf("heading", times, shape_of("heading", times)[-1])
+    quaternion = None if attitude is None else to_host(leaf("start_attitude", attitude, 4))
+    xp = numpy_of(to_host(times), to_host(angles), quaternion)  # jax.numpy if one is traced
+    first = xp.vectorize(xp.interp, signature="(),(n),(n)->()")(0.0, times, angles)
+    if quaternion is not None:
+        w, _, _, z = xp.moveaxis(quaternion, -1, 0)
+        start = 2.0 * xp.arctan2(z, w)
+        turns = xp.round((start - first) / (2.0 * np.pi))
         first, angles = start, angles + leaf("heading", 2.0 * np.pi * turns)[..., None]
-    start = leaf("heading", np.stack([first, 0.0 * first], axis=-1), 2)
+    start = leaf("heading", xp.stack([first, 0.0 * first], axis=-1), 2)
     most = leaf("max_yaw_rate", MAX_YAW_RATE if most is None else most)
     return with_request(cases, Heading(angles, times, most, start, follows))
+
+
+def _has_axes(value: object) -> bool:
+    array = numeric(value)
+    return array is not None and array.ndim > 0
 
 
 def with_request(cases: PyTree, heading: Heading) -> PyTree:

@@ -2,14 +2,13 @@
 
 from collections.abc import Callable
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.core import Tracer
 from jaxtyping import PyTree
 
 from planner_jax.core import rules
+from planner_jax.core.arithmetic import numpy_of, to_host
 from planner_jax.core.checks import shape_of
 from planner_jax.core.errors import ArgumentError
 from planner_jax.robot.quadrotor import Air, add_drag, thrust_in_air
@@ -30,15 +29,19 @@ def air_of(
     return Air(across, along, leaf("wind", (0.0, 0.0, 0.0) if wind is None else wind, 3))
 
 
-def require_hover(cases: PyTree) -> None:
-    """Raise `CaseError` if the wind needs more thrust at hover than the limits allow."""
+def check_hover(cases: PyTree) -> PyTree:
+    """Return cases with air; raise `CaseError` if hovering needs more thrust than the limits allow.
+
+    Traced cases are marked instead, as by `require_or_mark`.
+    """
     limits, gravity, air = cases.limits, cases.gravity, cases.limits.air
-    if air is None or any(isinstance(x, Tracer) for x in jax.tree.leaves((limits, gravity))):
-        return
     still = jnp.zeros_like(air.wind)
-    thrust = np.asarray(thrust_in_air(air, still, add_drag(air, still, still), gravity))
-    most = np.asarray(limits.thrust_bounds[1])
+    thrust = to_host(thrust_in_air(air, still, add_drag(air, still, still), gravity))
+    most = to_host(limits.thrust_bounds[1])
     if (rotors := limits.rotors) is not None:
-        most = np.minimum(most, rotors.mixer.shape[-2] * rotors.max_thrust / rotors.mass)
-    words = f"weak enough to hover within {most.min():.3g} m/s^2 of thrust"
-    rules.require_rule("wind: thrust at hover", thrust, thrust <= most, words, cases.batch_shape)
+        lift = to_host(rotors.mixer.shape[-2] * rotors.max_thrust / rotors.mass)
+        most = numpy_of(most, lift).minimum(most, lift)
+    least = f"{most.min():.3g} m/s^2" if isinstance(most, np.ndarray | np.generic) else "the limit"
+    words = f"weak enough to hover within {least} of thrust"
+    is_enough = numpy_of(thrust, most).less_equal(thrust, most)
+    return rules.require_or_mark(cases, "wind: thrust at hover", thrust, is_enough, words)

@@ -10,6 +10,7 @@ from jax.typing import DTypeLike
 from jaxtyping import PyTree
 
 from planner_jax.core import rules
+from planner_jax.core.arithmetic import numpy_of, to_host
 from planner_jax.core.checks import numbers_of
 from planner_jax.core.errors import ArgumentError, ArgumentTypeError
 from planner_jax.core.rules import Field, Table
@@ -74,38 +75,41 @@ def start_state(
     acceleration: the thrust is along body z, and equal to the weight.
     """
     velocity, acceleration, attitude = motion
-    head = np.zeros(batch + (4, 3))
-    rows = {"start": start, "start_velocity": velocity, "start_acceleration": acceleration}
-    for k, (name, value) in enumerate(rows.items()):
-        head[..., k, :] = numbers_of(name, value, batch, (3,))
+    given = {"start": start, "start_velocity": velocity, "start_acceleration": acceleration}
+    rows = [numbers_of(name, value, batch, (3,)) for name, value in given.items()]
     if attitude is not None:
-        if head[..., 2, :].any():
+        if isinstance(rows[2], Tracer) or rows[2].any():
             raise ArgumentError(
                 "start_attitude", "left out beside start_acceleration", shown="both"
             )
-        w, x, y, z = np.moveaxis(numbers_of("start_attitude", attitude, batch, (4,)), -1, 0)
-        square = np.asarray(w * w + x * x + y * y + z * z, float)
-        rules.require_rule("start_attitude", square, square > 0.0, "a quaternion", batch)
+        quaternion = numbers_of("start_attitude", attitude, batch, (4,))
+        xp = numpy_of(quaternion)
+        w, x, y, z = xp.moveaxis(quaternion, -1, 0)
+        square = xp.asarray(w * w + x * x + y * y + z * z, float)
+        if xp is np:  # a traced quaternion of zeros leads to an acceleration of NaN
+            rules.require_rule("start_attitude", square, square > 0.0, "a quaternion", batch)
         # Exactly upside down, the thrust alone would not determine the axis of the tilt.
-        w = np.where(w * w + z * z == 0.0, _LEAST_COSINE * np.sqrt(square), w)
-        axis = 2.0 * np.stack([w * y + x * z, y * z - w * x, -x * x - y * y], axis=-1)
-        weight = np.asarray(numbers_of("gravity", gravity, batch, ()), float)
-        head[..., 2, :] = weight[..., None] * axis / square[..., None]  # weight * (body z - e_3)
-    return jnp.asarray(head, dtype)
+        w = xp.where(w * w + z * z == 0.0, _LEAST_COSINE * xp.sqrt(square), w)
+        axis = 2.0 * xp.stack([w * y + x * z, y * z - w * x, -x * x - y * y], axis=-1)
+        weight = numbers_of("gravity", gravity, batch, ()).astype(float)
+        rows[2] = weight[..., None] * axis / square[..., None]  # weight * (body z - e_3)
+    rows = [row.astype(float) for row in (*rows, np.zeros(batch + (3,)))]
+    return jnp.asarray(numpy_of(*rows).stack(rows, axis=-2), dtype)
 
 
-def require_start(cases: PyTree) -> None:
-    """Raise `CaseError` for a start below `min_height` or too strong a wind; skip JAX tracers."""
-    heights = cases.head_state[..., 0, 2], cases.limits.min_height
-    if any(isinstance(each, Tracer) for each in heights):
-        return
-    height, least = map(np.asarray, heights)
+def check_start(cases: PyTree) -> PyTree:
+    """Return the cases; raise `CaseError` for a start below `min_height` or too strong a wind.
+
+    Traced cases are marked instead, as by `require_or_mark`.
+    """
+    height, least = to_host(cases.head_state)[..., 0, 2], to_host(cases.limits.min_height)
     words = "at a height >= min_height"
-    rules.require_rule("start", height, height >= least, words, cases.batch_shape)
-    if cases.limits.air is not None:
-        from planner_jax.task.air import require_hover  # few cases have drag
+    cases = rules.require_or_mark(cases, "start", height, height >= least, words)
+    if cases.limits.air is None:
+        return cases
+    from planner_jax.task.air import check_hover  # few cases have drag
 
-        require_hover(cases)
+    return check_hover(cases)
 
 
 def require_own_robot(robot: object, usual: QuadrotorModel, suite: str, wind: object) -> None:

@@ -14,8 +14,8 @@ from jaxtyping import PyTree
 
 from planner_jax.ball.target import TargetPath
 from planner_jax.core import GRAVITY
-from planner_jax.core.arithmetic import Numbers
-from planner_jax.core.checks import floating, numeric, require_switch, shape_of
+from planner_jax.core.arithmetic import Numbers, numpy_of, to_host
+from planner_jax.core.checks import floating, numbers_of, numeric, require_switch, shape_of
 from planner_jax.core.errors import ArgumentError, ArgumentTypeError
 from planner_jax.core.origin import NEAR, Located, find_origin, move
 from planner_jax.core.paths import require_path
@@ -154,6 +154,10 @@ def case(
     the planner first replaces both. `CaseError` is raised for an invalid number, `ValueError` for a
     wrong shape, `TypeError` for a wrong type.
 
+    Inside compiled functions every number may be a traced array. Values are then not checked: an
+    invalid one leads to the status `BAD_INPUT` of the plan. Shapes and types are checked, and a
+    traced `start` has the origin (0, 0) by default.
+
     * `targets`: paths of the targets, such as a `BallPath`; leaves have leading axes (..., N).
     * `horizon`: (..., N) [s], latest time at which each target may be caught.
     * `present`: (..., N) bool, whether each target exists.
@@ -198,7 +202,7 @@ def case(
         present=_broadcast_present(present, shape),
         horizon=leaf("horizon", horizon, num),
         order=jnp.asarray(np.broadcast_to(np.arange(num, dtype=np.int32), shape), jnp.int32),
-        times=leaf("horizon", shares * np.asarray(horizon)[..., :1], num),
+        times=leaf("horizon", shares * numbers_of("horizon", horizon, batch, (num,))[..., :1], num),
         head_state=quadrotor.start_state(near("start", start), motion, gravity, batch, dtype),
         gravity=leaf("gravity", gravity),
         net=Net(
@@ -213,14 +217,13 @@ def case(
     )
     cases = quadrotor.add_heading(cases, leaf, heading, max_yaw_rate, start_attitude)
     require_sound(cases, _ARGUMENTS)
-    quadrotor.require_start(cases)
-    return cases
+    return quadrotor.check_start(cases)
 
 
 def _broadcast_present(present: ArrayLike, shape: tuple[int, ...]) -> Array:
-    array = numeric(present)
-    if array is None or array.dtype != np.bool_:
+    array = to_host(numeric(present))
+    if array.dtype != np.bool_:
         raise ArgumentTypeError("present", "True or False of each target", present)
     if array.shape not in ((), shape[-1:], shape):
         raise ArgumentError("present", f"the shape {shape}", array.shape, verb="have")
-    return jnp.asarray(np.broadcast_to(array, shape), bool)
+    return jnp.asarray(numpy_of(array).broadcast_to(array, shape), bool)

@@ -15,6 +15,7 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from planner_jax.ball.target import TargetPath
+from planner_jax.core.arithmetic import numpy_of, to_host
 from planner_jax.core.paths import require_path
 from planner_jax.optimise.chain_remainder import evaluate_pieces, fit_offsets
 from planner_jax.optimise.planner import OptimisedPlanner
@@ -102,24 +103,24 @@ class ReplanCatch(OptimisedPlanner):
         own = planned_state(previous.trajectory, elapsed)
         head_state = resolve_argument("head_state", head_state, own, elapsed)
         since = elapsed[..., None]
-        order, times = np.asarray(previous.order), np.asarray(previous.times)
-        present, horizon = np.asarray(cases.present), np.asarray(cases.horizon)
+        order, times = to_host(previous.order), to_host(previous.times)
+        present, horizon = to_host(cases.present), to_host(cases.horizon)
         is_past = times <= since
+        xp = numpy_of(order, is_past)  # jax.numpy if plans or times are traced
         if times.shape[-1] == 1:  # a single target needs no new order
             present = present & ~is_past
-        elif is_past.any():
-            caught = np.empty_like(is_past)
-            np.put_along_axis(caught, order, is_past, axis=-1)
+        elif xp is jnp or is_past.any():
+            caught = xp.take_along_axis(is_past, xp.argsort(order, axis=-1), axis=-1)
             present = present & ~caught
-            next_first = np.argsort(is_past, axis=-1, kind="stable")
-            order, times = (np.take_along_axis(x, next_first, axis=-1) for x in (order, times))
+            next_first = xp.argsort(is_past, axis=-1, stable=True)
+            order, times = (xp.take_along_axis(x, next_first, axis=-1) for x in (order, times))
         left = dataclasses.replace(
             cases,
             targets=targets,
             present=present,
             horizon=horizon - since,
             order=order,
-            times=np.maximum(times - since, _SHORTEST),
+            times=numpy_of(is_past).maximum(times - since, _SHORTEST),
             head_state=head_state,
         )
         return Replanning(case=left, previous=previous, elapsed=elapsed)

@@ -13,7 +13,7 @@ from jaxtyping import PyTree
 from planner_jax.ball.flight import BallState
 from planner_jax.ball.flight_table import is_resolved
 from planner_jax.core import GRAVITY, rules
-from planner_jax.core.arithmetic import Numbers, numpy_of
+from planner_jax.core.arithmetic import Numbers, numpy_of, to_host
 from planner_jax.core.checks import floating
 from planner_jax.core.origin import NEAR, Located, find_origin, move
 from planner_jax.core.rules import Field, Rule, Table, require_sound
@@ -146,6 +146,10 @@ def case(
 ) -> HitCase:
     """Make one case of a hit, or a batch; defaults are the numbers of [Yu2023bat, Section VI-A].
 
+    Inside compiled functions every number may be a traced array. Values are then not checked: an
+    invalid one leads to the status `BAD_INPUT` of the plan. Shapes and types are checked, and a
+    traced `start` has the origin (0, 0) by default.
+
     Args:
         ball_pos: (..., 3) [m], position of the ball at time 0, above the ground at z = 0.
         ball_vel: (..., 3) [m/s], velocity of the ball at time 0.
@@ -236,7 +240,5 @@ def case(
 
         cases = with_spin(cases, spin, ball_radius, ball, (0.0, 0.0, 0.0) if wind is None else wind)
     require_sound(cases, _ARGUMENTS)
-    quadrotor.require_start(cases)
-    height = np.asarray(cases.ball.pos)[..., 2]
-    rules.require_rule("ball_pos", height, height >= 0.0, "at a height >= 0 m", batch)
-    return cases
+    cases, height = quadrotor.check_start(cases), to_host(cases.ball.pos)[..., 2]
+    return rules.require_or_mark(cases, "ball_pos", height, height >= 0.0, "at a height >= 0 m")

@@ -22,7 +22,7 @@ from planner_jax.ball.flight_table import (
 )
 from planner_jax.ball.recording import BALLS, Ball
 from planner_jax.ball.spin import SpinningBall
-from planner_jax.core.arithmetic import at_least
+from planner_jax.core.arithmetic import at_least, numpy_of
 from planner_jax.core.checks import numbers_of, require_kind
 from planner_jax.core.choices import require
 from planner_jax.robot.quadrotor import tangent_basis
@@ -40,12 +40,20 @@ def with_spin(
     """Return the case with a ball of a radius [m] and a `spin` (3,) or (..., 3) [rad/s]."""
     ball = BALLS["table tennis"] if ball is None else ball
     require_kind("ball", ball, Ball)
-    turn = numbers_of("spin", spin, case.batch_shape, (3,)).astype(float)
-    require(bool((np.abs(turn) < 1e4).all()), "spin", "within 10,000 rad/s", spin)
+    batch = case.batch_shape
+    turn = numbers_of("spin", spin, batch, (3,)).astype(float)
+    is_slow = abs(turn) < 1e4
+    if isinstance(turn, np.ndarray):
+        require(bool(is_slow.all()), "spin", "within 10,000 rad/s", spin)
+    else:
+        turn = jnp.where(is_slow, turn, jnp.nan)  # leads to the status BAD_INPUT
+    radius = numbers_of("ball_radius", radius, batch, ()).astype(float)[..., None]
 
     def full(x: PyTree, *shape: int) -> Array:
-        return jnp.asarray(np.broadcast_to(x, (*case.batch_shape, *shape)), case.drag.dtype)
+        whole = numpy_of(x).broadcast_to(x, (*batch, *shape))
+        return jnp.asarray(whole, case.drag.dtype)
 
+    wind = numbers_of("wind", wind, batch, (3,))
     numbers = 0.0, case.restitution, ball.friction[0], ball.grip, ball.reach[0]
     around = spinning.Surroundings(case.gravity, full(wind, 3), *map(full, numbers))
     return case.replace(lift=full(turn * radius / ball.reach[0], 3), around=around)

@@ -5,12 +5,12 @@ import functools
 from typing import ClassVar
 
 import jax.numpy as jnp
-import numpy as np
 from flax import struct
 from jax import Array
 
 from planner_jax.core import rules
-from planner_jax.core.checks import floating, shape_of
+from planner_jax.core.arithmetic import to_host
+from planner_jax.core.checks import floating, numbers_of, shape_of
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.origin import find_origin, move
 from planner_jax.core.rules import Field, Table, require_sound
@@ -81,6 +81,10 @@ def case(
 ) -> RallyCase:
     """Make one case of K hits in a row, or a batch.
 
+    Inside compiled functions every number may be a traced array. Values are then not checked: an
+    invalid one leads to the status `BAD_INPUT` of the plan. Shapes and types are checked, and a
+    traced `start` has the origin (0, 0) by default.
+
     Args:
         ball_pos: (..., 3) [m], position of the ball at `ball_time`, above the ground at z = 0.
         ball_vel: (..., 3) [m/s], velocity of the ball at `ball_time`.
@@ -116,7 +120,7 @@ def case(
     back = None if shift is None else -shift
     near = move("places", places, back, dtype)
     if shape_of("place_range", place_range) == (3,):
-        place_range = np.broadcast_to(np.asarray(place_range), shape[-2:])
+        place_range = numbers_of("place_range", place_range, shape[-2:-1], (3,))
     base = hit_case(
         ball_pos,
         ball_vel,
@@ -145,12 +149,11 @@ def case(
     )
     names = {f"hit_limits.{field.name}": field.name for field in dataclasses.fields(RallyLimits)}
     require_sound(cases, names)
-    height, half = (np.asarray(each)[..., 2] for each in (cases.places, cases.place_range))
+    height, half = (to_host(each)[..., 2] for each in (cases.places, cases.place_range))
     least, most = (
-        np.asarray(each)[..., None]
+        to_host(each)[..., None]
         for each in (cases.hit_limits.min_contact, cases.hit_limits.max_contact)
     )
     is_within = (height - half >= least - _ROUNDING) & (height + half <= most + _ROUNDING)
     words = "boxes between the heights min_contact and max_contact"
-    rules.require_rule("places", height, is_within, words, batch)
-    return cases
+    return rules.require_or_mark(cases, "places", height, is_within, words)

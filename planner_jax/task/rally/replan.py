@@ -14,6 +14,7 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from planner_jax.ball.flight import BallState
+from planner_jax.core.arithmetic import Numbers, numpy_of, to_host
 from planner_jax.core.checks import require_kind
 from planner_jax.core.paths import require_beginning
 from planner_jax.optimise.chain_remainder import evaluate_pieces, fit_offsets
@@ -83,8 +84,12 @@ class ReplanRally(OptimisedPlanner):
         require_kind("ball", ball, BallState)
         require_beginning("ball", ball, cases.batch_shape, f"the batch shape {cases.batch_shape}")
         index = count_done(previous, elapsed)[..., None] + np.arange(cases.places.shape[-2])
-        index = np.minimum(index, index.shape[-1] - 1)[..., None]
-        later = lambda boxes: np.take_along_axis(np.asarray(boxes), index, axis=-2)  # noqa: E731
+        index = index.clip(max=index.shape[-1] - 1)[..., None]
+
+        def later(boxes: Array) -> Numbers:
+            known = to_host(boxes)
+            return numpy_of(known, index).take_along_axis(known, index, axis=-2)
+
         own = {
             "drag": (drag, cases.drag),
             "restitution": (restitution, cases.restitution),
@@ -166,5 +171,4 @@ class ReplanRally(OptimisedPlanner):
 
 def count_done(plan: RallyPlan, elapsed: Array | np.ndarray):
     """Return how many hits of a plan are done `elapsed` [s] after its start, () or (B,)."""
-    xp = np if isinstance(elapsed, np.ndarray | np.generic) else jnp
-    return xp.sum(xp.asarray(plan.strokes.time) <= elapsed[..., None], axis=-1)
+    return (to_host(plan.strokes.time) <= elapsed[..., None]).sum(axis=-1)

@@ -100,5 +100,5 @@ def case(
     cases = TeamCase(shared, heads, leaf("least_distance", least_distance))
     require_sound(cases, {"head_states": "starts"})
     for k in range(cases.num_robots):
-        quadrotor.require_start(cases.of_robot(k))
+        quadrotor.check_start(cases.of_robot(k))
     return cases
