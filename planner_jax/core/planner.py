@@ -26,6 +26,9 @@ CaseT = TypeVar("CaseT", bound=Case)
 PlanT = TypeVar("PlanT", bound=Plan)
 
 
+Solve = Callable[[PyTree], PyTree]  # from plans of earlier attempts, or None, to the best plans
+
+
 class Kind(enum.Enum):
     """Name the method by which a planner makes plans; a planner implements one of the three."""
 
@@ -112,6 +115,14 @@ class Planner(Generic[CaseT, PlanT]):
         may use only the class and the shapes of the cases.
         """
         return Fixed(attempt)
+
+    def join_attempts(self, attempts: Sequence[PyTree], cases: CaseT, /) -> "Solve | None":
+        """Return a function that makes several attempts (searches) in one loop, for `pj.solve`.
+
+        It takes the plans of earlier attempts, or None without such attempts, and returns the best
+        plans. By default the method returns None: each attempt has a program of its own.
+        """
+        return None
 
     def divides(self, attempt: PyTree, /) -> bool:
         """Return whether `pj.plan` solves a case from each starting point as a separate problem.

@@ -45,7 +45,9 @@ class Along:
     nodes: int  # number of intervals of each piece
     excess: Excess
     margins: tuple[float, ...]  # (E,), added to each excess before the hinge
-    hinge_width: float
+    # None: the last two `parameters` are a factor on the margins, and the width. These numbers are
+    # then known only at run time, and no CUDA kernel is used.
+    hinge_width: float | None
     # Cost per second that the user defines (extras of a case). With it no CUDA kernel is used.
     rate: Rate | None = None
     # Number of derivatives on which limits depend: 4 for position to jerk, 5 with the snap.
@@ -69,6 +71,13 @@ class Along:
         shape = self.maps.order, pieces, self.maps.coefficients.shape[-1], self.nodes
         hinges = self.margins, self.hinge_width, self.hinge_weights
         return f"Along{(*shape, *code, *hinges, self.rate is None, self.orders)}"
+
+    def split(self, parameters: PyTree) -> tuple[PyTree, Array | float, Array | float]:
+        """Split parameters: numbers of the excess, factor on the margins, and hinge width."""
+        if self.hinge_width is None:
+            *numbers, factor, width = parameters
+            return tuple(numbers), factor, width
+        return parameters, 1.0, self.hinge_width
 
     def matrices(self) -> np.ndarray:
         """Return matrices (K, orders, C) from C columns to the motion at K samples.
@@ -225,11 +234,14 @@ def _of_segment(
         jnp.asarray(np.array(each)[:, None], columns.dtype)
         for each in (along.margins, along.hinge_weights)
     )
+    numbers, factor, width = along.split(parameters)
+    if along.hinge_width is None:
+        margins = factor * margins
     motion = sample_motion(along.maps, along.nodes, columns, duration, along.orders)
-    each = along.excess(motion, parameters)
-    hinges = factors * smooth_hinge(jnp.stack(each) + margins, along.hinge_width)
+    each = along.excess(motion, numbers)
+    hinges = factors * smooth_hinge(jnp.stack(each) + margins, width)
     penalty = duration * jnp.sum(hinges * weights[None])
     if along.rate is not None:
-        penalty = penalty + duration * jnp.sum(along.rate(motion, parameters) * weights)
+        penalty = penalty + duration * jnp.sum(along.rate(motion, numbers) * weights)
     # On a CPU, maxima of two arrays in turn are faster than a maximum over stacked arrays.
     return penalty, jnp.max(functools.reduce(jnp.maximum, each))

@@ -74,8 +74,8 @@ def grid_of(
     *_, num_columns, _, lanes = points[0][0].shape
     threads = block_width(lanes, _THREADS)
     # The kernel computes no horizontal position, which the user's cost terms (`rate`) need, and no
-    # snap, which limits of single rotors need (5 orders).
-    if along.rate is not None or along.orders != 4 or threads is None:
+    # snap, which limits of single rotors need (5 orders). Its hinges are constants.
+    if along.rate is not None or along.orders != 4 or threads is None or along.hinge_width is None:
         return None
     if any(leaf.dtype != jnp.float32 for leaf in leaves):
         return None

@@ -53,15 +53,18 @@ def integrate(
     columns: Array,
     durations: Array,
     stands: bool,
+    parameters: PyTree,
 ) -> tuple[Array, Array]:
     """Return N segments' penalties for entering keep-outs, and greatest depths (N,) over a radius.
 
     The segments have `columns` (N, C, 3), scaled end states and waypoint offsets, and the mean
-    `durations` (N,) [s] of a piece. `along` has quadrature and hinge. If `stands`, the quadrotor
-    stands still after the last segment, until no centre moves. The depths have no derivative.
+    `durations` (N,) [s] of a piece. `along` and the `parameters` of its integral have quadrature
+    and hinge. If `stands`, the quadrotor stands still after the last segment, until no centre
+    moves. The depths have no derivative.
     """
     constant = functools.partial(jnp.asarray, dtype=columns.dtype)
-    hinge = lambda x: smooth_hinge(x + along.margins[-1], along.hinge_width)  # noqa: E731
+    _, factor, width = along.split(parameters)
+    hinge = lambda x: smooth_hinge(x + factor * along.margins[-1], width)  # noqa: E731
     matrix = constant(along.maps.sample_matrix(along.nodes, 0))
     pos = jnp.einsum("kc,nci->nki", matrix, columns, precision=lax.Precision.HIGHEST)
     ends = jnp.cumsum(durations * along.maps.num_pieces)

@@ -265,12 +265,18 @@ def relative_excess(limits: QuadrotorLimits, excess: Sequence[Array]) -> list[Ar
 
 
 def flight_along(
-    maps: ProportionalMinco, nodes: int, case: QuadrotorCase, margin: float, hinge_width: float
+    maps: ProportionalMinco,
+    nodes: int,
+    case: QuadrotorCase,
+    margin: float,
+    hinge_width: float | None,
 ) -> Along:
     """Return the penalties for exceeding the limits of a case along the segments of a flight.
 
     Each penalty starts at a relative distance `margin` before its limit, and is smoothed over
-    `hinge_width`. The matrices `maps` sample it at `nodes` intervals of each polynomial piece.
+    `hinge_width`. The matrices `maps` sample it at `nodes` intervals of each polynomial piece. If
+    `hinge_width` is None, the parameters of the integral have a factor on the margin, and the
+    width.
     """
     factors = [measure.factor for measure in flight_measures(case.limits)]
     factors += [1.0] * num_limits(case.extras)

@@ -7,11 +7,12 @@ large product.
 """
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array, lax
 from jax.extend.core import ClosedJaxpr, JaxprEqn, Literal, Var
 
@@ -78,16 +79,19 @@ def _widen(value: _Value, shape: tuple[int, ...], lanes: int) -> Array:
     """Return a value as an array (*shape, lanes); repeat it if all lanes (problems) share it."""
     if isinstance(value, _Lanes):
         return value.array
-    return jnp.broadcast_to(jnp.asarray(value)[..., None], (*shape, lanes))
+    return _repeat(jnp.asarray(value), (*shape, lanes), range(len(shape)))
 
 
 def _full_results(closed: ClosedJaxpr, leaves: Sequence[Array], lanes: int) -> list[Array]:
-    values = _evaluate(closed, [_Lanes(leaf) for leaf in leaves], lanes)
+    values = _evaluate(closed, [_Lanes(leaf) for leaf in leaves], lanes, {})
     pairs = zip(values, closed.jaxpr.outvars, strict=True)
     return [_widen(value, shape_of(out), lanes) for value, out in pairs]
 
 
-def _evaluate(closed: ClosedJaxpr, args: Sequence[_Value], lanes: int) -> list[_Value]:
+def _evaluate(
+    closed: ClosedJaxpr, args: Sequence[_Value], lanes: int, constants: dict[Hashable, Array]
+) -> list[_Value]:
+    """Evaluate a jaxpr; `constants` are the repeated literals that the program has already."""
     jaxpr = closed.jaxpr
     values: dict[Var, _Value] = dict(zip(jaxpr.constvars, closed.consts, strict=True))
     values.update(zip(jaxpr.invars, args, strict=True))
@@ -97,26 +101,32 @@ def _evaluate(closed: ClosedJaxpr, args: Sequence[_Value], lanes: int) -> list[_
 
     for eqn in jaxpr.eqns:
         inputs = [read(atom) for atom in eqn.invars]
-        outputs = inputs if eqn.primitive.name in _UNCHANGED else _outputs(eqn, inputs, lanes)
+        is_unchanged = eqn.primitive.name in _UNCHANGED
+        outputs = inputs if is_unchanged else _outputs(eqn, inputs, lanes, constants)
         values.update(zip(eqn.outvars, outputs, strict=True))
     return [read(atom) for atom in jaxpr.outvars]
 
 
-def _outputs(eqn: JaxprEqn, inputs: list[_Value], lanes: int) -> list[_Value]:
+def _outputs(
+    eqn: JaxprEqn, inputs: list[_Value], lanes: int, constants: dict[Hashable, Array]
+) -> list[_Value]:
     name = eqn.primitive.name
     if name in _CALLS:
         inner = eqn.params["jaxpr"] if "jaxpr" in eqn.params else eqn.params["call_jaxpr"]
         closed = inner if isinstance(inner, ClosedJaxpr) else ClosedJaxpr(inner, ())
         kernel = kernels.kernel_of(eqn) if kernels.in_use() else None
         if kernel is None:
-            return _evaluate(closed, inputs, lanes)
+            return _evaluate(closed, inputs, lanes, constants)
         return _by_kernel(eqn, closed, kernel, inputs, lanes)
     if not any(isinstance(value, _Lanes) for value in inputs):
         return _bind(eqn, inputs)
     arrays = None
     if name in _ELEMENTWISE:
         out_shape = shape_of(eqn.outvars[0])
-        arrays = _bind(eqn, [_spread(value, out_shape, lanes) for value in inputs])
+        pairs = zip(inputs, eqn.invars, strict=True)
+        arrays = _bind(
+            eqn, [_spread_once(value, atom, out_shape, lanes, constants) for value, atom in pairs]
+        )
     elif name in _BY_AXIS:
         pairs = zip(inputs, eqn.invars, strict=True)
         arrays = _bind(eqn, [_widen(value, shape_of(atom), lanes) for value, atom in pairs])
@@ -162,11 +172,35 @@ def _bind(eqn: JaxprEqn, inputs: Sequence[_Value], **changes: object) -> list[Ar
     return list(results) if eqn.primitive.multiple_results else [results]
 
 
+def _spread_once(
+    value: _Value,
+    atom: Var | Literal,
+    shape: tuple[int, ...],
+    lanes: int,
+    constants: dict[Hashable, Array],
+) -> Array:
+    """Return a value as an array (*shape, lanes); a literal is repeated only once."""
+    if not isinstance(atom, Literal) or np.ndim(atom.val):
+        return _spread(value, shape, lanes)
+    key = str(np.asarray(atom.val)), atom.aval.dtype, shape  # type: ignore[attr-defined]
+    if key not in constants:
+        constants[key] = _spread(value, shape, lanes)
+    return constants[key]
+
+
 def _spread(value: _Value, shape: tuple[int, ...], lanes: int) -> Array:
-    array = value.array if isinstance(value, _Lanes) else jnp.asarray(value)[..., None]
-    if array.ndim == 1 and shape:  # one number for each lane, such as the bound of a clamp
-        array = array.reshape((1,) * len(shape) + array.shape)
-    return jnp.broadcast_to(array, (*shape, lanes))
+    whole = (*shape, lanes)
+    if not isinstance(value, _Lanes):
+        array = jnp.asarray(value)
+        return _repeat(array, whole, range(array.ndim))
+    if value.array.ndim == 1:  # one number for each lane, such as the bound of a clamp
+        return _repeat(value.array, whole, (len(shape),))
+    return _repeat(value.array, whole, range(len(whole)))
+
+
+def _repeat(array: Array, shape: tuple[int, ...], axes: Sequence[int]) -> Array:
+    """Repeat an array to a shape, in which its own axes are `axes`."""
+    return array if array.shape == shape else lax.broadcast_in_dim(array, shape, tuple(axes))
 
 
 def _by_vmap(eqn: JaxprEqn, inputs: list[_Value]) -> list[Array]:

@@ -6,9 +6,11 @@ variables that determine the segments' ends.
 """
 
 import abc
+import copy
 import dataclasses
 import functools
-from typing import ClassVar
+from collections.abc import Sequence
+from typing import ClassVar, Self
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +20,7 @@ from jax import Array
 from jaxtyping import Bool, Float, PyTree
 
 from planner_jax.core.errors import ArgumentError
-from planner_jax.core.planner import CaseT, PlanT
+from planner_jax.core.planner import CaseT, PlanT, Solve
 from planner_jax.core.protocol import require_settings
 from planner_jax.cost.along import BETWEEN_NODES, Along, integrate_along
 from planner_jax.cost.penalty import smooth_hinge
@@ -29,7 +31,7 @@ from planner_jax.cost.quadrotor import (
     overturn_excess,
 )
 from planner_jax.optimise.planner import OptimisedPlanner
-from planner_jax.optimise.settings import Curvature, Evaluation
+from planner_jax.optimise.settings import Curvature, Evaluation, Round
 from planner_jax.optimise.shipped import StartNetwork, load_scale, select_start
 from planner_jax.trajectory.polynomial import PiecewisePolynomial
 from planner_jax.trajectory.proportional_minco import (
@@ -79,6 +81,12 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
     # segment, and of several segments, between which the body rate can have narrow peaks.
     decode_nodes: ClassVar[tuple[int, int]] = (32, 48)
     stands: ClassVar[bool] = False  # whether the quadrotor stands still after the last segment
+    # Fields with numbers of the cost that the `settings` of rounds may change. They do not change
+    # `prepare`, `plain_guesses` and `decode`, and may be arrays.
+    weights: ClassVar[tuple[str, ...]] = ("energy_weight", "margin", "hinge_width")
+    # Fields that the `settings` of rounds may change to refine trajectories. A trajectory of a
+    # coarse planner is one of a fine planner, whose additional variables, `held`, are zero.
+    refinements: ClassVar[tuple[str, ...]] = ("nodes",)
     proportions: tuple[float, ...] = (1.0,) * 6  # relative durations of a segment's pieces
     nodes: int = 8  # number of intervals of each piece, at whose ends penalties are evaluated
     time_weight: float = 0.005
@@ -127,6 +135,19 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
         """Convert excesses at the segments' ends to relative ones; unchanged by default."""
         return excess
 
+    def join_attempts(self, attempts: Sequence[Round], cases: CaseT) -> Solve | None:
+        """Return a function that makes all these attempts (rounds) in one loop, or None."""
+        from planner_jax.optimise.search import make_solve  # only `pj.solve` needs it
+
+        return make_solve(self, attempts, cases)
+
+    def with_weights(self, weights: dict[str, Array]) -> Self:
+        """Return a copy of the planner with arrays in fields that are listed in `weights`."""
+        planner = copy.copy(self)  # `dataclasses.replace` would check the arrays' values
+        for name, value in weights.items():
+            object.__setattr__(planner, name, value)
+        return planner
+
     def start_network(self, case: PyTree) -> StartNetwork | None:
         """Return the network that corrects the first guess of a case, or None without a network."""
         return None
@@ -162,18 +183,34 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
         return proportional_minco(_ORDER, self.proportions)
 
     def guesses(self, context: PyTree, num: int) -> Float[Array, "num n"]:
-        """Return starting points (num, n); waypoint offsets are zero, or predicted by a network."""
+        """Return starting points (num, n), the first one as predicted if that costs less."""
+        points = self.plain_guesses(context, num)
+        learned = self.predict_start(points[0], self.network_inputs(context), context.case)
+        if learned is None:
+            return points
+        cost = lambda point: self.objective(point, context).cost  # noqa: E731
+        return points.at[0].set(select_start(cost, points[0], learned))
+
+    def plain_guesses(self, context: PyTree, num: int) -> Float[Array, "num n"]:
+        """Return starting points (num, n), whose waypoint offsets are zero, without predictions."""
         if num > len(self.guess_table):
             raise ArgumentError("starts", f"<= {len(self.guess_table)}", num)
         natural = self.guess_ends(context, num)
         natural = jnp.pad(natural, ((0, 0), (0, 0), (self.num_offsets, 0)))
-        points = (natural / jnp.asarray(self.scale, natural.dtype)[None, None]).reshape(num, -1)
-        network = self.start_network(context.case)
-        if network is None:
-            return points
-        learned = self.limit_learned(points[0] + network(self.start_features(context)))
-        cost = lambda point: self.objective(point, context).cost  # noqa: E731
-        return points.at[0].set(select_start(cost, points[0], learned))
+        return (natural / jnp.asarray(self.scale, natural.dtype)[None, None]).reshape(num, -1)
+
+    def network_inputs(self, context: PyTree) -> Float[Array, " F"]:
+        """Return the features of a case for its network; none without a network."""
+        if self.start_network(context.case) is None:
+            return jnp.zeros((0,), context.case.head_state.dtype)
+        return self.start_features(context)
+
+    def predict_start(
+        self, guess: Float[Array, " n"], features: Float[Array, " F"], case: PyTree
+    ) -> Float[Array, " n"] | None:
+        """Return a point that may cost less than the first `guess`; None if there is none."""
+        network = self.start_network(case)
+        return None if network is None else self.limit_learned(guess + network(features))
 
     def split(self, point: Float[Array, " n"]) -> tuple[Array, Array]:
         """Split a point: waypoint offsets (N, M - 1, 3), end variables (N, K) of N segments."""
@@ -189,7 +226,18 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
 
     def along(self, nodes: int, case: QuadrotorCase) -> Along:
         """Return a segment's penalties, to be integrated with `nodes` intervals in each piece."""
+        if self._has_run_time_hinges:
+            return flight_along(self.maps, nodes, case, 1.0, None)
         return flight_along(self.maps, nodes, case, self.margin, self.hinge_width)
+
+    def _parameters(self, case: QuadrotorCase) -> tuple:
+        """Return the numbers that the integrals of `along` need."""
+        numbers = case.gravity, case.limits, case.extras
+        return (*numbers, self.margin, self.hinge_width) if self._has_run_time_hinges else numbers
+
+    @property
+    def _has_run_time_hinges(self) -> bool:
+        return isinstance(self.margin, Array) or isinstance(self.hinge_width, Array)
 
     def evaluate_ends(
         self, natural: Float[Array, "N K"], context: PyTree
@@ -223,11 +271,11 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
         offsets, natural = self.split(point)
         rows, durations, core, at_ends = self.evaluate_ends(natural, context)
         along, columns = self.along(self.nodes, case), jnp.concatenate([rows, offsets], axis=1)
-        parameters = (case.gravity, case.limits, case.extras)
+        parameters = self._parameters(case)
         penalties, worst = integrate_along(along, columns, durations, parameters)
         if moving:
             lasting = jnp.where(self.active(context), durations, 0.0)
-            more, deepest = moving(along, columns, lasting, self.stands)
+            more, deepest = moving(along, columns, lasting, self.stands, parameters)
             penalties, worst = penalties + more, jnp.maximum(worst, deepest)
         energies = jax.vmap(functools.partial(offset_energy, self.maps))(offsets, durations)
         energy = self.energy_weight * self._count(energies, context)
@@ -254,7 +302,7 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
             natural,
             offsets,
             jnp.asarray(self.scale, point.dtype),
-            (case.gravity, case.limits, case.extras),
+            self._parameters(case),
             self.energy_weight,
             self.active(context),
         )
@@ -273,7 +321,7 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
         if moving:
             lasting = jnp.where(active, durations, 0.0)
             of_moving = self.along(nodes, case), chain.columns, lasting, self.stands
-            greatest.append(moving(*of_moving)[1])
+            greatest.append(moving(*of_moving, self._parameters(case))[1])
         trajectory = chain_trajectory(self.maps, chain, active)
         along = [jnp.max(jnp.where(active, each, -1.0)) for each in greatest]
         along.append(overturn_excess(trajectory, case.gravity, case.limits))

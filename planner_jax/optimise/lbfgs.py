@@ -15,10 +15,11 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 from flax import struct
-from jax import Array
+from jax import Array, lax
+from jaxtyping import PyTree
 
 from planner_jax.core.protocol import is_better
-from planner_jax.lanes import with_kernel
+from planner_jax.lanes import over_lanes, with_kernel
 from planner_jax.optimise.settings import Evaluation, LbfgsConfig, Objective
 
 
@@ -123,19 +124,45 @@ def search_direction(memory: Memory, grad: Array, step_cap: float) -> Array:
     H approximates the inverse Hessian by the stored pairs of steps and gradient changes. Without a
     pair the direction is steepest descent with length 1, a moderate step in scaled variables.
     """
-    q = grad
-    alphas = []
-    pairs = range(memory.steps.shape[0])
-    for k in reversed(pairs):
-        alpha = memory.inverse_curvature[k] * jnp.sum(memory.steps[k] * q)
-        q = q - alpha * memory.changes[k]
-        alphas.append(alpha)
+    return _recur_twice(memory, grad, step_cap, _scan_unrolled, lambda function: function)
+
+
+def _recur_twice(
+    memory: Memory, grad: Array, step_cap: float, scan: Callable, over: Callable
+) -> Array:
+    """Return the direction by loops of `scan`; `over` maps a function of one problem."""
+    q, alphas = scan(over(_recur_back), grad, memory, reverse=True)
+    q = over(_scale_start)(q, memory, grad)
+    q, _ = scan(over(_recur_forth), q, (memory, alphas))
+    return over(lambda q: -q * shortening(jnp.sum(q**2), step_cap))(q)
+
+
+def _recur_back(q: Array, pair: Memory) -> tuple[Array, Array]:
+    alpha = pair.inverse_curvature * jnp.sum(pair.steps * q)
+    return q - alpha * pair.changes, alpha
+
+
+def _scale_start(q: Array, memory: Memory, grad: Array) -> Array:
     newest_change = jnp.sum(memory.changes[-1] ** 2)
-    q = start_scale(memory.inverse_curvature[-1], newest_change, jnp.sum(grad**2)) * q
-    for k, alpha in zip(pairs, reversed(alphas), strict=True):
-        beta = memory.inverse_curvature[k] * jnp.sum(memory.changes[k] * q)
-        q = q + memory.steps[k] * (alpha - beta)
-    return -q * shortening(jnp.sum(q**2), step_cap)
+    return start_scale(memory.inverse_curvature[-1], newest_change, jnp.sum(grad**2)) * q
+
+
+def _recur_forth(q: Array, pair_and_alpha: tuple[Memory, Array]) -> tuple[Array, None]:
+    pair, alpha = pair_and_alpha
+    beta = pair.inverse_curvature * jnp.sum(pair.changes * q)
+    return q + pair.steps * (alpha - beta), None
+
+
+def _scan_unrolled(
+    function: Callable, carry: Array, inputs: PyTree, reverse: bool = False
+) -> tuple[Array, list]:
+    """Scan as `lax.scan`, without a loop; the results are in a list, which may be an input."""
+    order, results = range(jax.tree.leaves(inputs)[0].shape[0]), []
+    for k in reversed(order) if reverse else order:
+        entry = jax.tree.map(lambda x, k=k: x[k], inputs, is_leaf=lambda x: isinstance(x, list))
+        carry, result = function(carry, entry)
+        results.append(result)
+    return carry, results[::-1] if reverse else results
 
 
 @functools.cache
@@ -155,18 +182,59 @@ def step(objective: Objective, state: LbfgsState, config: LbfgsConfig) -> LbfgsS
     takes the trial step along it with the least cost. A finished problem of a batch keeps its
     point; its memory and gradient are updated, but not used.
     """
-
-    def value(point: Array) -> tuple[Array, Array]:
-        evaluation = objective(point)
-        return evaluation.cost, evaluation.violation
-
-    (cost, violation), grad = jax.value_and_grad(value, has_aux=True)(state.point)
+    here, grad = _evaluate(objective, state.point)
     memory, direction = _turn(config.memory, config.step_cap)(
         state.memory, state.step, grad - state.grad, grad
     )
+    return _try_steps(objective, config, state, here, grad, memory, direction)
+
+
+def step_lanes(
+    objective: Callable[[Array, PyTree], Evaluation],
+    state: LbfgsState,
+    contexts: PyTree,
+    config: LbfgsConfig,
+) -> LbfgsState:
+    """Return the states of L problems after one iteration; the last axes count the problems.
+
+    `objective` takes a point (n,) and the context of one problem. The result is equal to `step` up
+    to rounding, but the two-loop recursion is a loop, for CPUs.
+    """
+
+    def try_steps(state: LbfgsState, context: PyTree, *found: PyTree) -> LbfgsState:
+        return _try_steps(lambda x: objective(x, context), config, state, *found)
+
+    evaluate = lambda x, context: _evaluate(lambda x: objective(x, context), x)  # noqa: E731
+    here, grad = over_lanes(evaluate)(state.point, contexts)
+    memory = over_lanes(remember)(state.memory, state.step, grad - state.grad)
+    direction = _recur_twice(memory, grad, config.step_cap, lax.scan, over_lanes)
+    return over_lanes(try_steps)(state, contexts, here, grad, memory, direction)
+
+
+def _evaluate(objective: Objective, point: Array) -> tuple[Evaluation, Array]:
+    """Return the objective and its gradient (n,) at a point (n,)."""
+
+    def value(point: Array) -> tuple[Array, Evaluation]:
+        evaluation = objective(point)
+        return evaluation.cost, evaluation
+
+    (_, evaluation), grad = jax.value_and_grad(value, has_aux=True)(point)
+    return evaluation, grad
+
+
+def _try_steps(
+    objective: Objective,
+    config: LbfgsConfig,
+    state: LbfgsState,
+    here: Evaluation,
+    grad: Array,
+    memory: Memory,
+    direction: Array,
+) -> LbfgsState:
+    """Return the state after the trial step along a direction (n,) with the least cost."""
     lengths = state.numbers.reach * jnp.asarray(config.trial_steps, grad.dtype)
     trials = jax.vmap(lambda length: objective(state.point + length * direction))(lengths)
-    choice = _choose(config, state.numbers, Evaluation(cost, violation), lengths, trials)
+    choice = _choose(config, state.numbers, here, lengths, trials)
     step = jnp.where(choice.going, choice.length * direction, state.step)
     point = jnp.where(choice.going, state.point + step, state.point)
     return LbfgsState(

@@ -174,7 +174,7 @@ def solve_round(planner: "OptimisedPlanner", attempt: Round, case: PyTree) -> Py
         )
 
     first = planner.with_settings(attempt.all_stages[0].settings)
-    optimum = _at_start(first.guesses(context, 1)[0])
+    optimum = start_at(first.guesses(context, 1)[0])
     for stage in attempt.all_stages:
         problem = planner.with_settings(stage.settings)
         optimum = _add_spent(search(problem, stage.solver, optimum.point), optimum)
@@ -187,7 +187,7 @@ def solve_batch(planner: "OptimisedPlanner", attempt: Round, cases: PyTree) -> P
     contexts = over_lanes(last.prepare)(put_lanes_last(cases))
     first = planner.with_settings(attempt.all_stages[0].settings)
     starts = over_lanes(lambda context: first.guesses(context, 1)[0])(contexts)
-    optimum = over_lanes(_at_start)(starts)
+    optimum = over_lanes(start_at)(starts)
     for stage in attempt.all_stages:
         problem = planner.with_settings(stage.settings)
         found = minimise_lanes(
@@ -197,7 +197,8 @@ def solve_batch(planner: "OptimisedPlanner", attempt: Round, cases: PyTree) -> P
     return put_lanes_first(over_lanes(functools.partial(plan_at, last))(optimum, contexts))
 
 
-def _at_start(point: Array) -> Optimum:
+def start_at(point: Array) -> Optimum:
+    """Return the result of a search of 0 iterations, whose cost is not evaluated."""
     nothing, zero = jnp.zeros((), point.dtype), jnp.zeros((), jnp.int32)
     return Optimum(point, Evaluation(nothing, nothing), zero, jnp.zeros((), bool))
 

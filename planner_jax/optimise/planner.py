@@ -125,7 +125,14 @@ class OptimisedPlanner(Planner[CaseT, PlanT], abc.ABC):
 
         Rounds that differ only in numbers of the L-BFGS settings can then share a program.
         """
-        return load_round(attempt, jax.default_backend() != "cpu")
+        return load_round(self.fit_attempt(attempt, cases), jax.default_backend() != "cpu")
+
+    def fit_attempt(self, attempt: Round, cases: PyTree) -> Round:
+        """Return a round (attempt) with settings for these cases, by default unchanged.
+
+        The method may use only the class and the shapes of the cases.
+        """
+        return attempt
 
     def solve(self, case: PyTree, attempt: Round) -> PyTree:
         """Return the plan that one attempt (round of searches) finds for one case."""

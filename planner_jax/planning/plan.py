@@ -150,7 +150,8 @@ def require_batch(cases: Case) -> int:
 def solve(planner: Planner[CaseT, PlanT], cases: CaseT) -> PlanT:
     """Plan cases as a pure function, for compiled functions, `vmap` and `scan`.
 
-    Each attempt (search) after the first is made at all cases of a batch if one is unsolved.
+    Each attempt (search) after the first is made at all cases of a batch if one is unsolved. Hits,
+    catches and rallies on a CPU, without Newton's method, are searched only while unsolved.
     `plan` removes solved cases from the batch, and is faster where few cases are left.
 
     Args:
@@ -265,8 +266,10 @@ def _plan_one(planner: Planner, attempts: Sequence[Attempt], case: PyTree, watch
 def _plan_purely(planner: Planner, attempts: Sequence[Attempt], cases: PyTree) -> PyTree:
     """Return plans as jax arrays; while any case is unsolved, searches are made for all cases."""
     require_pure(planner)
+    joined = (planner.join_attempts(attempts[k:], cases) for k in range(len(attempts)))
+    alone, finish = next(((k, each) for k, each in enumerate(joined) if each), (None, None))
     plans: PyTree = None
-    pairs = [(attempt, planner.load_attempt(attempt, cases)) for attempt in attempts]
+    pairs = [(attempt, planner.load_attempt(attempt, cases)) for attempt in attempts[:alone]]
     # Consecutive attempts (searches) with pytrees of equal structure share one compiled loop.
     for _, same in itertools.groupby(pairs, lambda pair: jax.tree.structure(pair[1])):
         group, loaded = zip(*same, strict=True)
@@ -299,7 +302,7 @@ def _plan_purely(planner: Planner, attempts: Sequence[Attempt], cases: PyTree) -
             return lax.cond(is_first | jnp.any(due), solve_again, lambda plans: plans, plans)
 
         plans = lax.fori_loop(0, len(group), try_next, plans)
-    return plans
+    return finish(plans) if finish else plans
 
 
 def _solve_by(planner: Planner, cases: PyTree, loaded: Sequence[PyTree], k: Array | int) -> PyTree:

@@ -12,7 +12,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jaxtyping import PyTree
 
 from planner_jax.core.protocol import FEASIBILITY_TOLERANCE
 from planner_jax.optimise.chain import ChainEnds, ChainPlanner
@@ -169,15 +168,12 @@ class ExactCatch(ChainPlanner[CatchCase, CatchPlan]):
         rows = jnp.asarray(rows, context.times.dtype)
         return jax.vmap(lambda guess: self._guess(context, guess))(rows)
 
-    def load_attempt(self, attempt: Round, cases: CatchCase) -> PyTree:
-        """Return an attempt (search settings) as arrays, with more iterations for more targets."""
-        return super().load_attempt(self._for_start(attempt, cases), cases)
-
     def starts_long(self, cases: CatchCase) -> bool:
         """Return whether more than three targets must be caught, which needs more iterations."""
         return self.rounds == _ROUNDS and cases.num_targets > _FEW and not cases.optional
 
-    def _for_start(self, attempt: Round, case: CatchCase) -> Round:
+    def fit_attempt(self, attempt: Round, case: CatchCase) -> Round:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """Return an attempt (round) with more iterations for more targets."""
         if self.starts_long(case) and attempt in _ROUNDS[:2]:
             steps = _STEPS_A_TARGET * case.num_targets if attempt == _FIRST else _OF_MANY.max_steps
             return Round(starts=1, solver=dataclasses.replace(_OF_MANY, max_steps=steps))

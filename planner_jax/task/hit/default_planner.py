@@ -140,6 +140,7 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
     package = "planner_jax.task.hit"
     num_end_variables = 8
     guess_table = _GUESSES
+    refinements = ("nodes", "velocities")
     decode_nodes = (16, 16)
     # Durations of the trajectory's polynomial pieces, relative to each other. The first pieces are
     # short, so that the jerk can change fast and a hovering quadrotor starts to turn early.

@@ -24,7 +24,7 @@ from planner_jax.cost.quadrotor import Measure
 from planner_jax.optimise.chain import ChainEnds, ChainPlanner
 from planner_jax.optimise.planner import pending
 from planner_jax.optimise.settings import Curvature, LbfgsConfig, Round
-from planner_jax.optimise.shipped import load_scale, select_start
+from planner_jax.optimise.shipped import load_scale
 from planner_jax.robot.quadrotor import tangent_basis
 from planner_jax.task.hit.context import (
     HitContext,
@@ -117,6 +117,7 @@ class ExactRally(ChainPlanner[RallyCase, RallyPlan]):
     package = "planner_jax.task.rally"
     num_end_variables = 11
     guess_table = _GUESSES
+    weights = (*ChainPlanner.weights, "place_weight", "apex_weight")
     proportions: tuple[float, ...] = _PROPORTIONS
     nodes: int = 6  # intervals of each piece at whose ends penalties are evaluated
     time_weight: float = 0.0
@@ -155,22 +156,26 @@ class ExactRally(ChainPlanner[RallyCase, RallyPlan]):
         metric = self._metric(point.size)
         return point if metric is None else _multiply(metric.inverse, point)
 
-    def guesses(self, context: RallyContext, num: int) -> Array:
-        """Return starting points (num, n), the first one moved by the metric if that costs less."""
-        points = super().guesses(context, num)
+    def plain_guesses(self, context: RallyContext, num: int) -> Array:
+        """Return starting points (num, n) of the search, whose waypoint offsets are zero."""
+        points = super().plain_guesses(context, num)
         metric = self._metric(points.shape[1])
         if metric is None:
             return points
-        points = jax.vmap(functools.partial(_multiply, metric.inverse))(points)
-        moved = points[0] + jnp.asarray(metric.inverse @ metric.shift, points.dtype)
-        cost = lambda point: self.objective(point, context).cost  # noqa: E731
-        return points.at[0].set(select_start(cost, points[0], moved))
+        return jax.vmap(functools.partial(_multiply, metric.inverse))(points)
 
-    def load_attempt(self, attempt: Round, cases: RallyCase) -> PyTree:
-        """Return an attempt (search settings) as arrays, with fewer iterations with a metric."""
+    def predict_start(self, guess: Array, features: Array, case: RallyCase) -> Array | None:
+        """Return the first guess (n,) moved by the metric, or None without a metric."""
+        metric = self._metric(guess.size)
+        if metric is None:
+            return None
+        return guess + jnp.asarray(metric.inverse @ metric.shift, guess.dtype)
+
+    def fit_attempt(self, attempt: Round, cases: RallyCase) -> Round:
+        """Return an attempt (round), with fewer iterations if there is a metric."""
         size = cases.places.shape[-2] * len(self.scale)
         is_short = attempt == ROUNDS[0] and self._metric(size) is not None
-        return super().load_attempt(_SHORT if is_short else attempt, cases)
+        return _SHORT if is_short else attempt
 
     def curvature_at(self, point: Array, context: RallyContext) -> Curvature:
         """Return evaluation, gradient, Hessian products and preconditioner at a point (n,)."""
