@@ -68,7 +68,7 @@ class Ball:
         for field in fields(self):
             shape = np.shape(getattr(type(self), field.name))  # of the default
             value = numbers_of(field.name, vars(self)[field.name], (), shape)
-            for each in value.flat:
+            for each in np.ravel(value):
                 require_number(field.name, each, POSITIVE)
 
     @classmethod

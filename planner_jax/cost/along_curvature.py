@@ -151,6 +151,8 @@ def block_and_diagonal(
 def _at_samples(
     along: Along, motion: Array, parameters: PyTree
 ) -> tuple[Array, Array, Array, dict[tuple[Slot, Slot], Array]]:
+    width = along.hinge_width
+    assert width is not None  # only a program of several searches has a width known at run time
     margins, factors = (
         jnp.asarray(np.array(each)[:, None], motion.dtype)
         for each in (along.margins, along.hinge_weights)
@@ -161,7 +163,7 @@ def _at_samples(
         parts = {"snap": snap[0]} if snap else {}
         samples = Motion(height=pos[:, 2], vel=vel, acc=acc, jerk=jerk, pos=pos, **parts)
         excess = jnp.stack(along.excess(samples, parameters))
-        penalty = jnp.sum(factors * smooth_hinge(excess + margins, along.hinge_width), axis=0)
+        penalty = jnp.sum(factors * smooth_hinge(excess + margins, width), axis=0)
         if along.rate is not None:
             penalty = penalty + along.rate(samples, parameters)
         return jnp.sum(penalty), (penalty, jnp.max(excess))

@@ -301,9 +301,10 @@ def sample_excess(along: Along, unit: Vectors, duration: Array, given: PyTree) -
 
 
 def _penalty(along: Along, unit: Vectors, duration: Array, given: PyTree) -> tuple[Array, Array]:
-    excess = sample_excess(along, unit, duration, given)
+    excess, width = sample_excess(along, unit, duration, given), along.hinge_width
+    assert width is not None  # see `grid_of`
     hinges = [
-        factor * smooth_hinge(value + margin, along.hinge_width)
+        factor * smooth_hinge(value + margin, width)
         for value, margin, factor in zip(excess, along.margins, along.hinge_weights, strict=True)
     ]
     return duration * _total(hinges), functools.reduce(jnp.maximum, excess)

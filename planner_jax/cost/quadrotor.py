@@ -99,7 +99,7 @@ def tilt_excess(acc: Components, gravity: Array, limits: QuadrotorLimits) -> Arr
 
 
 _OVERTURN_NODES = 4  # intervals of a piece, at whose ends `overturn_excess` evaluates the motion
-_WEAK_STEPS = 3  # number of Gauss-Newton steps that minimise the thrust within an interval
+_WEAK_STEPS = 2  # number of Gauss-Newton steps that minimise the thrust within an interval
 
 
 class QuadrotorCase(Protocol):
@@ -343,16 +343,19 @@ def _weak_thrust_excess(
     first, last = slopes[:, :-1], slopes[:, 1:]
     square, cube = 3.0 * way - 2.0 * first - last, first + last - 2.0 * way
 
+    def at(share: Array) -> tuple[Array, Array]:
+        u = share[..., None]
+        f = start + u * (first + u * (square + u * cube))
+        return f, first + u * (2.0 * square + 3.0 * u * cube)
+
     def step(share: Array, f: Array, rate: Array) -> Array:
         change = jnp.sum(f * rate, axis=2) * reciprocal(at_least(jnp.sum(rate**2, axis=2), 1e-6))
         return jnp.clip(share - change, 0.0, 1.0)
 
     share = step(jnp.zeros(start.shape[:2], start.dtype), start, way)
     for _ in range(_WEAK_STEPS):
-        u = share[..., None]
-        f = start + u * (first + u * (square + u * cube))
-        rate = first + u * (2.0 * square + 3.0 * u * cube)
-        share = step(share, f, rate)
+        share = step(share, *at(share))
+    f, rate = at(share)
     turn = jnp.sum(jnp.cross(f, rate) ** 2, axis=2) * (_OVERTURN_NODES / durations[:, None]) ** 2
     size = at_least(jnp.sum(f * f, axis=2), 1e-8)
     return jnp.max(turn * reciprocal(size * limits.body_rate) ** 2 - 1.0)

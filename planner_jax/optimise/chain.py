@@ -141,7 +141,7 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
 
         return make_solve(self, attempts, cases)
 
-    def with_weights(self, weights: dict[str, Array]) -> Self:
+    def with_weights(self, weights: dict[str, PyTree]) -> Self:
         """Return a copy of the planner with arrays in fields that are listed in `weights`."""
         planner = copy.copy(self)  # `dataclasses.replace` would check the arrays' values
         for name, value in weights.items():

@@ -74,12 +74,13 @@ def list_models(
         names = {name for stage in group for name, _ in stage.settings} & {*planner.weights}
         fields = {name: {getattr(own[stage], name) for stage in group} for name in names}
         varying = tuple(sorted(name for name, values in fields.items() if len(values) > 1))
-        free = None
+        free, solver = None, group[0].solver
+        assert isinstance(solver, LbfgsConfig)
         if size < len(finest.scale):
-            free = None if finest.held is None else tuple(np.flatnonzero(~finest.held))
+            free = None if finest.held is None else tuple(map(int, np.flatnonzero(~finest.held)))
             if free is None or len(free) != size:
                 return None
-        models |= dict.fromkeys(group, Model(of_group, group[0].solver, varying, free))
+        models |= dict.fromkeys(group, Model(of_group, solver, varying, free))
     lead = len(cases.batch_shape)
     case = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[lead:], x.dtype), cases)
     networks = {each.planner.start_network(case) is None for each in models.values()}
@@ -104,7 +105,7 @@ def _rows_of(
 ) -> Iterator[Row]:
     places = {model: k for k, model in enumerate(dict.fromkeys(models.values()))}
     varying = sorted({name for model in places for name in model.varying})
-    width, last = attempt.starts, len(attempt.all_stages) - 1
+    width, last, rows = attempt.starts, len(attempt.all_stages) - 1, []
     for k, stage in enumerate(attempt.all_stages):
         fields = planner.with_settings(stage.settings)
         row = Row(
@@ -121,8 +122,9 @@ def _rows_of(
             writes=k == last and width == 1,
             frozen=stage.frozen,
         )
-        yield row
+        rows.append(row)
         width = row.keep
-    if not row.writes:  # the plan of the best starting point, after 0 iterations
-        solver = (0, *row.solver[1:])
-        yield row.replace(solver=solver, width=1, starts=False, writes=True)
+    yield from rows
+    if not rows[-1].writes:  # the plan of the best starting point, after 0 iterations
+        still = {"solver": (0, *rows[-1].solver[1:]), "width": 1, "starts": False, "writes": True}
+        yield dataclasses.replace(rows[-1], **still)

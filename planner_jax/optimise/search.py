@@ -127,7 +127,7 @@ class _Program:
         if cases.batch_shape == ():
             cases, plans = jax.tree.map(lambda leaf: leaf[None], (cases, plans))
             return jax.tree.map(lambda leaf: leaf[0], self(cases, plans))
-        num, starts = cases.batch_shape[0], max(row.width for row in self.rows)
+        num, starts = cases.batch_shape[0], max(int(row.width) for row in self.rows)
         lane = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), cases)
         item, plan = jax.eval_shape(self._plan_guess, lane)
         packings = of_cases, of_items, of_plans = tuple(map(Packing, (lane, item, plan)))
@@ -138,7 +138,7 @@ class _Program:
             unsolved = jnp.full(num, Status.INFEASIBLE, jnp.int32)
             score = _Score(zeros, jnp.full(num, jnp.inf, dtype), unsolved)
         else:
-            rows = [row.replace(is_first=False) for row in rows]
+            rows = [dataclasses.replace(row, is_first=False) for row in rows]
             best = of_plans.pack(put_lanes_last(plans))
             score = _Score(plans.cost, plans.violation, plans.status)
         packed = of_cases.pack(put_lanes_last(cases))
@@ -211,7 +211,7 @@ class _Program:
 
     def _search(self, row: Row, cases: PyTree, index: Array, before: _Item) -> tuple[_Item, PyTree]:
         """Search from guesses, or from where earlier searches ended; the lanes are last."""
-        most = max(each.first + each.width for each in self.rows if each.starts)
+        most = max(int(each.first) + int(each.width) for each in self.rows if each.starts)
         contexts = over_lanes(self.finest.prepare)(cases)
         inputs = over_lanes(self.finest.network_inputs)(contexts)
 

@@ -84,7 +84,7 @@ def obstacles(
     require(bool((np.asarray(growth) >= 0.0).all()), "growth", ">= 0", growth)
     given = _check_paths(paths, count)
     tables = [given[k] for k in owner]
-    shift = numbers_of("origin", origin, (), (2,)).astype(np.float64)
+    shift = np.asarray(numbers_of("origin", origin, (), (2,)), np.float64)
     centre, velocity = np.zeros((num, 2)), np.zeros((num, 2))
     corners, radius, rates = np.zeros((num, size, 2)), np.zeros(num), np.zeros(num)
     velocity[: len(parts)] = np.broadcast_to(np.asarray(velocities, float), (count, 2))[owner]

@@ -107,7 +107,7 @@ def walls_of_grid(
     if cells is None or cells.dtype != np.bool_ or cells.ndim != 2:
         raise ArgumentTypeError("occupied", "a bool array (H, W)", occupied)
     require_number("resolution", resolution, POSITIVE)
-    place = numbers_of("origin", origin, (), (3,)).astype(float)
+    place = np.asarray(numbers_of("origin", origin, (), (3,)), float)
     for each in place:
         require_number("origin", each)
     require_size("coarsen", coarsen)

@@ -236,7 +236,7 @@ def case(
 
     def corner(name: str, value: ArrayLike) -> np.ndarray:
         both = value if shape_of(name, value) else np.full(2, value, np.float64)
-        return numbers_of(name, both, batch, (2,)).astype(np.float64) - shift
+        return np.asarray(numbers_of(name, both, batch, (2,)), np.float64) - shift
 
     is_bare = require_path("target", target, batch, 2)
     is_free = end_heading is None
