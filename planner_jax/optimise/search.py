@@ -144,7 +144,7 @@ class _Program:
         """Make the searches of a row for the cases that are due, in tiles."""
         of_cases, of_items, of_plans = packings
         num = due.size
-        tile = -(-num // -(-num // _TILE))  # equal tiles, so that few lanes have no item
+        tile = min(num, _TILE)
         is_due = (due[:, None] & (jnp.arange(starts) < row.width)[None]).ravel()
         total = jnp.sum(is_due, dtype=jnp.int32)
         order = jnp.argsort(~is_due, stable=True).astype(jnp.int32)
