@@ -10,9 +10,9 @@ import pytest
 import planner_jax as pj
 from planner_jax.core.protocol import Status, is_solved
 from planner_jax.lanes import over_lanes
+from planner_jax.lanes.packing import Packing
 from planner_jax.optimise import lbfgs
 from planner_jax.optimise.rows import list_models, list_rows
-from planner_jax.optimise.search import Packing
 from planner_jax.optimise.settings import LbfgsConfig, NewtonConfig, Round
 from planner_jax.recovery.case import RecoveryCase
 from planner_jax.recovery.planner import RecoveryPlanner
@@ -122,15 +122,14 @@ def test_solve_returns_the_plans_of_plan(task):
 
 @pytest.mark.slow
 def test_hard_and_bad_cases_of_a_scan_are_planned_as_in_a_batch():
-    cases = pj.hit.draw(12, start="uniform", delay=0.5)
-    cases.ball.pos[3] = np.nan
-    planner = pj.hit.planner()
+    cases = jax.tree.map(jnp.asarray, pj.hit.draw(12, start="uniform", delay=0.5))
+    head = cases.head_state.at[3, 0, 0].set(jnp.nan)
+    cases, planner = dataclasses.replace(cases, head_state=head), pj.hit.planner()
 
     @jax.jit
     def plan_in_turn(cases):
         return jax.lax.scan(lambda _, case: (None, pj.solve(planner, case)), None, cases)[1]
 
-    plans = plan_in_turn(jax.tree.map(jnp.asarray, cases))
-    batch = pj.plan(planner, jax.tree.map(jnp.asarray, cases))
-    assert plans.status[3] == Status.BAD_INPUT
+    plans, batch = plan_in_turn(cases), pj.plan(planner, cases)
+    assert plans.status[3] == batch.status[3] == Status.BAD_INPUT
     assert abs(is_solved(plans.status).sum() - is_solved(batch.status).sum()) <= 1

@@ -11,7 +11,6 @@ tiles of lanes, so that solved cases take no time.
 
 import dataclasses
 import functools
-import math
 from collections.abc import Sequence
 
 import jax
@@ -25,6 +24,7 @@ from planner_jax.core.planner import Solve
 from planner_jax.core.protocol import Status, is_better, is_solved, is_unsolved, mark_bad_input
 from planner_jax.core.rules import has_rules, is_sound
 from planner_jax.lanes import kernels, over_lanes
+from planner_jax.lanes.packing import Packing
 from planner_jax.optimise import lbfgs
 from planner_jax.optimise.chain import ChainPlanner
 from planner_jax.optimise.multistart import (
@@ -57,39 +57,6 @@ class _Score:
     cost: Array
     violation: Array
     status: Array
-
-
-class Packing:
-    """The arrays of one lane as one vector for each data type, which is gathered at once."""
-
-    def __init__(self, lane: PyTree) -> None:
-        leaves, self._tree = jax.tree.flatten(lane)
-        self._shapes = [leaf.shape for leaf in leaves]
-        self._kinds = [np.dtype(leaf.dtype) for leaf in leaves]
-        self._types = sorted(set(self._kinds), key=str)
-
-    def zeros(self, num: int) -> list[Array]:
-        """Return the vectors of `num` lanes of zeros: a list of arrays (num, size)."""
-        sizes = dict.fromkeys(self._types, 0)
-        for kind, shape in zip(self._kinds, self._shapes, strict=True):
-            sizes[kind] += math.prod(shape)
-        return [jnp.zeros((num, size), kind) for kind, size in sizes.items()]
-
-    def pack(self, lanes: PyTree) -> list[Array]:
-        """Return the vectors (lanes, size) of arrays with the lanes last."""
-        triples = zip(self._kinds, self._shapes, jax.tree.leaves(lanes), strict=True)
-        pairs = [(kind, x.reshape(math.prod(shape), x.shape[-1])) for kind, shape, x in triples]
-        return [jnp.concatenate([x for k, x in pairs if k == own]).T for own in self._types]
-
-    def unpack(self, vectors: list[Array]) -> PyTree:
-        """Return arrays with the lanes last from their vectors (lanes, size)."""
-        columns = {own: vector.T for own, vector in zip(self._types, vectors, strict=True)}
-        done, leaves = dict.fromkeys(self._types, 0), []
-        for kind, shape in zip(self._kinds, self._shapes, strict=True):
-            begin, done[kind] = done[kind], done[kind] + math.prod(shape)
-            part = columns[kind][begin : done[kind]]
-            leaves.append(part.reshape(*shape, part.shape[1]))
-        return jax.tree.unflatten(self._tree, leaves)
 
 
 def make_solve(planner: ChainPlanner, attempts: Sequence[Round], cases: PyTree) -> Solve | None:
@@ -177,7 +144,7 @@ class _Program:
         """Make the searches of a row for the cases that are due, in tiles."""
         of_cases, of_items, of_plans = packings
         num = due.size
-        tile = -(-num // -(-num // _TILE))  # equal tiles, so that few lanes have no item
+        tile = min(num, _TILE)
         is_due = (due[:, None] & (jnp.arange(starts) < row.width)[None]).ravel()
         total = jnp.sum(is_due, dtype=jnp.int32)
         order = jnp.argsort(~is_due, stable=True).astype(jnp.int32)
