@@ -89,7 +89,7 @@ def test_the_loop_over_pairs_computes_the_direction_of_the_unrolled_recursion():
         jnp.asarray(rng.normal(size=size), jnp.float32) for size in ((3, 5, 4), (3, 5, 4), (5, 4))
     )
     memory = lbfgs.Memory(steps, changes, 1.0 / jnp.sum(steps * changes, axis=1))
-    looped = lbfgs._recur_twice(memory, grad, 2.0, jax.lax.scan, over_lanes)
+    looped = lbfgs.recur_twice(memory, grad, 2.0, jax.lax.scan, over_lanes)
     by_lane = jax.vmap(lambda *x: lbfgs.search_direction(*x, 2.0), in_axes=-1, out_axes=-1)
     np.testing.assert_allclose(looped, by_lane(memory, grad), rtol=2e-5, atol=1e-6)
 

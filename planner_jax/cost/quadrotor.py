@@ -13,7 +13,7 @@ from typing import ClassVar, Protocol
 
 import jax
 import jax.numpy as jnp
-from jax import Array
+from jax import Array, lax
 from jaxtyping import PyTree
 
 from planner_jax.core.arithmetic import Components, at_least, components, inverse_sqrt, reciprocal
@@ -27,7 +27,7 @@ from planner_jax.robot.quadrotor import (
     net_thrust,
     thrust_in_air,
 )
-from planner_jax.trajectory.polynomial import Motion, PiecewisePolynomial, sample_pieces
+from planner_jax.trajectory.polynomial import Motion, PiecewisePolynomial, sample_orders
 from planner_jax.trajectory.proportional_minco import ProportionalMinco
 
 
@@ -99,7 +99,7 @@ def tilt_excess(acc: Components, gravity: Array, limits: QuadrotorLimits) -> Arr
 
 
 _OVERTURN_NODES = 4  # intervals of a piece, at whose ends `overturn_excess` evaluates the motion
-_WEAK_STEPS = 2  # number of Gauss-Newton steps that minimise the thrust within an interval
+_WEAK_STEPS = 4  # number of evaluations that minimise the thrust within an interval
 
 
 class QuadrotorCase(Protocol):
@@ -303,62 +303,58 @@ def overturn_excess(
 ) -> Array:
     """Return the greatest relative excess of the body rate between samples, where it peaks; ().
 
-    It peaks upside down and where the thrust is nearly zero (`_weak_thrust_excess`). Upside down
+    It peaks upside down and where the thrust is nearly zero (`_rate_of_weak_thrust`). Upside down
     the Hopf fibration has no attitude: the body turns about the thrust at a rate that grows without
     limit, for a time shorter than the intervals between samples. From each sample the thrust
     direction z is followed at its rate w along a great circle. With the vertical component n of the
     circle's normal, the body rate at the lowest point is  w sqrt(1 + (n / (1 + z_z))^2) , and there
     1 + z_z = 1 - sqrt(1 - n^2) . Only lowest points within an interval count.
     """
-    load = _load(sample_pieces(trajectory, _OVERTURN_NODES), limits)
-    pull = net_thrust(load.acc, gravity)
-    unit = inverse_sqrt(at_least(jnp.sum(pull * pull, axis=1), 1e-4))[:, None]
-    z = pull * unit
-    turn = jnp.cross(z, load.jerk * unit)
-    rate = jnp.sum(turn * turn, axis=1)
-    squared = jnp.clip(turn[:, 2] ** 2 * reciprocal(at_least(rate, 1e-6)), 1e-12, 1.0)
-    level = jnp.sqrt(1.0 - squared)
-    steps = jnp.repeat(trajectory.durations / _OVERTURN_NODES, _OVERTURN_NODES + 1)
-    angle = jnp.minimum(jnp.sqrt(rate) * steps, 1.0)
-    is_met = -z[:, 2] >= level * jnp.cos(angle)
-    top = rate * (1.0 + (1.0 + level) ** 2 * reciprocal(squared))
-    excess = jnp.where(
-        is_met & (z[:, 2] < 0.0), top * reciprocal(limits.body_rate) ** 2 - 1.0, -1.0
-    )
-    weak = _weak_thrust_excess(pull, load.jerk, trajectory.durations, limits)
-    return relative(jnp.maximum(jnp.max(excess), weak))
+    if limits.air is None:
+        acc, jerk = sample_orders(trajectory, _OVERTURN_NODES, (2, 3))
+    else:
+        vel, acc, jerk = sample_orders(trajectory, _OVERTURN_NODES, (1, 2, 3))
+        acc, jerk = add_drag(limits.air, vel, acc), add_drag_rate(limits.air, acc, jerk)
+    pull = net_thrust(acc, gravity)
+    step = trajectory.durations[:, None] / _OVERTURN_NODES
+    size, mixed = at_least(_dot(pull, pull), 1e-4), _dot(pull, jerk)
+    rate = jnp.maximum((size * _dot(jerk, jerk) - mixed * mixed) / size**2, 1e-6)
+    (x, y, z), (a, b, _) = (jnp.moveaxis(each, 2, 0) for each in (pull, jerk))
+    squared = jnp.minimum(jnp.maximum(((x * b - y * a) / size) ** 2 / rate, 1e-12), 1.0)
+    level, z = jnp.sqrt(1.0 - squared), z / jnp.sqrt(size)
+    is_met = -z >= level * jnp.cos(jnp.minimum(jnp.sqrt(rate) * step, 1.0))
+    top = rate * (1.0 + (1.0 + level) ** 2 / squared)
+    top = jnp.where(is_met & (z < 0.0), top, rate)
+    greatest = jnp.maximum(jnp.max(top), jnp.max(_rate_of_weak_thrust(pull, jerk, step)))
+    return relative(greatest / limits.body_rate**2 - 1.0)
 
 
-def _weak_thrust_excess(
-    pull: Array, jerk: Array, durations: Array, limits: QuadrotorLimits
-) -> Array:
-    """Return w^2 / w_max^2 - 1 for the greatest rate w where the thrust is least between samples.
+def _dot(a: Array, b: Array) -> Array:
+    return jnp.sum(a * b, axis=-1)
 
-    The thrust per mass f has the samples `pull`, and between two of them it is the cubic function
-    with the derivatives `jerk`. Gauss-Newton steps minimise |f|; there  w = |f x f'| / |f|^2 .
+
+def _rate_of_weak_thrust(pull: Array, jerk: Array, step: Array) -> Array:
+    """Return the squared turning rate w^2 (P, K) where the thrust is least between two samples.
+
+    The thrust per mass f has the samples `pull` (P, K + 1, 3), and between two of them, `step` (P,
+    1) [s] apart, it is the cubic function with the derivatives `jerk`. Gauss-Newton steps minimise
+    |f|; there  w = |f x f'| / |f|^2 .
     """
-    ends, slopes = (each.reshape(-1, _OVERTURN_NODES + 1, 3) for each in (pull, jerk))
-    slopes = slopes * (durations / _OVERTURN_NODES)[:, None, None]
-    start, way = ends[:, :-1], ends[:, 1:] - ends[:, :-1]
+    slopes = jerk * step[..., None]
+    start, way = pull[:, :-1], pull[:, 1:] - pull[:, :-1]
     first, last = slopes[:, :-1], slopes[:, 1:]
     square, cube = 3.0 * way - 2.0 * first - last, first + last - 2.0 * way
 
-    def at(share: Array) -> tuple[Array, Array]:
-        u = share[..., None]
+    def descend(_: Array | int, state: tuple[Array, Array]) -> tuple[Array, Array]:
+        u = state[0][..., None]
         f = start + u * (first + u * (square + u * cube))
-        return f, first + u * (2.0 * square + 3.0 * u * cube)
+        rate = first + u * (2.0 * square + 3.0 * u * cube)
+        mixed, speed, size = _dot(f, rate), _dot(rate, rate) + 1e-6, _dot(f, f)
+        share = jnp.minimum(jnp.maximum(state[0] - mixed / speed, 0.0), 1.0)
+        return share, (size * speed - mixed * mixed) / (jnp.maximum(size, 1e-8) * step) ** 2
 
-    def step(share: Array, f: Array, rate: Array) -> Array:
-        change = jnp.sum(f * rate, axis=2) * reciprocal(at_least(jnp.sum(rate**2, axis=2), 1e-6))
-        return jnp.clip(share - change, 0.0, 1.0)
-
-    share = step(jnp.zeros(start.shape[:2], start.dtype), start, way)
-    for _ in range(_WEAK_STEPS):
-        share = step(share, *at(share))
-    f, rate = at(share)
-    turn = jnp.sum(jnp.cross(f, rate) ** 2, axis=2) * (_OVERTURN_NODES / durations[:, None]) ** 2
-    size = at_least(jnp.sum(f * f, axis=2), 1e-8)
-    return jnp.max(turn * reciprocal(size * limits.body_rate) ** 2 - 1.0)
+    half = jnp.full(start.shape[:2], 0.5, start.dtype)
+    return lax.fori_loop(0, _WEAK_STEPS, descend, (half, half))[1]
 
 
 def greatest_excess(

@@ -15,11 +15,11 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 from flax import struct
-from jax import Array, lax
+from jax import Array
 from jaxtyping import PyTree
 
 from planner_jax.core.protocol import is_better
-from planner_jax.lanes import over_lanes, with_kernel
+from planner_jax.lanes import with_kernel
 from planner_jax.optimise.settings import Evaluation, LbfgsConfig, Objective
 
 
@@ -124,10 +124,10 @@ def search_direction(memory: Memory, grad: Array, step_cap: float) -> Array:
     H approximates the inverse Hessian by the stored pairs of steps and gradient changes. Without a
     pair the direction is steepest descent with length 1, a moderate step in scaled variables.
     """
-    return _recur_twice(memory, grad, step_cap, _scan_unrolled, lambda function: function)
+    return recur_twice(memory, grad, step_cap, _scan_unrolled, lambda function: function)
 
 
-def _recur_twice(
+def recur_twice(
     memory: Memory, grad: Array, step_cap: float, scan: Callable, over: Callable
 ) -> Array:
     """Return the direction by loops of `scan`; `over` maps a function of one problem."""
@@ -182,36 +182,14 @@ def step(objective: Objective, state: LbfgsState, config: LbfgsConfig) -> LbfgsS
     takes the trial step along it with the least cost. A finished problem of a batch keeps its
     point; its memory and gradient are updated, but not used.
     """
-    here, grad = _evaluate(objective, state.point)
+    here, grad = evaluate(objective, state.point)
     memory, direction = _turn(config.memory, config.step_cap)(
         state.memory, state.step, grad - state.grad, grad
     )
-    return _try_steps(objective, config, state, here, grad, memory, direction)
+    return try_steps(objective, config, state, here, grad, memory, direction)
 
 
-def step_lanes(
-    objective: Callable[[Array, PyTree], Evaluation],
-    state: LbfgsState,
-    contexts: PyTree,
-    config: LbfgsConfig,
-) -> LbfgsState:
-    """Return the states of L problems after one iteration; the last axes count the problems.
-
-    `objective` takes a point (n,) and the context of one problem. The result is equal to `step` up
-    to rounding, but the two-loop recursion is a loop, for CPUs.
-    """
-
-    def try_steps(state: LbfgsState, context: PyTree, *found: PyTree) -> LbfgsState:
-        return _try_steps(lambda x: objective(x, context), config, state, *found)
-
-    evaluate = lambda x, context: _evaluate(lambda x: objective(x, context), x)  # noqa: E731
-    here, grad = over_lanes(evaluate)(state.point, contexts)
-    memory = over_lanes(remember)(state.memory, state.step, grad - state.grad)
-    direction = _recur_twice(memory, grad, config.step_cap, lax.scan, over_lanes)
-    return over_lanes(try_steps)(state, contexts, here, grad, memory, direction)
-
-
-def _evaluate(objective: Objective, point: Array) -> tuple[Evaluation, Array]:
+def evaluate(objective: Objective, point: Array) -> tuple[Evaluation, Array]:
     """Return the objective and its gradient (n,) at a point (n,)."""
 
     def value(point: Array) -> tuple[Array, Evaluation]:
@@ -222,7 +200,7 @@ def _evaluate(objective: Objective, point: Array) -> tuple[Evaluation, Array]:
     return evaluation, grad
 
 
-def _try_steps(
+def try_steps(
     objective: Objective,
     config: LbfgsConfig,
     state: LbfgsState,

@@ -11,7 +11,7 @@ tiles of lanes, so that solved cases take no time.
 
 import dataclasses
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -36,7 +36,7 @@ from planner_jax.optimise.multistart import (
 )
 from planner_jax.optimise.planner import OptimisedPlanner
 from planner_jax.optimise.rows import Model, Row, list_models, list_rows
-from planner_jax.optimise.settings import Evaluation, Round
+from planner_jax.optimise.settings import Evaluation, LbfgsConfig, Round
 from planner_jax.optimise.shipped import select_start
 
 _TILE = 256  # greatest number of lanes that run together; a tile lasts until its slowest lane ends
@@ -231,7 +231,7 @@ def _minimise(
 
     state = lax.while_loop(
         lambda state: jnp.any(lbfgs.is_unfinished(state.numbers, config)),
-        lambda state: lbfgs.step_lanes(objective, state, (starts, contexts), config),
+        lambda state: _step_lanes(objective, state, (starts, contexts), config),
         over_lanes(lambda start: lbfgs.init(start, config))(starts),
     )
     point, numbers = state.best_point, state.numbers
@@ -239,6 +239,28 @@ def _minimise(
         point = jnp.zeros((size, *point.shape[1:]), point.dtype).at[free].set(point)
     is_stationary = lbfgs.is_stationary(numbers, config)
     return Optimum(point, numbers.best, numbers.iteration, is_stationary)
+
+
+def _step_lanes(
+    objective: Callable[[Array, PyTree], Evaluation],
+    state: lbfgs.LbfgsState,
+    contexts: PyTree,
+    config: LbfgsConfig,
+) -> lbfgs.LbfgsState:
+    """Return the states of L problems after one iteration; the last axes count the problems.
+
+    `objective` takes a point (n,) and the context of one problem. The result is equal to
+    `lbfgs.step` up to rounding, but the two-loop recursion is a loop, for CPUs.
+    """
+
+    def try_steps(state: lbfgs.LbfgsState, context: PyTree, *found: PyTree) -> lbfgs.LbfgsState:
+        return lbfgs.try_steps(lambda x: objective(x, context), config, state, *found)
+
+    evaluate = lambda x, context: lbfgs.evaluate(lambda x: objective(x, context), x)  # noqa: E731
+    here, grad = over_lanes(evaluate)(state.point, contexts)
+    memory = over_lanes(lbfgs.remember)(state.memory, state.step, grad - state.grad)
+    direction = lbfgs.recur_twice(memory, grad, config.step_cap, lax.scan, over_lanes)
+    return over_lanes(try_steps)(state, contexts, here, grad, memory, direction)
 
 
 def _order_starts(row: Row, items: _Item, num: int) -> Array:

@@ -1,14 +1,12 @@
 """`plan`, for one case or a large batch on any devices, and `solve`, its pure counterpart."""
 
 import dataclasses
-import functools
-import itertools
 from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array, lax
+from jax import lax
 from jax.core import Tracer
 from jaxtyping import PyTree
 
@@ -22,7 +20,6 @@ from planner_jax.core.protocol import (
     Status,
     is_better,
     is_resident,
-    is_solved,
     is_unsolved,
     mark_out_of_time,
     select,
@@ -31,7 +28,7 @@ from planner_jax.core.protocol import (
 from planner_jax.core.rules import Case, has_rules, require_shapes, require_sound
 from planner_jax.host.compile_cache import keep_compiled_programs
 from planner_jax.planning.batch import Progress, Watch, plan_batch, plan_on_host
-from planner_jax.planning.programs import solve_cases, solve_one
+from planner_jax.planning.programs import solve_one
 
 _ARRAYS = (jax.Array, np.ndarray, np.generic)
 
@@ -215,7 +212,10 @@ class Driver:
             return plans, is_unsolved(plans.status)
         attempts = attempts or planner.attempts_for(cases)
         if self.is_pure:
-            plans = _plan_purely(planner, attempts, cases)
+            from planner_jax.planning.pure import plan_purely  # only compiled functions need it
+
+            require_pure(planner)
+            plans = plan_purely(planner, attempts, cases)
             return plans, is_unsolved(plans.status)
         if planner.kind is Kind.HOST:
             return plan_on_host(planner, attempts, cases, self.watch)
@@ -261,54 +261,6 @@ def _plan_one(planner: Planner, attempts: Sequence[Attempt], case: PyTree, watch
         if not is_unsolved(int(best.status)) and not any(each.improves for each in attempts):
             break
     return best
-
-
-def _plan_purely(planner: Planner, attempts: Sequence[Attempt], cases: PyTree) -> PyTree:
-    """Return plans as jax arrays; while any case is unsolved, searches are made for all cases."""
-    require_pure(planner)
-    joined = (planner.join_attempts(attempts[k:], cases) for k in range(len(attempts)))
-    alone, finish = next(((k, each) for k, each in enumerate(joined) if each), (None, None))
-    plans: PyTree = None
-    pairs = [(attempt, planner.load_attempt(attempt, cases)) for attempt in attempts[:alone]]
-    # Consecutive attempts (searches) with pytrees of equal structure share one compiled loop.
-    for _, same in itertools.groupby(pairs, lambda pair: jax.tree.structure(pair[1])):
-        group, loaded = zip(*same, strict=True)
-        solve_by = functools.partial(_solve_by, planner, cases, loaded)
-        is_start = plans is None
-        if is_start:
-            shapes = jax.eval_shape(solve_by, 0)
-            plans = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
-        within = [np.inf if each.within is None else each.within for each in group]
-        greatest = jnp.asarray(within, plans.violation.dtype)
-        improves = jnp.asarray([each.improves for each in group])
-
-        def try_next(
-            k: Array,
-            plans: PyTree,
-            solve_by=solve_by,
-            greatest=greatest,
-            improves=improves,
-            is_start=is_start,
-        ) -> PyTree:
-            is_first = is_start & (k == 0)
-            due = is_unsolved(plans.status) & (plans.violation <= greatest[k])
-            due |= is_solved(plans.status) & improves[k]
-
-            def solve_again(plans: PyTree) -> PyTree:
-                later = solve_by(k)
-                better = select(later, plans, due)
-                return jax.tree.map(lambda a, b: jnp.where(is_first, a, b), later, better)
-
-            return lax.cond(is_first | jnp.any(due), solve_again, lambda plans: plans, plans)
-
-        plans = lax.fori_loop(0, len(group), try_next, plans)
-    return finish(plans) if finish else plans
-
-
-def _solve_by(planner: Planner, cases: PyTree, loaded: Sequence[PyTree], k: Array | int) -> PyTree:
-    if len(loaded) == 1:
-        return solve_cases(planner, cases, loaded[0])
-    return solve_cases(planner, cases, jax.tree.map(lambda *leaves: jnp.stack(leaves)[k], *loaded))
 
 
 def require_pure(planner: Planner) -> None:

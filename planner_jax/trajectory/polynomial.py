@@ -2,6 +2,7 @@
 
 import functools
 import math
+from collections.abc import Iterable
 
 import jax.numpy as jnp
 import numpy as np
@@ -102,6 +103,15 @@ def snap_energy(trajectory: PiecewisePolynomial, order: int = 4) -> Array:
 
 def sample_pieces(trajectory: PiecewisePolynomial, nodes: int) -> Motion:
     """Sample the motion at `nodes` + 1 times of every piece, ends included, piece after piece."""
+    pos, *others = (each.reshape(-1, 3) for each in sample_orders(trajectory, nodes, range(5)))
+    vel, acc, jerk, snap = others
+    return Motion(height=pos[:, 2], vel=vel, acc=acc, jerk=jerk, pos=pos, snap=snap)
+
+
+def sample_orders(
+    trajectory: PiecewisePolynomial, nodes: int, orders: Iterable[int]
+) -> tuple[Array, ...]:
+    """Sample derivatives (P, nodes + 1, 3) of some orders at equal times of P pieces."""
     coeffs, degree = trajectory.coeffs, trajectory.coeffs.shape[1] - 1
     fractions = jnp.asarray(np.arange(nodes + 1) / nodes, coeffs.dtype)
     times = trajectory.durations[:, None] * fractions[None]
@@ -111,11 +121,9 @@ def sample_pieces(trajectory: PiecewisePolynomial, nodes: int) -> Motion:
         value = jnp.zeros(times.shape + (3,), coeffs.dtype)
         for k in range(degree, order - 1, -1):
             value = value * times[..., None] + factors[k] * coeffs[:, None, k]
-        return value.reshape(-1, 3)
+        return value
 
-    pos = sample(0)
-    vel, acc, jerk, snap = (sample(order) for order in (1, 2, 3, 4))
-    return Motion(height=pos[:, 2], vel=vel, acc=acc, jerk=jerk, pos=pos, snap=snap)
+    return tuple(map(sample, orders))
 
 
 def join(first: PiecewisePolynomial, then: PiecewisePolynomial) -> PiecewisePolynomial:

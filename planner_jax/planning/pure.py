@@ -1,0 +1,62 @@
+"""The loop over the attempts (searches) of a planner inside a compiled program, for `pj.solve`."""
+
+import functools
+import itertools
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+from jaxtyping import PyTree
+
+from planner_jax.core.planner import Planner
+from planner_jax.core.protocol import Attempt, is_solved, is_unsolved, select
+from planner_jax.planning.programs import solve_cases
+
+
+def plan_purely(planner: Planner, attempts: Sequence[Attempt], cases: PyTree) -> PyTree:
+    """Return plans as jax arrays; while any case is unsolved, searches are made for all cases."""
+    joined = (planner.join_attempts(attempts[k:], cases) for k in range(len(attempts)))
+    alone, finish = next(((k, each) for k, each in enumerate(joined) if each), (None, None))
+    plans: PyTree = None
+    pairs = [(attempt, planner.load_attempt(attempt, cases)) for attempt in attempts[:alone]]
+    # Consecutive attempts (searches) with pytrees of equal structure share one compiled loop.
+    for _, same in itertools.groupby(pairs, lambda pair: jax.tree.structure(pair[1])):
+        group, loaded = zip(*same, strict=True)
+        solve_by = functools.partial(_solve_by, planner, cases, loaded)
+        is_start = plans is None
+        if is_start:
+            shapes = jax.eval_shape(solve_by, 0)
+            plans = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+        within = [np.inf if each.within is None else each.within for each in group]
+        greatest = jnp.asarray(within, plans.violation.dtype)
+        improves = jnp.asarray([each.improves for each in group])
+
+        def try_next(
+            k: Array,
+            plans: PyTree,
+            solve_by=solve_by,
+            greatest=greatest,
+            improves=improves,
+            is_start=is_start,
+        ) -> PyTree:
+            is_first = is_start & (k == 0)
+            due = is_unsolved(plans.status) & (plans.violation <= greatest[k])
+            due |= is_solved(plans.status) & improves[k]
+
+            def solve_again(plans: PyTree) -> PyTree:
+                later = solve_by(k)
+                better = select(later, plans, due)
+                return jax.tree.map(lambda a, b: jnp.where(is_first, a, b), later, better)
+
+            return lax.cond(is_first | jnp.any(due), solve_again, lambda plans: plans, plans)
+
+        plans = lax.fori_loop(0, len(group), try_next, plans)
+    return finish(plans) if finish else plans
+
+
+def _solve_by(planner: Planner, cases: PyTree, loaded: Sequence[PyTree], k: Array | int) -> PyTree:
+    if len(loaded) == 1:
+        return solve_cases(planner, cases, loaded[0])
+    return solve_cases(planner, cases, jax.tree.map(lambda *leaves: jnp.stack(leaves)[k], *loaded))
