@@ -163,7 +163,7 @@ def test_penalty_for_moving_keep_outs_has_exact_slopes(float64):
 
     @jax.jit
     def penalty(columns, durations):
-        return integrate((keep_out,), along, columns, durations, True)[0].sum()
+        return integrate((keep_out,), along, columns, durations, True, ())[0].sum()
 
     slopes = jax.grad(penalty, (0, 1))(columns, durations)
     change = random.normal(size=columns.shape), random.normal(size=2)

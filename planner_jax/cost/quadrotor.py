@@ -325,8 +325,10 @@ def overturn_excess(
     is_met = -z >= level * jnp.cos(jnp.minimum(jnp.sqrt(rate) * step, 1.0))
     top = rate * (1.0 + (1.0 + level) ** 2 / squared)
     top = jnp.where(is_met & (z < 0.0), top, rate)
-    greatest = jnp.maximum(jnp.max(top), jnp.max(_rate_of_weak_thrust(pull, jerk, step)))
-    return relative(greatest / limits.body_rate**2 - 1.0)
+    is_flown = step > 0.0  # absent targets have segments of duration 0
+    found = top, _rate_of_weak_thrust(pull, jerk, step)
+    greatest = [jnp.max(jnp.where(is_flown, each, 0.0)) for each in found]
+    return relative(jnp.maximum(*greatest) / limits.body_rate**2 - 1.0)
 
 
 def _dot(a: Array, b: Array) -> Array:
