@@ -39,7 +39,7 @@ def test_rows_list_the_stages_of_all_rounds(planner):
     cases = {ExactHit: pj.hit, ExactCatch: pj.catch, ExactRally: pj.rally}[type(planner)].draw(1)
     attempts = [planner.fit_attempt(each, cases) for each in planner.attempts]
     models = list_models(planner, attempts, cases)
-    rows = list(list_rows(planner, attempts, models))
+    rows = list_rows(planner, attempts, models)
     assert sum(row.starts for row in rows) == sum(row.writes for row in rows) == len(attempts)
     assert len(rows) >= sum(len(each.all_stages) for each in attempts)
     assert len(set(map(id, models.values()))) <= 2

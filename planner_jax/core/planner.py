@@ -24,8 +24,6 @@ from planner_jax.core.rules import Case
 
 CaseT = TypeVar("CaseT", bound=Case)
 PlanT = TypeVar("PlanT", bound=Plan)
-
-
 Solve = Callable[[PyTree], PyTree]  # from plans of earlier attempts, or None, to the best plans
 
 
@@ -116,7 +114,7 @@ class Planner(Generic[CaseT, PlanT]):
         """
         return Fixed(attempt)
 
-    def join_attempts(self, attempts: Sequence[PyTree], cases: CaseT, /) -> "Solve | None":
+    def join_attempts(self, attempts: Sequence[PyTree], cases: CaseT, /) -> Solve | None:
         """Return a function that makes several attempts (searches) in one loop, for `pj.solve`.
 
         It takes the plans of earlier attempts, or None without such attempts, and returns the best

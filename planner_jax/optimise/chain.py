@@ -185,11 +185,18 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
     def guesses(self, context: PyTree, num: int) -> Float[Array, "num n"]:
         """Return starting points (num, n), the first one as predicted if that costs less."""
         points = self.plain_guesses(context, num)
-        learned = self.predict_start(points[0], self.network_inputs(context), context.case)
+        guess = points[0]
+        start = self.first_start(guess, self.network_inputs(context), context)
+        return points if start is guess else points.at[0].set(start)
+
+    def first_start(
+        self, guess: Float[Array, " n"], features: Float[Array, " F"], context: PyTree
+    ) -> Float[Array, " n"]:
+        """Return the first `guess`, or the point predicted from it if that costs less."""
+        learned = self.predict_start(guess, features, context.case)
         if learned is None:
-            return points
-        cost = lambda point: self.objective(point, context).cost  # noqa: E731
-        return points.at[0].set(select_start(cost, points[0], learned))
+            return guess
+        return select_start(lambda point: self.objective(point, context).cost, guess, learned)
 
     def plain_guesses(self, context: PyTree, num: int) -> Float[Array, "num n"]:
         """Return starting points (num, n), whose waypoint offsets are zero, without predictions."""

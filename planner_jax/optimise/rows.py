@@ -7,7 +7,7 @@ of variables, is in the `Model` of a row.
 """
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import jax
 import numpy as np
@@ -46,7 +46,9 @@ class Model:
     planner: ChainPlanner
     solver: LbfgsConfig
     varying: tuple[str, ...]  # fields of the planner that differ among its rows
-    free: tuple[int, ...] | None  # indices of its variables among those of the finest; None: all
+    # The indices of the planner's variables among the variables of the finest planner; None if the
+    # planner has all of them.
+    free: np.ndarray | None
 
 
 def list_models(
@@ -77,7 +79,7 @@ def list_models(
         free, solver = None, group[0].solver
         assert isinstance(solver, LbfgsConfig)
         if size < len(finest.scale):
-            free = None if finest.held is None else tuple(map(int, np.flatnonzero(~finest.held)))
+            free = None if finest.held is None else np.flatnonzero(~finest.held)
             if free is None or len(free) != size:
                 return None
         models |= dict.fromkeys(group, Model(of_group, solver, varying, free))
@@ -94,15 +96,15 @@ def _fits(stage: Stage, allowed: set[str]) -> bool:
 
 def list_rows(
     planner: ChainPlanner, attempts: Sequence[Round], models: dict[Stage, Model]
-) -> Iterator[Row]:
-    """Yield a row for each stage of all rounds (attempts), and for each choice among starts."""
-    for place, attempt in enumerate(attempts):
-        yield from _rows_of(planner, attempt, place == 0, models)
+) -> list[Row]:
+    """Return a row for each stage of all rounds (attempts), and for each choice among starts."""
+    pairs = enumerate(attempts)
+    return [row for k, each in pairs for row in _rows_of(planner, each, k == 0, models)]
 
 
 def _rows_of(
     planner: ChainPlanner, attempt: Round, is_first: bool, models: dict[Stage, Model]
-) -> Iterator[Row]:
+) -> list[Row]:
     places = {model: k for k, model in enumerate(dict.fromkeys(models.values()))}
     varying = sorted({name for model in places for name in model.varying})
     width, last, rows = attempt.starts, len(attempt.all_stages) - 1, []
@@ -124,7 +126,7 @@ def _rows_of(
         )
         rows.append(row)
         width = row.keep
-    yield from rows
     if not rows[-1].writes:  # the plan of the best starting point, after 0 iterations
         still = {"solver": (0, *rows[-1].solver[1:]), "width": 1, "starts": False, "writes": True}
-        yield dataclasses.replace(rows[-1], **still)
+        rows.append(dataclasses.replace(rows[-1], **still))
+    return rows

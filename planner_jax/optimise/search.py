@@ -37,7 +37,6 @@ from planner_jax.optimise.multistart import (
 from planner_jax.optimise.planner import OptimisedPlanner
 from planner_jax.optimise.rows import Model, Row, list_models, list_rows
 from planner_jax.optimise.settings import Evaluation, LbfgsConfig, Round
-from planner_jax.optimise.shipped import select_start
 
 _TILE = 256  # greatest number of lanes that run together; a tile lasts until its slowest lane ends
 
@@ -77,7 +76,7 @@ def make_solve(planner: ChainPlanner, attempts: Sequence[Round], cases: PyTree) 
     if models is None:
         return None
     finest = max(models.values(), key=lambda each: len(each.planner.scale)).planner
-    rows = list(list_rows(planner, attempts, models))
+    rows = list_rows(planner, attempts, models)
     return functools.partial(_Program(finest, tuple(dict.fromkeys(models.values())), rows), cases)
 
 
@@ -126,7 +125,10 @@ class _Program:
         return mark_bad_input(plans, cases)
 
     def _plan_guess(self, case: PyTree) -> tuple[_Item, PyTree]:
-        """Return a search of 0 iterations and its plan, whose shapes are those of all searches."""
+        """Return the first guess of a case as a search of 0 iterations, and its plan.
+
+        All other searches, and their plans, have arrays of the same shapes and types.
+        """
         context = self.finest.prepare(case)
         optimum = start_at(self.finest.plain_guesses(context, 1)[0])
         plan = plan_at(self.finest, optimum, context)
@@ -208,16 +210,12 @@ def _minimise(
     """Minimise by L-BFGS from points (n, lanes) of the finest model."""
     planner = model.planner.with_weights({name: row.weights[name] for name in model.varying})
     config = jax.tree.unflatten(jax.tree.structure(model.solver), row.solver)
-    size, free = len(starts), None if model.free is None else np.array(model.free)
+    size, free = len(starts), model.free
     if free is not None:
         starts = starts[free]
 
     def select(start: Array, inputs: Array, context: PyTree, index: Array) -> Array:
-        learned = planner.predict_start(start, inputs, context.case)
-        if learned is None:
-            return start
-        cost = lambda point: planner.objective(point, context).cost  # noqa: E731
-        return jnp.where(index == 0, select_start(cost, start, learned), start)
+        return jnp.where(index == 0, planner.first_start(start, inputs, context), start)
 
     keep = lambda starts, *_: starts  # noqa: E731
     starts = lax.cond(row.starts, over_lanes(select), keep, starts, inputs, contexts, index)

@@ -147,9 +147,9 @@ def require_batch(cases: Case) -> int:
 def solve(planner: Planner[CaseT, PlanT], cases: CaseT) -> PlanT:
     """Plan cases as a pure function, for compiled functions, `vmap` and `scan`.
 
-    Each attempt (search) after the first is made at all cases of a batch if one is unsolved. Hits,
-    catches and rallies on a CPU, without Newton's method, are searched only while unsolved.
-    `plan` removes solved cases from the batch, and is faster where few cases are left.
+    Each attempt (search) after the first is made at all cases of a batch if one is unsolved. `plan`
+    removes solved cases from the batch, and is faster where few cases are left. On a CPU, hits,
+    catches and rallies are also removed here, except for attempts that use Newton's method.
 
     Args:
         planner: as for `plan`.

@@ -114,8 +114,9 @@ def check_start(cases: PyTree) -> PyTree:
 
 def require_own_robot(robot: object, usual: QuadrotorModel, suite: str, wind: object) -> None:
     """Raise unless `robot` is the default `usual`, and `wind` None; `suite` has its own robot."""
-    if robot != usual or wind is not None:
-        name = "wind" if robot == usual else "robot"
+    is_usual = isinstance(robot, QuadrotorModel) and robot == usual
+    if not is_usual or wind is not None:
+        name = "wind" if is_usual else "robot"
         raise ArgumentError(name, f"left out with suite {suite!r}, which has its own", shown="")
 
 

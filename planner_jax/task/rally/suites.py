@@ -137,7 +137,8 @@ def draw(
     require_scalar("limit_scale", limit_scale)
     require_scale(limit_scale)
     if suite not in SUITES:
-        require_own_robot(robot or PAPER_HITTER, PAPER_HITTER, suite, wind)
+        own = PAPER_HITTER if robot is None else robot
+        require_own_robot(own, PAPER_HITTER, suite, wind)
         return TASK.other_suite(suite)(num, seed, first)
     if hits is not None:
         require_size("hits", hits)
@@ -158,7 +159,7 @@ def draw(
         min_apex=course.apex[0],
         max_apex=course.apex[1],
         home=course.home,
-        robot=robot or course.robot,
+        robot=course.robot if robot is None else robot,
         start=start,
         start_attitude=attitude,
         drag=course.drag,
