@@ -194,7 +194,8 @@ def call_randomly(num: int, seed: int) -> tuple[Counter, dict[str, str]]:
     valid, rng = make_valid(), random.Random(seed)
     objects = valid.pop("objects")["values"]
     fit = valid["pj.ball.fit"]
-    for floor in (None, np.min(fit["positions"]), np.min(fit["positions"]) - 1e3):
+    lowest = fit["positions"][:, 2].min()
+    for floor in (None, lowest, lowest - 1e3):
         pj.ball.fit(**fit, floor=floor)  # compiles its programs before a call is timed
     functions = list(find_public(valid))
     outcomes: Counter = Counter()
