@@ -98,7 +98,7 @@ def measure_scale(
         def diagonals(case: Any, planner: Any = planner) -> jax.Array:
             context = planner.prepare(case)
             scale = jnp.asarray(planner.scale)
-            start = planner.guesses(context, 1)[0]
+            start = planner.first_guess(context)
             optimum = minimise(lambda x: planner.objective(x, context), start, config)
 
             def at(point: jax.Array) -> jax.Array:
@@ -126,7 +126,7 @@ def measure_metric(planner: Any, cases: Any) -> dict[str, np.ndarray]:
     def search(case: Any) -> tuple[jax.Array, jax.Array]:
         context = planner.prepare(case)
         cost = lambda x: planner.objective(x, context)  # noqa: E731
-        start = planner.guesses(context, 1)[0]
+        start = planner.first_guess(context)
         point = minimise(cost, start, config).point
         return jax.hessian(lambda x: cost(x).cost)(point), point - start
 

@@ -25,7 +25,6 @@ with contextlib.redirect_stdout(io.StringIO()):  # hides the message that Warp i
 
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.protocol import is_solved
-from planner_jax.optimise.multistart import solve_batch
 from planner_jax.optimise.settings import LbfgsConfig, Round
 from planner_jax.policies.observation import FEATURES, PER_TARGET, choice_of, observe
 from planner_jax.policies.settings import WEIGHTS
@@ -221,12 +220,12 @@ def evaluate_actions(cases: CatchCase, actions: Array, iterations: int) -> dict[
 
 def _plan(cases: CatchCase, choices: CatchChoice, iterations: int) -> tuple[CatchChoice, Any]:
     if not cases.optional:
-        return choices, solve_batch(ExactCatch(), _attempt(iterations), cases.with_choice(choices))
+        return choices, ExactCatch().solve_lanes(cases.with_choice(choices), _attempt(iterations))
     several = jax.vmap(in_several_lengths)(cases, jax.tree.map(lambda x: x[:, None], choices))
     num = several.times.shape[1]
     flat = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), several)
     tried = jax.tree.map(lambda leaf: jnp.repeat(leaf, num, axis=0), cases).with_choice(flat)
-    found = solve_batch(ExactCatch(), _attempt(iterations), tried)
+    found = ExactCatch().solve_lanes(tried, _attempt(iterations))
     each = jax.tree.map(lambda leaf: leaf.reshape(-1, num, *leaf.shape[1:]), (flat, found))
     # Each decision was also planned without its last catches. These variants are sorted by falling
     # number of catches, so that the first solved variant has the most catches.

@@ -22,7 +22,7 @@ SLOW_MODES = [pytest.param(mode, marks=pytest.mark.slow) for mode in MODES[2:]]
 ALONG = Along(
     proportional_minco(2, (0.4, 1.0)),
     5,
-    lambda motion, given: motion_excess(motion, *given),
+    lambda motion, given: motion_excess(motion, *given[:2]),
     margins=(0.1, 0.1, 0.1, 0.05),
     hinge_width=0.2,
 )
@@ -224,6 +224,26 @@ def test_derivatives_in_lanes_are_those_without_a_kernel(monkeypatch):
         for ours, theirs in zip(*map(jax.tree.leaves, (found, expected)), strict=True):
             scale = np.abs(theirs).max()
             np.testing.assert_allclose(ours, theirs, rtol=2e-4, atol=5e-5 * scale)
+
+
+@pytest.mark.parametrize("mode", ["values", "slopes"])
+def test_the_kernel_takes_margins_and_width_at_run_time(mode):
+    columns, durations, given = cases()
+    share, width = (np.full(LANES, number, np.float32) for number in (1.5, 0.3))
+    args = columns, durations, (*given, share, width)
+    along = dataclasses.replace(ALONG, hinge_width=None)
+    constant = dataclasses.replace(
+        ALONG, margins=tuple(1.5 * each for each in ALONG.margins), hinge_width=0.3
+    )
+    expected, found = (
+        along_kernel(each, mode, interpret=True)(
+            jax.tree.structure(own),
+            jax.tree.leaves(jax.tree.map(lambda x: jnp.moveaxis(jnp.asarray(x), 0, -1), own)),
+        )
+        for each, own in ((constant, (columns, durations, given)), (along, args))
+    )
+    for ours, theirs in zip(found, expected, strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-5, atol=1e-5)
 
 
 def test_the_kernel_declines_types_and_sizes_that_it_does_not_support():

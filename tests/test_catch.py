@@ -1,15 +1,13 @@
 import dataclasses
-import functools
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_solve import WellPlanner
+from test_solve import Well, WellPlanner
 
 import planner_jax as pj
 from planner_jax.core.protocol import Status, is_solved
-from planner_jax.optimise.multistart import solve_round
 from planner_jax.optimise.settings import Evaluation, LbfgsConfig, Round, Stage
 from planner_jax.planning.decided import first_choice
 from planner_jax.planning.plan import plan
@@ -175,7 +173,7 @@ class Bowl(WellPlanner):
 def solve(starts, solver, *, settings=(), goals=()):
     stages = tuple(Stage(SEARCH, (("goal", goal),)) for goal in goals)
     attempt = Round(starts, solver, settings, stages)
-    return jax.jit(functools.partial(solve_round, Bowl(), attempt))(np.zeros((), np.float32))
+    return jax.jit(lambda case: Bowl().solve(case, attempt))(Well(np.zeros((), np.float32)))
 
 
 def test_a_round_starts_where_its_last_stage_ended():

@@ -16,7 +16,6 @@ from planner_jax.core import planner as planner_module
 from planner_jax.core.protocol import Attempt, Plan, is_solved, outcome
 from planner_jax.core.rules import has_rules
 from planner_jax.optimise.planner import OptimisedPlanner
-from planner_jax.optimise.settings import load_stage
 from planner_jax.task.intercept.default_planner import SpacetimeIntercept
 from tests.planners import ENTRIES, NUM, LibraryPlanner, Place, Stand, library, places
 from tests.trees import assert_same
@@ -142,9 +141,9 @@ def test_a_second_batch_of_the_same_bucket_is_not_traced_again(entry, forbid_tra
     ("planner", "case", "num"),
     [
         # `num` is the number of compiled programs: attempts need different programs if they have
-        # other variables or keep another margin from the limits.
-        (pj.hit.planner("exact"), pj.hit.draw(1), 3),
-        (pj.catch.planner("exact").planner, pj.catch.draw(1), 2),
+        # other variables.
+        (pj.hit.planner("exact"), pj.hit.draw(1), 2),
+        (pj.catch.planner("exact").planner, pj.catch.draw(1), 1),
         (pj.intercept.planner("spacetime"), pj.intercept.draw(1), 2),
         (pj.intercept.planner("quick"), pj.intercept.draw(1), 1),
         (pj.block.planner("online"), pj.block.draw(1), 1),
@@ -154,11 +153,9 @@ def test_a_second_batch_of_the_same_bucket_is_not_traced_again(entry, forbid_tra
 )
 def test_the_attempts_of_a_planner_share_programs(planner, case, num):
     loaded = []
-    for attempt in planner.attempts_for(case):
-        if planner.divides(attempt):
-            loaded += [load_stage(stage, False) for stage in attempt.all_stages]
-        else:
-            loaded.append(planner.load_attempt(attempt, case))
+    attempts = planner.attempts_for(case)
+    for attempt in planner.group_attempts(attempts, case, is_whole=False, is_single=True):
+        loaded.append(planner.load_attempt(attempt, case))
     layouts = [[(leaf.shape, leaf.dtype) for leaf in jax.tree.leaves(each)] for each in loaded]
     programs = zip(map(jax.tree.structure, loaded), map(tuple, layouts), strict=True)
     assert len(set(programs)) == num < len(planner.attempts)

@@ -13,7 +13,7 @@ from derivatives import double
 import planner_jax as pj
 from planner_jax.core.protocol import is_solved
 from planner_jax.lanes import kernels, over_lanes
-from planner_jax.optimise.multistart import minimise_lanes, solve_batch
+from planner_jax.optimise.multistart import minimise_lanes
 from planner_jax.optimise.sensitivity import gradient_at
 from planner_jax.optimise.settings import LbfgsConfig, Round
 from planner_jax.planning.plan import plan
@@ -54,7 +54,7 @@ def test_hits_are_those_of_a_cpu(devices, serves):
 
 def test_compiled_programs_hold_their_kernels(devices, serves):
     attempt = Round(1, LbfgsConfig(max_steps=2))
-    hits = jax.jit(lambda cases: solve_batch(ExactHit(), attempt, cases))
+    hits = jax.jit(lambda cases: ExactHit().solve_lanes(cases, attempt))
     program = hits.lower(jax.device_put(serves, devices[0])).compile().as_text()
     assert program.count('custom_call_target="__gpu$xla.gpu.triton"') >= 5
 

@@ -11,7 +11,6 @@ import planner_jax as pj
 from planner_jax.cli import doctor
 from planner_jax.core.errors import ArgumentError
 from planner_jax.lanes import kernels, over_lanes
-from planner_jax.optimise.multistart import solve_batch
 from planner_jax.optimise.preconditioner import positive_inverse
 from planner_jax.optimise.sensitivity import gradient_at
 from planner_jax.optimise.settings import LbfgsConfig, Round
@@ -44,7 +43,7 @@ def kernels_in(function, *args):
 
 def round_of(planner):
     attempt = Round(1, LbfgsConfig(max_steps=2))
-    return lambda cases: solve_batch(planner, attempt, cases)
+    return lambda cases: planner.solve_lanes(cases, attempt)
 
 
 def serves():

@@ -12,13 +12,11 @@ from planner_jax.core.protocol import Status, is_solved
 from planner_jax.lanes import over_lanes
 from planner_jax.lanes.packing import Packing
 from planner_jax.optimise import lbfgs
-from planner_jax.optimise.rows import list_models, list_rows
 from planner_jax.optimise.settings import LbfgsConfig, NewtonConfig, Round
 from planner_jax.recovery.case import RecoveryCase
 from planner_jax.recovery.planner import RecoveryPlanner
 from planner_jax.task.catch.default_planner import ExactCatch
 from planner_jax.task.hit.default_planner import ExactHit
-from planner_jax.task.rally.default_planner import ExactRally
 from tests.jaxpr import equations
 
 MOST = {"hit": 9000, "catch": 6500}  # equations of jit(pj.solve) of one case
@@ -32,43 +30,51 @@ def test_solve_of_one_case_has_few_equations(task):
     assert sum(1 for _ in equations(jaxpr.jaxpr)) <= MOST[task]
 
 
-@pytest.mark.parametrize(
-    "planner", [ExactHit(), ExactCatch(), ExactRally()], ids=["hit", "catch", "rally"]
-)
-def test_rows_list_the_stages_of_all_rounds(planner):
-    cases = {ExactHit: pj.hit, ExactCatch: pj.catch, ExactRally: pj.rally}[type(planner)].draw(1)
-    attempts = [planner.fit_attempt(each, cases) for each in planner.attempts]
-    models = list_models(planner, attempts, cases)
-    rows = list_rows(planner, attempts, models)
-    assert sum(row.starts for row in rows) == sum(row.writes for row in rows) == len(attempts)
-    assert len(rows) >= sum(len(each.all_stages) for each in attempts)
-    assert len(set(map(id, models.values()))) <= 2
+PLANNERS = {"hit": ExactHit(), "catch": ExactCatch()}
+
+
+def tables_of(planner, cases, *, is_whole):
+    groups = planner.group_attempts(planner.attempts, cases, is_whole=is_whole, is_single=False)
+    return [planner.load_attempt(each, cases) for each in groups]
+
+
+@pytest.mark.parametrize(("task", "programs", "models"), [("hit", 2, 2), ("catch", 1, 1)])
+def test_rows_list_the_stages_of_all_rounds(task, programs, models):
+    planner, cases = PLANNERS[task], getattr(pj, task).draw(1)
+    (table,) = tables_of(planner, cases, is_whole=True)
+    rows = table.rows
+    assert np.sum(rows.starts) == np.sum(rows.writes) == len(planner.attempts)
+    assert len(rows.starts) >= sum(len(each.all_stages) for each in planner.attempts)
+    assert len(table.models) == models
+    parts = tables_of(planner, cases, is_whole=False)
+    assert [len(each.models) for each in parts] == [1] * programs
+    assert sum(np.sum(each.rows.starts) for each in parts) == len(planner.attempts)
+
+
+def test_other_numbers_of_rounds_are_data_of_the_same_program():
+    cases, planner = pj.catch.draw(1), ExactCatch()
+    first, second, *others = planner.rounds
+    solver = dataclasses.replace(second.solver, max_steps=31, tolerance=1e-5)
+    longer = dataclasses.replace(second, solver=solver, within=0.1)
+    changed = dataclasses.replace(planner, rounds=(first, longer, *others))
+    before, after = (tables_of(each, cases, is_whole=True)[0] for each in (planner, changed))
+    assert jax.tree.structure(before) == jax.tree.structure(after)
+    assert np.any(np.asarray(before.numbers) != np.asarray(after.numbers))
 
 
 @pytest.mark.parametrize(
-    "change",
+    ("rounds", "programs"),
     [
-        {"rounds": (Round(), Round(improves=True))},
-        {"rounds": (Round(solver=NewtonConfig()),)},
-        {"rounds": (Round(settings=(("catch_weight", 1.0),)),)},
-        {"rounds": (Round(solver=LbfgsConfig(max_steps=0)),)},
+        ((Round(), Round(improves=True)), 1),
+        ((Round(), Round(solver=NewtonConfig())), 1),
+        ((Round(), Round(settings=(("catch_weight", 1.0),))), 2),
+        ((Round(), Round(solver=LbfgsConfig(max_steps=0))), 1),
     ],
     ids=["improves", "Newton", "another field", "no iterations"],
 )
-def test_rounds_that_fit_no_table_have_their_own_programs(change):
-    cases, planner = pj.catch.draw(1), dataclasses.replace(ExactCatch(), **change)
-    assert planner.join_attempts(planner.attempts, cases) is None
-    usual = ExactCatch()
-    assert usual.join_attempts(usual.attempts, cases) is not None
-
-
-def test_a_subclass_with_its_own_guesses_has_its_own_programs():
-    @jax.tree_util.register_static
-    class OwnGuesses(ExactCatch):
-        def guesses(self, context, num):
-            return super().guesses(context, num)
-
-    assert OwnGuesses().join_attempts(OwnGuesses().attempts, pj.catch.draw(1)) is None
+def test_rounds_that_prepare_cases_differently_have_their_own_programs(rounds, programs):
+    planner = dataclasses.replace(ExactCatch(), rounds=rounds)
+    assert len(tables_of(planner, pj.catch.draw(1), is_whole=True)) == programs
 
 
 def test_packed_arrays_are_unpacked_unchanged():
@@ -100,7 +106,7 @@ def test_weights_in_arrays_give_the_objective_of_constant_weights():
     case = RecoveryCase(hit.head_state, np.zeros(3, np.float32), hit.gravity, hit.limits)
     weights = {name: jnp.float32(getattr(planner, name)) for name in planner.weights}
     context = planner.prepare(case)
-    point = planner.plain_guesses(context, 1)[0]
+    point = planner.guesses(context, 1)[0]
     own, other = (
         each.objective(point, context) for each in (planner, planner.with_weights(weights))
     )

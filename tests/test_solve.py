@@ -12,7 +12,7 @@ from jax import Array
 import planner_jax as pj
 from planner_jax.core.protocol import Plan, Status, is_solved
 from planner_jax.optimise.settings import Evaluation, LbfgsConfig, Round, Stage
-from planner_jax.planning import batch, searches
+from planner_jax.planning import batch
 from tests.trees import assert_same
 
 
@@ -157,18 +157,17 @@ def test_a_later_round_takes_only_what_is_unsolved(monkeypatch):
     sizes = []
 
     def note_size(function):
-        def noting(planner, attempt, mesh, cases, **options):
+        def noting(planner, attempt, mesh, cases, before, **options):
             sizes.append(cases.goal.size)
-            return function(planner, attempt, mesh, cases, **options)
+            return function(planner, attempt, mesh, cases, before, **options)
 
         return noting
 
     monkeypatch.setattr(batch, "solve_on_devices", note_size(batch.solve_on_devices))
-    monkeypatch.setattr(searches, "divide_batch", note_size(searches.divide_batch))
     goals = np.full(300, 0.5, np.float32)
     goals[[7, -1]] = 3.5
     assert is_solved(pj.plan(WellPlanner(), Well(jnp.asarray(goals))).status).all()
-    assert sorted(sizes[:2]) == [128, 256] and sizes[2:] == [2]  # the first two calls run at once
+    assert sorted(sizes[:4]) == [16, 16, 16, 256] and sizes[4:] == [16]
 
 
 def retry_within(within):

@@ -13,19 +13,23 @@ the climb and the fall separately, because the speed may have a kink at the apex
 """
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
+from jax import Array, lax
 from jax.custom_derivatives import SymbolicZero
 
 from planner_jax.core.arithmetic import reciprocal
+from planner_jax.core.compiled import has_only_cpu, traced_platform
 
 _NODES = 5  # number of nodes of the climb, and of the fall
-_ITERATIONS = 8  # number of times that the rates are computed from the speed
-_CONSTANT = 3  # number of the first iterations whose results are constants in derivatives
+_ITERATIONS = 3  # number of times that the speed is computed from the rates
+_FIRST = 4  # the same before those iterations, if the drag is strong
+# Greatest product of drag and greatest speed without drag, [m] per flight time, of weak drag: the
+# iterations without `_FIRST` then miss the target by no more than the quadrature does.
+_WEAK = 0.5
 
 
 def fly_between(
@@ -99,22 +103,44 @@ def _solve(square: Array, rise: Array, fall: Array, drag: Array) -> Array:
         upward = across * (rise + integrate((kept * fallen)[:, :-1], lengths)[1, -1])
         return across, upward, kept * across, kept * (upward - fallen)
 
-    top = jnp.clip(0.5 + rise / fall, 0.0, 1.0)  # time of the apex in units of T
-    lengths, times = divide(top)
-    speed = speed_of(jnp.ones_like(times), rise + fall * (0.5 - times))
-    for k in range(_ITERATIONS - 1):
-        if k < _CONSTANT:
-            top, times, speed = map(jax.lax.stop_gradient, (top, times, speed))
-            lengths, _ = divide(top)
+    def improve(top: Array, speed: Array) -> tuple[Array, Array]:
+        """Return the time of the apex and the speed at the nodes (2, N) by the speed before."""
+        lengths, times = divide(top)
         _, _, across, upward = rates_of(speed, lengths)
         top = jnp.clip(top + upward[0, -1] / fall, 0.0, 1.0)
-        lengths, later = divide(top)
-        shift, times = later - times, later
+        shift = divide(top)[1] - times
         brake = 1.0 - drag * speed * shift
-        speed = speed_of(across[:, :-1] * brake, upward[:, :-1] * brake - fall * shift)
+        return top, speed_of(across[:, :-1] * brake, upward[:, :-1] * brake - fall * shift)
+
+    top = jnp.clip(0.5 + rise / fall, 0.0, 1.0)  # time of the apex in units of T
+    times = divide(top)[1]
+    speed = speed_of(jnp.ones_like(times), rise + fall * (0.5 - times))
+    top, speed = _repeat_first(improve, drag, top, speed)
+    for _ in range(_ITERATIONS):
+        top, speed = improve(top, speed)
+    lengths, _ = divide(top)
     *first, across, upward = rates_of(speed, lengths)
     climb = integrate(upward[:, :-1], lengths)[0, -1]
     return jnp.stack([*first, across[1, -1], upward[1, -1], climb])
+
+
+def _repeat_first(
+    improve: Callable[[Array, Array], tuple[Array, Array]], drag: Array, top: Array, speed: Array
+) -> tuple[Array, Array]:
+    """Return time of the apex and speed after `_FIRST` iterations; on a CPU only if they help."""
+    is_strong = drag * jnp.max(speed) > _WEAK
+    found = top, speed
+    if has_only_cpu() or traced_platform() == "cpu":
+        last = jnp.where(is_strong, _FIRST, 0)
+        advance = lambda state: (state[0] + 1, *improve(*state[1:]))  # noqa: E731
+        state = lax.while_loop(lambda s: s[0] < last, advance, (jnp.zeros_like(last), *found))
+        return state[1], state[2]
+    # On a GPU the host would wait for every test whether the loop has ended.
+    for k in range(_FIRST):
+        found = improve(*(lax.stop_gradient(found) if k < _FIRST - 1 else found))
+    pairs = zip(found, (top, speed), strict=True)
+    top, speed = (jnp.where(is_strong, later, first) for later, first in pairs)
+    return top, speed
 
 
 @functools.cache

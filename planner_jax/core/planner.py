@@ -24,7 +24,6 @@ from planner_jax.core.rules import Case
 
 CaseT = TypeVar("CaseT", bound=Case)
 PlanT = TypeVar("PlanT", bound=Plan)
-Solve = Callable[[PyTree], PyTree]  # from plans of earlier attempts, or None, to the best plans
 
 
 class Kind(enum.Enum):
@@ -114,20 +113,16 @@ class Planner(Generic[CaseT, PlanT]):
         """
         return Fixed(attempt)
 
-    def join_attempts(self, attempts: Sequence[PyTree], cases: CaseT, /) -> Solve | None:
-        """Return a function that makes several attempts (searches) in one loop, for `pj.solve`.
+    def group_attempts(
+        self, attempts: Sequence[PyTree], cases: CaseT, /, *, is_whole: bool, is_single: bool
+    ) -> Sequence[PyTree]:
+        """Return the attempts (searches) in the form in which compiled programs make them.
 
-        It takes the plans of earlier attempts, or None without such attempts, and returns the best
-        plans. By default the method returns None: each attempt has a program of its own.
+        By default they are unchanged. A planner may join attempts that one program makes in turn:
+        all that it can for `pj.solve`, which `is_whole` means, else those whose program is
+        compiled fast. With `is_single` each result makes one attempt of such a program.
         """
-        return None
-
-    def divides(self, attempt: PyTree, /) -> bool:
-        """Return whether `pj.plan` solves a case from each starting point as a separate problem.
-
-        Attempts (settings of a search) then share a program for any number of starting points.
-        """
-        return False
+        return attempts
 
     def compiles_quickly(self, attempt: PyTree, /) -> bool:
         """Return whether a CPU compiles the search of an attempt for one case by `QUICK_OPTIONS`.

@@ -199,6 +199,11 @@ class Attempt:
         if self.within is not None:
             require_number("within", self.within, POSITIVE)
 
+    @property
+    def continues(self) -> bool:
+        """Return whether the compiled search needs the numbers of the best plans so far."""
+        return False
+
     def is_due(self, plans: "Plan") -> Array:
         """Return which plans need this search, bool: unsolved, and violation <= `within`.
 
@@ -211,6 +216,31 @@ class Attempt:
 
 
 PlanT = TypeVar("PlanT", bound=Plan)
+
+
+@struct.dataclass
+class Score:
+    """The numbers of plans by which they are compared with other plans; see `is_better`."""
+
+    cost: Array | np.ndarray
+    violation: Array | np.ndarray
+    status: Array | np.ndarray
+
+    @classmethod
+    def of(cls, plans: Plan) -> "Score":
+        """Return the numbers of plans, of any batch shape."""
+        return cls(plans.cost, plans.violation, plans.status)
+
+    @classmethod
+    def none(cls, batch: tuple[int, ...], dtype: np.dtype) -> "Score":
+        """Return NumPy numbers of cases without plans, than which every finite plan is better."""
+        unsolved = np.full(batch, Status.INFEASIBLE, np.int32)
+        return cls(np.zeros(batch, dtype), np.full(batch, np.inf, dtype), unsolved)
+
+    def without(self, is_padding: Numbers) -> "Score":
+        """Return the numbers with a status for which no search is made, where a mask is true."""
+        status = numpy_of(self.status).where(is_padding, Status.BAD_INPUT, self.status)
+        return dataclasses.replace(self, status=status.astype(np.int32))
 
 
 @runtime_checkable

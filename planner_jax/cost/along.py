@@ -45,8 +45,8 @@ class Along:
     nodes: int  # number of intervals of each piece
     excess: Excess
     margins: tuple[float, ...]  # (E,), added to each excess before the hinge
-    # None: the last two `parameters` are a factor on the margins, and the width. These numbers are
-    # then known only at run time, and no CUDA kernel is used.
+    # None: the last two `parameters` are a factor on the margins, and the width, which are known
+    # only at run time.
     hinge_width: float | None
     # Cost per second that the user defines (extras of a case). With it no CUDA kernel is used.
     rate: Rate | None = None

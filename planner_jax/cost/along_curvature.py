@@ -151,12 +151,13 @@ def block_and_diagonal(
 def _at_samples(
     along: Along, motion: Array, parameters: PyTree
 ) -> tuple[Array, Array, Array, dict[tuple[Slot, Slot], Array]]:
-    width = along.hinge_width
-    assert width is not None  # only a program of several searches has a width known at run time
     margins, factors = (
         jnp.asarray(np.array(each)[:, None], motion.dtype)
         for each in (along.margins, along.hinge_weights)
     )
+    parameters, share, width = along.split(parameters)
+    if along.hinge_width is None:
+        margins = share * margins
 
     def value(at: Array) -> tuple[Array, tuple[Array, Array]]:
         pos, vel, acc, jerk, *snap = at

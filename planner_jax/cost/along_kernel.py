@@ -74,8 +74,8 @@ def grid_of(
     *_, num_columns, _, lanes = points[0][0].shape
     threads = block_width(lanes, _THREADS)
     # The kernel computes no horizontal position, which the user's cost terms (`rate`) need, and no
-    # snap, which limits of single rotors need (5 orders). Its hinges are constants.
-    if along.rate is not None or along.orders != 4 or threads is None or along.hinge_width is None:
+    # snap, which limits of single rotors need (5 orders).
+    if along.rate is not None or along.orders != 4 or threads is None:
         return None
     if any(leaf.dtype != jnp.float32 for leaf in leaves):
         return None
@@ -301,10 +301,10 @@ def sample_excess(along: Along, unit: Vectors, duration: Array, given: PyTree) -
 
 
 def _penalty(along: Along, unit: Vectors, duration: Array, given: PyTree) -> tuple[Array, Array]:
-    excess, width = sample_excess(along, unit, duration, given), along.hinge_width
-    assert width is not None  # see `grid_of`
+    numbers, share, width = along.split(given)
+    excess = sample_excess(along, unit, duration, numbers)
     hinges = [
-        factor * smooth_hinge(value + margin, width)
+        factor * smooth_hinge(value + share * margin, width)
         for value, margin, factor in zip(excess, along.margins, along.hinge_weights, strict=True)
     ]
     return duration * _total(hinges), functools.reduce(jnp.maximum, excess)

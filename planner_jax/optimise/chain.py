@@ -6,11 +6,9 @@ variables that determine the segments' ends.
 """
 
 import abc
-import copy
 import dataclasses
 import functools
-from collections.abc import Sequence
-from typing import ClassVar, Self
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +18,7 @@ from jax import Array
 from jaxtyping import Bool, Float, PyTree
 
 from planner_jax.core.errors import ArgumentError
-from planner_jax.core.planner import CaseT, PlanT, Solve
+from planner_jax.core.planner import CaseT, PlanT
 from planner_jax.core.protocol import require_settings
 from planner_jax.cost.along import BETWEEN_NODES, Along, integrate_along
 from planner_jax.cost.penalty import smooth_hinge
@@ -31,7 +29,7 @@ from planner_jax.cost.quadrotor import (
     overturn_excess,
 )
 from planner_jax.optimise.planner import OptimisedPlanner
-from planner_jax.optimise.settings import Curvature, Evaluation, Round
+from planner_jax.optimise.settings import Curvature, Evaluation
 from planner_jax.optimise.shipped import StartNetwork, load_scale, select_start
 from planner_jax.trajectory.polynomial import PiecewisePolynomial
 from planner_jax.trajectory.proportional_minco import (
@@ -81,11 +79,7 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
     # segment, and of several segments, between which the body rate can have narrow peaks.
     decode_nodes: ClassVar[tuple[int, int]] = (32, 48)
     stands: ClassVar[bool] = False  # whether the quadrotor stands still after the last segment
-    # Fields with numbers of the cost that the `settings` of rounds may change. They do not change
-    # `prepare`, `plain_guesses` and `decode`, and may be arrays.
     weights: ClassVar[tuple[str, ...]] = ("energy_weight", "margin", "hinge_width")
-    # Fields that the `settings` of rounds may change to refine trajectories. A trajectory of a
-    # coarse planner is one of a fine planner, whose additional variables, `held`, are zero.
     refinements: ClassVar[tuple[str, ...]] = ("nodes",)
     proportions: tuple[float, ...] = (1.0,) * 6  # relative durations of a segment's pieces
     nodes: int = 8  # number of intervals of each piece, at whose ends penalties are evaluated
@@ -135,19 +129,6 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
         """Convert excesses at the segments' ends to relative ones; unchanged by default."""
         return excess
 
-    def join_attempts(self, attempts: Sequence[Round], cases: CaseT) -> Solve | None:
-        """Return a function that makes all these attempts (rounds) in one loop, or None."""
-        from planner_jax.optimise.search import make_solve  # only `pj.solve` needs it
-
-        return make_solve(self, attempts, cases)
-
-    def with_weights(self, weights: dict[str, PyTree]) -> Self:
-        """Return a copy of the planner with arrays in fields that are listed in `weights`."""
-        planner = copy.copy(self)  # `dataclasses.replace` would check the arrays' values
-        for name, value in weights.items():
-            object.__setattr__(planner, name, value)
-        return planner
-
     def start_network(self, case: PyTree) -> StartNetwork | None:
         """Return the network that corrects the first guess of a case, or None without a network."""
         return None
@@ -182,12 +163,10 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
         """Linear maps from a segment's end states and waypoint offsets to its polynomials."""
         return proportional_minco(_ORDER, self.proportions)
 
-    def guesses(self, context: PyTree, num: int) -> Float[Array, "num n"]:
-        """Return starting points (num, n), the first one as predicted if that costs less."""
-        points = self.plain_guesses(context, num)
-        guess = points[0]
-        start = self.first_start(guess, self.network_inputs(context), context)
-        return points if start is guess else points.at[0].set(start)
+    @property
+    def size(self) -> int:
+        """Number of variables of a segment."""
+        return len(self.scale)
 
     def first_start(
         self, guess: Float[Array, " n"], features: Float[Array, " F"], context: PyTree
@@ -198,8 +177,8 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
             return guess
         return select_start(lambda point: self.objective(point, context).cost, guess, learned)
 
-    def plain_guesses(self, context: PyTree, num: int) -> Float[Array, "num n"]:
-        """Return starting points (num, n), whose waypoint offsets are zero, without predictions."""
+    def guesses(self, context: PyTree, num: int) -> Float[Array, "num n"]:
+        """Return starting points (num, n), whose waypoint offsets are zero."""
         if num > len(self.guess_table):
             raise ArgumentError("starts", f"<= {len(self.guess_table)}", num)
         natural = self.guess_ends(context, num)

@@ -121,7 +121,7 @@ def optimal_plan(planner: Planner, case: PyTree, *, solver: LbfgsConfig | None =
     minimiser, case = planner.settle(case)
     solver = solver or LbfgsConfig(max_steps=200, tolerance=1e-7, patience=6)
     context = minimiser.prepare(case)
-    start = lax.stop_gradient(minimiser.guesses(context, 1)[0])
+    start = lax.stop_gradient(minimiser.first_guess(context))
     # A gradient with a norm below this multiple of the cost can be due to rounding errors alone.
     stationarity = 1e2 * float(jnp.finfo(start.dtype).eps)
 

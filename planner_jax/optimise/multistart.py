@@ -1,7 +1,6 @@
-"""The search loops of planners that minimise: several starts of one case, or a batch of cases."""
+"""The search loops of planners that minimise, for one problem and for a batch of problems."""
 
 import dataclasses
-import functools
 import math
 from collections.abc import Callable
 from types import ModuleType
@@ -17,14 +16,12 @@ from planner_jax.core.protocol import Status, is_unsolved, status_of
 from planner_jax.lanes import over_lanes
 from planner_jax.optimise import lbfgs
 from planner_jax.optimise.settings import (
-    COUNTED,
     Curvature,
     Curved,
     Evaluation,
     LbfgsConfig,
     NewtonConfig,
     Objective,
-    Round,
     Solver,
 )
 
@@ -51,7 +48,7 @@ def minimise(
     objective, with one automatic differentiation for each product with the Hessian.
     """
     if _has_steps(config, 0):
-        return _optimum_at(start, objective(start), config)
+        return optimum_at(start, objective(start), config)
     if isinstance(config, NewtonConfig):
         config = _with_stragglers(config)
     step = lambda s: _step(objective, curved, s, config)  # noqa: E731
@@ -77,7 +74,7 @@ def minimise_lanes(
     they are computed from `objective` by automatic differentiation.
     """
     if _has_steps(config, 0):
-        evaluate = lambda x, context: _optimum_at(x, objective(x, context), config)  # noqa: E731
+        evaluate = lambda x, context: optimum_at(x, objective(x, context), config)  # noqa: E731
         return over_lanes(evaluate)(starts, contexts)
 
     def search(state: PyTree, contexts: PyTree, config: Solver, steps: int | Array) -> PyTree:
@@ -87,8 +84,6 @@ def minimise_lanes(
             by_point = own and (lambda x: own(x, context))
             return _step(lambda x: objective(x, context), by_point, state, config)
 
-        if isinstance(steps, int) and steps <= COUNTED:
-            return lax.fori_loop(0, steps, lambda _, s: step(s, contexts), state)
         return lax.while_loop(
             lambda s: jnp.any(_method(config).is_unfinished(s.numbers, config)),
             lambda s: step(s, contexts),
@@ -152,59 +147,15 @@ def _optimum_of(state: PyTree, config: Solver) -> Optimum:
     )
 
 
-def _optimum_at(point: Array, evaluation: Evaluation, config: Solver) -> Optimum:
+def optimum_at(point: Array, evaluation: Evaluation, config: Solver) -> Optimum:
+    """Return the result of a search of 0 iterations at a point (n,) with this evaluation."""
     return Optimum(point, evaluation, jnp.zeros((), jnp.int32), jnp.full((), config.patience == 0))
-
-
-def solve_round(planner: "OptimisedPlanner", attempt: Round, case: PyTree) -> PyTree:
-    """Plan one case by the searches of a round (attempt), one after another.
-
-    The first search starts at the planner's first guess. Each later search starts at the point
-    where the search before it ended.
-    """
-    last = planner.with_settings(attempt.settings)
-    context = last.prepare(case)
-
-    def search(problem: "OptimisedPlanner", solver: Solver, start: Array) -> Optimum:
-        return minimise(
-            lambda x: problem.objective(x, context),
-            start,
-            solver,
-            lambda x: problem.curvature_at(x, context),
-        )
-
-    first = planner.with_settings(attempt.all_stages[0].settings)
-    optimum = start_at(first.guesses(context, 1)[0])
-    for stage in attempt.all_stages:
-        problem = planner.with_settings(stage.settings)
-        optimum = _add_spent(search(problem, stage.solver, optimum.point), optimum)
-    return plan_at(last, optimum, context)
-
-
-def solve_batch(planner: "OptimisedPlanner", attempt: Round, cases: PyTree) -> PyTree:
-    """Plan each case of a batch as `solve_round` does, all cases together."""
-    last = planner.with_settings(attempt.settings)
-    contexts = over_lanes(last.prepare)(put_lanes_last(cases))
-    first = planner.with_settings(attempt.all_stages[0].settings)
-    starts = over_lanes(lambda context: first.guesses(context, 1)[0])(contexts)
-    optimum = over_lanes(start_at)(starts)
-    for stage in attempt.all_stages:
-        problem = planner.with_settings(stage.settings)
-        found = minimise_lanes(
-            problem.objective, optimum.point, contexts, stage.solver, problem.curvature_at
-        )
-        optimum = _add_spent(found, optimum)
-    return put_lanes_first(over_lanes(functools.partial(plan_at, last))(optimum, contexts))
 
 
 def start_at(point: Array) -> Optimum:
     """Return the result of a search of 0 iterations, whose cost is not evaluated."""
     nothing, zero = jnp.zeros((), point.dtype), jnp.zeros((), jnp.int32)
     return Optimum(point, Evaluation(nothing, nothing), zero, jnp.zeros((), bool))
-
-
-def _add_spent(optimum: Optimum, before: Optimum) -> Optimum:
-    return dataclasses.replace(optimum, iterations=before.iterations + optimum.iterations)
 
 
 def put_lanes_last(cases: PyTree) -> PyTree:

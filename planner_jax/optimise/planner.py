@@ -1,9 +1,10 @@
 """The base class of planners that minimise a cost, with the methods that subclasses define."""
 
 import abc
+import copy
 import dataclasses
-from collections.abc import Callable
-from typing import ClassVar, Self
+from collections.abc import Callable, Sequence
+from typing import Any, ClassVar, Self
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +15,8 @@ from jaxtyping import PyTree
 from planner_jax.core.checks import require_numeric
 from planner_jax.core.choices import EFFORTS, require_one_of
 from planner_jax.core.planner import CaseT, Planner, PlanT
-from planner_jax.optimise.multistart import solve_batch, solve_round
+from planner_jax.core.protocol import Score
+from planner_jax.optimise.rows import Group, Table, group_rounds, load_group
 from planner_jax.optimise.settings import (
     Curvature,
     Evaluation,
@@ -24,7 +26,6 @@ from planner_jax.optimise.settings import (
     Settings,
     Solver,
     Stage,
-    load_round,
 )
 
 # Settings with which Newton's method continues the first round (attempt) to the optimum.
@@ -69,6 +70,12 @@ class OptimisedPlanner(Planner[CaseT, PlanT], abc.ABC):
     """
 
     rounds: tuple[Round, ...]  # attempts, in order
+    # Fields with numbers of the cost that the `settings` of rounds may change. They do not change
+    # `prepare`, `guesses` and `decode`, and may be arrays.
+    weights: ClassVar[tuple[str, ...]] = ()
+    # Fields that the `settings` of rounds may change to refine plans. A plan of a coarse planner is
+    # one of a fine planner, whose additional variables, `held`, are zero.
+    refinements: ClassVar[tuple[str, ...]] = ()
     # Number of Newton's subspace vectors. With 0 the preconditioner counts as inverse Hessian.
     subspace: ClassVar[int] = 4
     # Default of `curvature` in `pj.gradient`: "products" with the Hessian, or the "whole" Hessian.
@@ -116,16 +123,31 @@ class OptimisedPlanner(Planner[CaseT, PlanT], abc.ABC):
         return None
 
     @property
+    def size(self) -> int:
+        """A number that grows with the number of variables, for planners with `refinements`."""
+        return 0
+
+    def start_network(self, case: PyTree) -> Callable[[Array], Array] | None:
+        """Return the network that corrects the first guess of a case; by default None."""
+        return None
+
+    def network_inputs(self, context: PyTree) -> Array:
+        """Return the features (F,) of a case for its network; none without a network."""
+        return jnp.zeros((0,))
+
+    def first_start(self, guess: Array, features: Array, context: PyTree) -> Array:
+        """Return the first starting point (n,): by default the guess itself."""
+        return guess
+
+    def first_guess(self, context: PyTree) -> Array:
+        """Return the point (n,) from which the first search of a case starts."""
+        guess = self.guesses(context, 1)[0]
+        return self.first_start(guess, self.network_inputs(context), context)
+
+    @property
     def attempts(self) -> tuple[Round, ...]:
         """The planner's rounds: attempts at a case, in order, until one attempt solves it."""
         return self.rounds
-
-    def load_attempt(self, attempt: Round, cases: PyTree) -> PyTree:
-        """Convert a round (attempt) to an argument of compiled programs.
-
-        Rounds that differ only in numbers of the L-BFGS settings can then share a program.
-        """
-        return load_round(self.fit_attempt(attempt, cases), jax.default_backend() != "cpu")
 
     def fit_attempt(self, attempt: Round, cases: PyTree) -> Round:
         """Return a round (attempt) with settings for these cases, by default unchanged.
@@ -134,24 +156,45 @@ class OptimisedPlanner(Planner[CaseT, PlanT], abc.ABC):
         """
         return attempt
 
-    def solve(self, case: PyTree, attempt: Round) -> PyTree:
-        """Return the plan that one attempt (round of searches) finds for one case."""
-        if attempt.is_divided:
-            plans = self.solve_lanes(jax.tree.map(lambda leaf: leaf[None], case), attempt)
-            return jax.tree.map(lambda leaf: leaf[0], plans)
-        return solve_round(self, attempt, case)
+    def group_attempts(
+        self, attempts: Sequence[Round], cases: PyTree, *, is_whole: bool, is_single: bool
+    ) -> list[Group]:
+        """Join rounds (attempts) that share a compiled program."""
+        known, places = tuple(self.attempts), tuple(range(len(attempts)))
+        if attempts is not known and tuple(attempts) != known:
+            places = tuple(known.index(each) if each in known else -1 for each in attempts)
+            if -1 in places:  # rounds that the planner does not have
+                known, places = tuple(attempts), tuple(range(len(attempts)))
+        fitted = tuple([self.fit_attempt(each, cases) for each in known])
+        return group_rounds(self, fitted, places, is_whole, is_single)
 
-    def solve_lanes(self, cases: PyTree, attempt: Round) -> PyTree:
-        """Return the plans that one attempt (round of searches) finds for a batch of cases."""
-        if attempt.is_divided:
-            from planner_jax.optimise.divided import solve_divided  # few cases need it
+    def load_attempt(self, attempt: Round | Group, cases: PyTree) -> Table:
+        """Convert a round, or a group of rounds (attempts), to an argument of compiled programs."""
+        if isinstance(attempt, Round):
+            attempt = Group.of((self.fit_attempt(attempt, cases),), (0,), True, 0)
+        return load_group(self, attempt)
 
-            return solve_divided(self, attempt, cases)
-        return solve_batch(self, attempt, cases)
+    def solve(self, case: PyTree, attempt: Round | Table, before: Score | None = None) -> PyTree:
+        """Return the plan that rounds (attempts) find for one case; see `solve_lanes`."""
+        cases, before = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], (case, before))
+        return jax.tree.map(lambda leaf: leaf[0], self.solve_lanes(cases, attempt, before))
 
-    def divides(self, attempt: Round) -> bool:
-        """Return whether each starting point of a case becomes a separate problem of the batch."""
-        return attempt.is_divided
+    def solve_lanes(
+        self, cases: PyTree, attempt: Round | Table, before: Score | None = None
+    ) -> PyTree:
+        """Return the plans that rounds (attempts) find for a batch of cases.
+
+        `before` are the numbers of earlier plans; only better plans are returned, see
+        `search.solve_table`. None: there are no earlier plans.
+        """
+        from planner_jax.optimise.search import solve_table  # reads this class
+
+        cases = jax.tree.map(jnp.asarray, cases)
+        table = self.load_attempt(attempt, cases) if isinstance(attempt, Round) else attempt
+        if before is None:
+            dtype = next(x.dtype for x in jax.tree.leaves(cases) if jnp.issubdtype(x, jnp.floating))
+            before = Score.none(cases.batch_shape, dtype)
+        return solve_table(self, table, cases, jax.tree.map(jnp.asarray, before))
 
     def settle(
         self, cases: PyTree, plan_of: Callable[[Planner, PyTree], PyTree] | None = None
@@ -165,6 +208,17 @@ class OptimisedPlanner(Planner[CaseT, PlanT], abc.ABC):
     def with_settings(self, settings: Settings) -> Self:
         """Return a copy of the planner with the field values in `settings`, pairs (name, value)."""
         return dataclasses.replace(self, **dict(settings))  # type: ignore[type-var]
+
+    def setting(self, name: str) -> Any:
+        """Return the value of a field that `with_settings` changes."""
+        return getattr(self, name)
+
+    def with_weights(self, weights: dict[str, PyTree]) -> Self:
+        """Return a copy of the planner with arrays in fields that are listed in `weights`."""
+        planner = copy.copy(self)  # `dataclasses.replace` would check the arrays' values
+        for name, value in weights.items():
+            object.__setattr__(planner, name, value)
+        return planner
 
     def with_solver(self, solver: Solver = _LONG) -> Self:
         """Return a copy of the planner that makes one long search from its best first guess."""

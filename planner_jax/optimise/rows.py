@@ -1,24 +1,34 @@
-"""A table of all searches of a planner of segments, with a row for each stage of each attempt.
+"""A table of the searches of a planner that minimises: a row for each stage of each attempt.
 
 An attempt of such a planner is called round, and each stage of a round is one search.
 
-A row has the numbers of a stage. What a program must know when it is compiled, such as the number
-of variables, is in the `Model` of a row.
+A row has the numbers of a stage, which a compiled program reads at run time. What a program must
+know when it is compiled, such as the number of variables, is in the `Model` of a row. Rounds that
+can share a program are one `Group`, whose table `load_group` makes.
 """
 
 import dataclasses
-from collections.abc import Sequence
+import functools
+import itertools
+from collections.abc import Callable, Hashable, Sequence
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import jax
 import numpy as np
 from flax import struct
 from jax import Array
-from jaxtyping import PyTree
 
-from planner_jax.optimise.chain import ChainPlanner
-from planner_jax.optimise.settings import LbfgsConfig, Round, Stage
+from planner_jax.core.compiled import cached_by_precision
+from planner_jax.core.errors import ArgumentError
+from planner_jax.core.protocol import Attempt
+from planner_jax.optimise.settings import LbfgsConfig, Round, Settings, Solver, Stage
 
+if TYPE_CHECKING:
+    from planner_jax.optimise.planner import OptimisedPlanner
+
+Result = TypeVar("Result")
 Number = Array | float | int | bool
+_TURNS = 8  # greatest number of iterations on a GPU after which the host asks for unfinished lanes
 
 
 @struct.dataclass
@@ -32,93 +42,244 @@ class Row:
     keep: Number  # () int32, number of starting points that the next row continues
     first: Number  # () int32, index of the first starting point among the guesses
     within: Number  # (), greatest violation of a case for which the round is made
-    is_first: Number  # () bool, in the first round of a planner, which is due for all cases
+    improves: Number  # () bool, whether the round is made for solved cases, too
+    is_first: Number  # () bool, in the first round of a call, which is due for all cases
+    is_last: Number  # () bool, whether it returns the plan of the best start, without a search
     starts: Number  # () bool, whether the row is the first one of a round
     ends: Number  # () bool, whether `keep` selects by the status of the plans, not only by cost
     writes: Number  # () bool, whether the plans compete with the best plans of earlier rounds
-    frozen: Number  # () bool, whether the variables `ChainPlanner.held` are constant
+    frozen: Number  # () bool, whether the variables `OptimisedPlanner.held` are constant
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@dataclasses.dataclass(frozen=True)
 class Model:
-    """A planner and solver whose L-BFGS loop is compiled once."""
+    """The constants of a loop that is compiled once for several rows."""
 
-    planner: ChainPlanner
-    solver: LbfgsConfig
+    settings: Settings  # fields of the planner
+    solver: Solver  # for L-BFGS, `max_steps` are the turns of `search._minimise_lanes`
     varying: tuple[str, ...]  # fields of the planner that differ among its rows
-    # The indices of the planner's variables among the variables of the finest planner; None if the
-    # planner has all of them.
-    free: np.ndarray | None
+    # The indices of the variables among those of the finest planner; None: all of them.
+    free: tuple[int, ...] | None
 
 
-def list_models(
-    planner: ChainPlanner, attempts: Sequence[Round], cases: PyTree
-) -> dict[Stage, Model] | None:
-    """Return the model of each stage of all rounds (attempts), or None without a common table.
+@struct.dataclass
+class Table:
+    """The rows of a group of rounds (attempts) as an argument of compiled programs."""
 
-    There is none for Newton's method, for searches without iterations, for settings of other fields
-    than `weights` and `refinements`, and if the variables of one model are no subset of another's.
+    numbers: Array | np.ndarray  # (R, F), a row for each of R searches
+    models: tuple[Model, ...] = struct.field(pytree_node=False)
+    finest: Settings = struct.field(pytree_node=False)  # of the planner that decodes all plans
+    starts: int = struct.field(pytree_node=False)  # greatest number of starting points of a case
+    guesses: int = struct.field(pytree_node=False)  # number of guesses among which rows start
+
+    @property
+    def rows(self) -> Row:
+        """The R rows: leaves (R,)."""
+        flags = {"improves", "is_first", "is_last", "starts", "ends", "writes", "frozen"}
+        names = sorted({name for model in self.models for name in model.varying})
+        columns = iter(self.numbers.T)
+        solver = tuple(next(columns) for _ in range(3))
+        weights = {name: next(columns) for name in names}
+        fields: dict[str, Any] = {
+            "solver": (solver[0].astype(np.int32), solver[1], solver[2].astype(np.int32))
+        }
+        for name in [field.name for field in dataclasses.fields(Row)][2:]:
+            kind = bool if name in flags else np.int32
+            column = next(columns)
+            fields[name] = column if name == "within" else column.astype(kind)
+        return Row(weights=weights, **fields)
+
+
+@dataclasses.dataclass(frozen=True)
+class Group(Attempt):
+    """Rounds (attempts) that share a compiled program, as one attempt."""
+
+    rounds: tuple[Round, ...] = ()  # all rounds for which the program is compiled
+    made: tuple[int, ...] = ()  # indices of the rounds that are made
+    is_first: bool = True  # whether no attempt has been made before
+    place: int = 0  # index of its first round among the planner's attempts
+
+    @property
+    def continues(self) -> bool:
+        """Return true: only plans that are better than the best plans so far are returned."""
+        return True
+
+    @classmethod
+    def of(
+        cls, rounds: tuple[Round, ...], made: tuple[int, ...], is_first: bool, place: int
+    ) -> "Group":
+        """Return a group that makes some of these rounds, for the cases that need one of them."""
+        own = [rounds[k] for k in made]
+        bounds = [np.inf if each.within is None else each.within for each in own]
+        return cls(
+            starts=max(each.starts for each in own),
+            within=None if np.inf in bounds else max(bounds),
+            improves=any(each.improves for each in own),
+            rounds=rounds,
+            made=made,
+            is_first=is_first,
+            place=place,
+        )
+
+
+def _unless_arrays(cached: Callable[..., Result], function: Callable[..., Result]) -> Callable:
+    """Return a cached function of a planner and more, without the cache if it holds arrays."""
+
+    @functools.wraps(function)
+    def call(planner: "OptimisedPlanner", *args: object) -> Result:
+        has_arrays = bool(jax.tree.leaves(planner))
+        return (function if has_arrays else cached)(planner, *args)
+
+    return call
+
+
+def group_rounds(
+    planner: "OptimisedPlanner",
+    rounds: tuple[Round, ...],
+    places: tuple[int, ...],
+    is_whole: bool,
+    is_single: bool,
+) -> list[Group]:
+    """Return groups of those rounds (attempts) whose indices are `places`, in order.
+
+    With `is_single` each group makes one round, though its program can make others as well.
     """
-    stages = [stage for each in attempts for stage in each.all_stages]
-    allowed = {*planner.weights, *planner.refinements}
-    if not all(_fits(stage, allowed) for stage in stages):
-        return None
+    groups: list[Group] = []
+    for part in _divide(planner, rounds, is_whole):
+        own, made = rounds[part.start : part.stop], [k for k in places if k in part]
+        for some in [[k] for k in made] if is_single else [made][: len(made)]:
+            indices = tuple(k - part.start for k in some)
+            groups.append(Group.of(own, indices, not groups, some[0]))
+    return groups
+
+
+group_rounds = _unless_arrays(functools.lru_cache(maxsize=1024)(group_rounds), group_rounds)
+
+
+def _divide(planner: "OptimisedPlanner", rounds: tuple[Round, ...], is_whole: bool) -> list[range]:
+    """Return the indices of consecutive rounds (attempts) that one compiled program can make.
+
+    These rounds have equal values of all fields of the planner that `weights` and `refinements` do
+    not list. Unless `is_whole`, they also have the same models, so that the program of the first
+    rounds, which are often the only ones, is compiled fast.
+    """
+    names = {name for each in rounds for stage in each.all_stages for name, _ in stage.settings}
+    fixed = sorted(names - {*planner.weights, *planner.refinements})
+
+    def key(each: Round) -> Hashable:
+        shared = _key_of_fields(planner, each.all_stages[-1], fixed)
+        return (
+            shared if is_whole else (shared, {_key_of_model(planner, s) for s in each.all_stages})
+        )
+
+    keys = [key(each) for each in rounds]
+    groups: list[range] = []
+    for k in range(len(rounds)):
+        if groups and keys[groups[-1].start] == keys[k]:
+            groups[-1] = range(groups[-1].start, k + 1)
+        else:
+            groups.append(range(k, k + 1))
+    return groups
+
+
+def _key_of_fields(planner: "OptimisedPlanner", stage: Stage, names: Sequence[str]) -> tuple:
+    own = planner.with_settings(stage.settings)
+    return tuple(own.setting(name) for name in names)
+
+
+def _key_of_model(planner: "OptimisedPlanner", stage: Stage) -> tuple:
+    ignored = {*planner.weights} | {*planner.refinements} & {"nodes"}
+    names = {name for name, _ in stage.settings} - ignored
+    own, solver = planner.with_settings(stage.settings), stage.solver
+    is_counted = isinstance(solver, LbfgsConfig) and solver.max_steps > 0
+    fixed = jax.tree.structure(solver) if is_counted else solver
+    return own.size, fixed, tuple((name, own.setting(name)) for name in sorted(names))
+
+
+def load_group(planner: "OptimisedPlanner", group: Group) -> Table:
+    """Return the table of a group of rounds (attempts), whose numbers are an array."""
+    stages = list(dict.fromkeys(s for each in group.rounds for s in each.all_stages))
+    models = list_models(planner, stages)
+    lists = [_rows_of(planner, each, models) for each in group.rounds]
+    for k, rows in enumerate(lists):
+        is_first = group.is_first and k == group.made[0]
+        changes = {"is_first": is_first} if k in group.made else {"within": -np.inf}
+        if k not in group.made:
+            changes["improves"] = False
+        lists[k] = [dataclasses.replace(row, **changes) for row in rows]
+    rows = list(itertools.chain(*lists))
+    lasts = [each.all_stages[-1] for each in group.rounds]
+    sizes = [planner.with_settings(stage.settings).size for stage in lasts]
+    finest = lasts[sizes.index(max(sizes))].settings
+    numbers = np.array([[float(x) for x in jax.tree.leaves(row)] for row in rows])
+    is_double = jax.config.jax_enable_x64  # type: ignore[attr-defined]
+    return Table(
+        numbers=numbers.astype(np.float64 if is_double else np.float32),
+        models=tuple(dict.fromkeys(models.values())),
+        finest=finest,
+        starts=max(int(row.width) for row in rows),
+        guesses=max(int(row.first) + int(row.width) for row in rows if row.starts),
+    )
+
+
+load_group = _unless_arrays(cached_by_precision(load_group), load_group)
+
+
+def list_models(planner: "OptimisedPlanner", stages: Sequence[Stage]) -> dict[Stage, Model]:
+    """Return the model of each stage, of which stages with equal constants share one.
+
+    Raises:
+        ArgumentError: the variables of a stage are neither those of the finest planner nor those
+            that it does not hold constant in a search with `frozen` variables.
+    """
     own = {stage: planner.with_settings(stage.settings) for stage in stages}
-    groups: dict[tuple, list[Stage]] = {}  # by number of variables and fixed settings of the solver
-    for stage in own:
-        key = len(own[stage].scale), jax.tree.structure(stage.solver)
-        groups.setdefault(key, []).append(stage)
-    finest = max(own.values(), key=lambda each: len(each.scale))
-    models = {}
-    for (size, _), group in groups.items():
-        nodes = max(own[stage].nodes for stage in group)
-        of_group = own[group[0]].with_settings((("nodes", nodes),))
-        names = {name for stage in group for name, _ in stage.settings} & {*planner.weights}
-        fields = {name: {getattr(own[stage], name) for stage in group} for name in names}
-        varying = tuple(sorted(name for name, values in fields.items() if len(values) > 1))
-        free, solver = None, group[0].solver
-        assert isinstance(solver, LbfgsConfig)
-        if size < len(finest.scale):
-            free = None if finest.held is None else np.flatnonzero(~finest.held)
-            if free is None or len(free) != size:
-                return None
-        models |= dict.fromkeys(group, Model(of_group, solver, varying, free))
-    lead = len(cases.batch_shape)
-    case = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[lead:], x.dtype), cases)
-    networks = {each.planner.start_network(case) is None for each in models.values()}
-    return models if len(networks) == 1 else None
+    groups: dict[tuple, list[Stage]] = {}
+    for stage in stages:
+        groups.setdefault(_key_of_model(planner, stage), []).append(stage)
+    finest = max(own.values(), key=lambda each: each.size)
+    models: dict[Stage, Model] = {}
+    for group in groups.values():
+        names = {name for stage in group for name, _ in stage.settings}
+        values = {name: {own[stage].setting(name) for stage in group} for name in names}
+        varying = {name for name in names & {*planner.weights} if len(values[name]) > 1}
+        first, free = own[group[0]], None
+        settings = {name: first.setting(name) for name in sorted(names - varying)}
+        if "nodes" in {*settings} & {*planner.refinements}:
+            settings["nodes"] = max(values["nodes"])
+        if first.size < finest.size:
+            held = finest.held
+            free = () if held is None else tuple(np.flatnonzero(~held).tolist())
+            if len(free) != first.size:
+                raise ArgumentError(
+                    "rounds", "whose variables are those of the finest one that are not held"
+                )
+        pairs, solver = tuple(settings.items()), group[0].solver
+        if isinstance(solver, LbfgsConfig):  # the rows have the numbers
+            most = min(_TURNS, *(stage.solver.max_steps for stage in group))
+            solver = dataclasses.replace(solver, max_steps=most, tolerance=0.0, patience=0)
+        model = Model(pairs, solver, tuple(sorted(varying)), free)
+        models |= dict.fromkeys(group, model)
+    return models
 
 
-def _fits(stage: Stage, allowed: set[str]) -> bool:
-    is_lbfgs = isinstance(stage.solver, LbfgsConfig) and stage.solver.max_steps > 0
-    return is_lbfgs and {name for name, _ in stage.settings} <= allowed
-
-
-def list_rows(
-    planner: ChainPlanner, attempts: Sequence[Round], models: dict[Stage, Model]
-) -> list[Row]:
-    """Return a row for each stage of all rounds (attempts), and for each choice among starts."""
-    pairs = enumerate(attempts)
-    return [row for k, each in pairs for row in _rows_of(planner, each, k == 0, models)]
-
-
-def _rows_of(
-    planner: ChainPlanner, attempt: Round, is_first: bool, models: dict[Stage, Model]
-) -> list[Row]:
+def _rows_of(planner: "OptimisedPlanner", attempt: Round, models: dict[Stage, Model]) -> list[Row]:
     places = {model: k for k, model in enumerate(dict.fromkeys(models.values()))}
     varying = sorted({name for model in places for name in model.varying})
     width, last, rows = attempt.starts, len(attempt.all_stages) - 1, []
     for k, stage in enumerate(attempt.all_stages):
-        fields = planner.with_settings(stage.settings)
+        fields, solver = planner.with_settings(stage.settings), stage.solver
+        is_lbfgs = isinstance(solver, LbfgsConfig)
         row = Row(
-            solver=tuple(jax.tree.leaves(stage.solver)),
-            weights={name: getattr(fields, name) for name in varying},
+            solver=tuple(jax.tree.leaves(solver)) if is_lbfgs else (1, 0.0, 0),
+            weights={name: fields.setting(name) for name in varying},
             model=places[models[stage]],
             width=width,
             keep=1 if k == last else min(stage.keep or width, width),
             first=attempt.first,
             within=np.inf if attempt.within is None else attempt.within,
-            is_first=is_first,
+            improves=attempt.improves,
+            is_first=False,
+            is_last=False,
             starts=k == 0,
             ends=k == last,
             writes=k == last and width == 1,
@@ -126,7 +287,7 @@ def _rows_of(
         )
         rows.append(row)
         width = row.keep
-    if not rows[-1].writes:  # the plan of the best starting point, after 0 iterations
-        still = {"solver": (0, *rows[-1].solver[1:]), "width": 1, "starts": False, "writes": True}
-        rows.append(dataclasses.replace(rows[-1], **still))
+    if not rows[-1].writes:
+        end = {"width": 1, "starts": False, "writes": True, "is_last": True}
+        rows.append(dataclasses.replace(rows[-1], **end))
     return rows

@@ -1,8 +1,8 @@
-"""One loop over all searches of a planner of segments, for `pj.solve`.
+"""One loop over all searches of a planner that minimises, for `pj.plan` and `pj.solve`.
 
 A planner's rounds (attempts) consist of stages, each a search with its own settings. Here the
 settings are rows of a table, over which a compiled program iterates. The program contains the
-preparation of a case, the starting points, the final check and each L-BFGS loop once, so that it
+preparation of a case, the starting points, the final check and each search loop once, so that it
 compiles much faster than one program for each stage.
 
 A search of one case from one starting point is an item. The items that a row needs are gathered in
@@ -11,34 +11,36 @@ tiles of lanes, so that solved cases take no time.
 
 import dataclasses
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from flax import struct
 from jax import Array, lax
 from jaxtyping import PyTree
 
-from planner_jax.core.planner import Solve
-from planner_jax.core.protocol import Status, is_better, is_solved, is_unsolved, mark_bad_input
+from planner_jax.core.compiled import traced_platform
+from planner_jax.core.protocol import Score, is_better, is_solved, is_unsolved
 from planner_jax.core.rules import has_rules, is_sound
 from planner_jax.lanes import kernels, over_lanes
 from planner_jax.lanes.packing import Packing
 from planner_jax.optimise import lbfgs
-from planner_jax.optimise.chain import ChainPlanner
 from planner_jax.optimise.multistart import (
     Optimum,
+    minimise_lanes,
+    optimum_at,
     plan_at,
     put_lanes_first,
     put_lanes_last,
     start_at,
 )
 from planner_jax.optimise.planner import OptimisedPlanner
-from planner_jax.optimise.rows import Model, Row, list_models, list_rows
-from planner_jax.optimise.settings import Evaluation, LbfgsConfig, Round
+from planner_jax.optimise.rows import Model, Row, Table
+from planner_jax.optimise.settings import Evaluation, LbfgsConfig
 
-_TILE = 256  # greatest number of lanes that run together; a tile lasts until its slowest lane ends
+# Greatest number of lanes that run together; a tile lasts until its slowest lane ends.
+_CPU_TILE, _GPU_TILE = 256, 8192
+_BLOCK = 128  # the lanes of a tile on a GPU are a multiple of this number, as its kernels need
 
 
 @struct.dataclass
@@ -49,80 +51,50 @@ class _Item:
     status: Array  # () int32
 
 
-@struct.dataclass
-class _Score:
-    """The numbers of a case's best plan by which it is compared with later plans."""
+def solve_table(planner: OptimisedPlanner, table: Table, cases: PyTree, before: Score) -> PyTree:
+    """Return the best plans of B cases over the rows of a table; pure.
 
-    cost: Array
-    violation: Array
-    status: Array
-
-
-def make_solve(planner: ChainPlanner, attempts: Sequence[Round], cases: PyTree) -> Solve | None:
-    """Return a function that makes all attempts (rounds) of a planner in one loop.
-
-    It takes the plans of earlier attempts, or None without such attempts. The result is None if the
-    attempts do not fit a table, see `list_models`; if one of them also searches solved cases; and
-    on GPUs, where CUDA kernels need constant settings.
+    `before` has the numbers of the plans (B,) that earlier attempts found, of which a new plan must
+    be better. Where none is, cost, violation and status are those of `before`, and all other arrays
+    of the plan are zero.
     """
-    inherited = ((ChainPlanner, "guesses"), (OptimisedPlanner, "load_attempt"))
-    inherited += ((OptimisedPlanner, "solve"), (OptimisedPlanner, "solve_lanes"))
-    is_usual = all(getattr(type(planner), name) is getattr(base, name) for base, name in inherited)
-    if not is_usual or kernels.in_use() or any(each.improves for each in attempts):
-        return None
-    cases = jax.tree.map(jnp.asarray, cases)
-    attempts = [planner.fit_attempt(each, cases) for each in attempts]
-    models = list_models(planner, attempts, cases)
-    if models is None:
-        return None
-    finest = max(models.values(), key=lambda each: len(each.planner.scale)).planner
-    rows = list_rows(planner, attempts, models)
-    return functools.partial(_Program(finest, tuple(dict.fromkeys(models.values())), rows), cases)
+    finest = planner.with_settings(table.finest)
+    rows = table.rows
+    return _Program(planner, finest, table, rows)(cases, before)
 
 
 @dataclasses.dataclass(frozen=True)
 class _Program:
     """The loop over the rows of a table."""
 
-    finest: ChainPlanner  # prepares cases, guesses and decodes for all models
-    models: tuple[Model, ...]
-    rows: list[Row]
+    planner: OptimisedPlanner
+    finest: OptimisedPlanner  # prepares cases, guesses and decodes for all models
+    table: Table
+    rows: Row  # leaves (R,)
 
-    def __call__(self, cases: PyTree, plans: PyTree) -> PyTree:
-        """Return the best plans of cases over all rows, and over earlier `plans` if not None."""
-        if cases.batch_shape == ():
-            cases, plans = jax.tree.map(lambda leaf: leaf[None], (cases, plans))
-            return jax.tree.map(lambda leaf: leaf[0], self(cases, plans))
-        num, starts = cases.batch_shape[0], max(int(row.width) for row in self.rows)
+    def __call__(self, cases: PyTree, before: Score) -> PyTree:
+        num, starts = cases.batch_shape[0], self.table.starts
         lane = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), cases)
         item, plan = jax.eval_shape(self._plan_guess, lane)
         packings = of_cases, of_items, of_plans = tuple(map(Packing, (lane, item, plan)))
-        dtype = plan.cost.dtype
-        rows = self.rows
-        if plans is None:
-            best, zeros = of_plans.zeros(num), jnp.zeros(num, dtype)
-            unsolved = jnp.full(num, Status.INFEASIBLE, jnp.int32)
-            score = _Score(zeros, jnp.full(num, jnp.inf, dtype), unsolved)
-        else:
-            rows = [dataclasses.replace(row, is_first=False) for row in rows]
-            best = of_plans.pack(put_lanes_last(plans))
-            score = _Score(plans.cost, plans.violation, plans.status)
         packed = of_cases.pack(put_lanes_last(cases))
         is_usable = is_sound(cases) if has_rules(cases) else jnp.ones(num, bool)
-        table = jax.tree.map(lambda *column: _make_column(column, dtype), *rows)
 
         def take_row(state: tuple, row: Row) -> tuple[tuple, None]:
             found, due = state
             score = found[1]
-            again = is_unsolved(score.status) & (score.violation <= row.within) & is_usable
-            due = jnp.where(row.starts, again | row.is_first, due)
+            again = is_unsolved(score.status) & (score.violation <= row.within)
+            again = (again | is_solved(score.status) & row.improves) & is_usable
+            is_first = row.is_first & is_unsolved(score.status)  # false for the padding of a batch
+            due = jnp.where(row.starts, again | is_first, due)
             run = functools.partial(self._run, row, packings, packed, due, starts)
             return (lax.cond(jnp.any(due), run, lambda x: x, found), due), None
 
-        state = (best, score, of_items.zeros(num * starts)), jnp.ones(num, bool)
-        (found, _), _ = lax.scan(take_row, state, table)
+        state = (of_plans.zeros(num), before, of_items.zeros(num * starts)), jnp.ones(num, bool)
+        (found, _), _ = lax.scan(take_row, state, self.rows)
         plans = put_lanes_first(of_plans.unpack(found[0]))
-        return mark_bad_input(plans, cases)
+        score = found[1]
+        return plans.replace(cost=score.cost, violation=score.violation, status=score.status)
 
     def _plan_guess(self, case: PyTree) -> tuple[_Item, PyTree]:
         """Return the first guess of a case as a search of 0 iterations, and its plan.
@@ -130,7 +102,7 @@ class _Program:
         All other searches, and their plans, have arrays of the same shapes and types.
         """
         context = self.finest.prepare(case)
-        optimum = start_at(self.finest.plain_guesses(context, 1)[0])
+        optimum = start_at(self.finest.guesses(context, 1)[0])
         plan = plan_at(self.finest, optimum, context)
         return _Item(optimum, plan.status), plan
 
@@ -146,8 +118,8 @@ class _Program:
         """Make the searches of a row for the cases that are due, in tiles."""
         of_cases, of_items, of_plans = packings
         num = due.size
-        tile = min(num, _TILE)
-        is_due = (due[:, None] & (jnp.arange(starts) < row.width)[None]).ravel()
+        tile = _count_lanes(num, starts)
+        is_due = (due[:, None] & (jnp.arange(starts, dtype=jnp.int32) < row.width)[None]).ravel()
         total = jnp.sum(is_due, dtype=jnp.int32)
         order = jnp.argsort(~is_due, stable=True).astype(jnp.int32)
         order = jnp.concatenate([order, jnp.broadcast_to(order[0], tile)])
@@ -165,7 +137,7 @@ class _Program:
             is_new = is_own & row.writes
             is_new &= row.is_first | is_better(plan, _take(score, owner))
             target = jnp.where(is_new, owner, num)
-            later = _Score(plan.cost, plan.violation, plan.status)
+            later = Score(plan.cost, plan.violation, plan.status)
             best = _put(best, target, of_plans.pack(plan))
             score = _put(score, target, later)
             items = _put(items, jnp.where(is_own, index, num * starts), of_items.pack(item))
@@ -180,37 +152,56 @@ class _Program:
 
     def _search(self, row: Row, cases: PyTree, index: Array, before: _Item) -> tuple[_Item, PyTree]:
         """Search from guesses, or from where earlier searches ended; the lanes are last."""
-        most = max(int(each.first) + int(each.width) for each in self.rows if each.starts)
+        most = self.table.guesses
         contexts = over_lanes(self.finest.prepare)(cases)
         inputs = over_lanes(self.finest.network_inputs)(contexts)
 
         def guess(context: PyTree, index: Array) -> Array:
-            points = self.finest.plain_guesses(context, most)
+            points = self.finest.guesses(context, most)
             is_own = jnp.arange(most, dtype=index.dtype)[:, None] == index
             return jnp.sum(jnp.where(is_own, points, 0.0), axis=0)
 
         stay = lambda *_: before.optimum.point  # noqa: E731
         points = lax.cond(row.starts, over_lanes(guess), stay, contexts, index)
-        loops = [functools.partial(_minimise, model, row) for model in self.models]
+        models = self.table.models
+        loops = [functools.partial(_minimise, self.planner, model, row) for model in models]
         given = points, inputs, contexts, index
         found = loops[0](*given) if len(loops) == 1 else lax.switch(row.model, loops, *given)
         old = before.optimum
-        is_kept = row.solver[0] == 0
-        found = jax.tree.map(lambda new, old: jnp.where(is_kept, old, new), found, old)
         spent = jnp.where(row.starts, 0, old.iterations)
-        found = found.replace(iterations=jnp.where(is_kept, spent, spent + found.iterations))
+        found = dataclasses.replace(found, iterations=spent + found.iterations)
+        found = jax.tree.map(lambda new, old: jnp.where(row.is_last, old, new), found, old)
         plan = over_lanes(functools.partial(plan_at, self.finest))(found, contexts)
         found = found.replace(evaluation=found.evaluation.replace(violation=plan.violation))
         return _Item(found, plan.status), plan
 
 
+def _count_lanes(num: int, starts: int) -> int:
+    """Return how many lanes run together if each of `num` cases has up to `starts` searches."""
+    if _is_on_gpu():
+        most = max(num, min(num * starts, _GPU_TILE))
+        return -(-most // _BLOCK) * _BLOCK
+    return min(num, _CPU_TILE)
+
+
+def _is_on_gpu() -> bool:
+    platform = traced_platform()
+    return kernels.has_gpu() if platform is None else platform != "cpu"
+
+
 def _minimise(
-    model: Model, row: Row, starts: Array, inputs: Array, contexts: PyTree, index: Array
+    own: OptimisedPlanner,
+    model: Model,
+    row: Row,
+    starts: Array,
+    inputs: Array,
+    contexts: PyTree,
+    index: Array,
 ) -> Optimum:
-    """Minimise by L-BFGS from points (n, lanes) of the finest model."""
-    planner = model.planner.with_weights({name: row.weights[name] for name in model.varying})
-    config = jax.tree.unflatten(jax.tree.structure(model.solver), row.solver)
-    size, free = len(starts), model.free
+    """Minimise from points (n, lanes) of the finest model."""
+    weights = {name: row.weights[name] for name in model.varying}
+    planner, solver = own.with_settings(model.settings).with_weights(weights), model.solver
+    size, free = len(starts), None if model.free is None else jnp.array(model.free)
     if free is not None:
         starts = starts[free]
 
@@ -227,16 +218,46 @@ def _minimise(
             point = jnp.where(held, start, point)
         return planner.objective(point, context)
 
+    given = starts, contexts
+    if isinstance(solver, LbfgsConfig) and solver.max_steps > 0:
+        config = jax.tree.unflatten(jax.tree.structure(solver), row.solver)
+        found = _minimise_lanes(objective, starts, given, config, solver.max_steps)
+    elif isinstance(solver, LbfgsConfig):
+        stay = lambda x, given: optimum_at(x, objective(x, given), solver)  # noqa: E731
+        found = over_lanes(stay)(starts, given)
+    else:
+        curved = lambda x, given: planner.curvature_at(x, given[1])  # noqa: E731
+        found = minimise_lanes(objective, starts, given, solver, curved)
+    if free is None:
+        return found
+    point = jnp.zeros((size, *found.point.shape[1:]), found.point.dtype)
+    return dataclasses.replace(found, point=point.at[free].set(found.point))
+
+
+def _minimise_lanes(
+    objective: Callable[[Array, PyTree], Evaluation],
+    starts: Array,
+    contexts: PyTree,
+    config: LbfgsConfig,
+    turns: int,
+) -> Optimum:
+    """Minimise L problems by L-BFGS, whose numbers in `config` are known only at run time.
+
+    On a GPU `turns` iterations follow each other before it is tested whether all lanes are done.
+    """
+    is_gpu = _is_on_gpu()
+    step = functools.partial(_step_lanes, objective)
+    if is_gpu:
+        advance = over_lanes(lambda s, given: lbfgs.step(lambda x: objective(x, given), s, config))
+        step = lambda s, given, _: lax.fori_loop(0, turns, lambda _, s: advance(s, given), s)  # noqa: E731
     state = lax.while_loop(
         lambda state: jnp.any(lbfgs.is_unfinished(state.numbers, config)),
-        lambda state: _step_lanes(objective, state, (starts, contexts), config),
+        lambda state: step(state, contexts, config),
         over_lanes(lambda start: lbfgs.init(start, config))(starts),
     )
-    point, numbers = state.best_point, state.numbers
-    if free is not None:
-        point = jnp.zeros((size, *point.shape[1:]), point.dtype).at[free].set(point)
-    is_stationary = lbfgs.is_stationary(numbers, config)
-    return Optimum(point, numbers.best, numbers.iteration, is_stationary)
+    numbers = state.numbers
+    stationary = lbfgs.is_stationary(numbers, config)
+    return Optimum(state.best_point, numbers.best, numbers.iteration, stationary)
 
 
 def _step_lanes(
@@ -291,9 +312,3 @@ def _put(tree: PyTree, index: Array, new: PyTree) -> PyTree:
     """Return arrays with new entries; entries at indices past the end are left out."""
     put = lambda x, y: x.at[index].set(y, mode="drop", wrap_negative_indices=False)  # noqa: E731
     return jax.tree.map(put, tree, new)
-
-
-def _make_column(values: Sequence[float], dtype: np.dtype) -> np.ndarray:
-    column = np.array(values)
-    kinds = {"b": np.dtype(bool), "i": np.dtype(np.int32), "f": dtype}
-    return column.astype(kinds[column.dtype.kind])

@@ -114,9 +114,13 @@ class Differentiated(OptimisedPlanner):
         """Mask (n,) of variables that searches with `Stage.frozen` keep constant; None if none."""
         return self.planner.held
 
-    def divides(self, attempt: Round) -> bool:
-        """Return false: all starts of a case are one problem, so that one gradient is computed."""
-        return False
+    def network_inputs(self, context: _Context) -> Array:
+        """Return the features (F,) of a case for the inner planner's network."""
+        return self.planner.network_inputs(context.inner)
+
+    def first_start(self, guess: Array, features: Array, context: _Context) -> Array:
+        """Return the first starting point (n,) of the inner planner."""
+        return self.planner.first_start(guess, features, context.inner)
 
     def objective(self, point: Array, context: _Context) -> Evaluation:
         """Evaluate the objective of the inner planner at a point (n,)."""

@@ -1,7 +1,6 @@
 """Types of objectives, and settings of a planner's attempts (rounds), each of several searches."""
 
 import dataclasses
-import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -16,13 +15,11 @@ from planner_jax.core.checks import (
     require_switch,
 )
 from planner_jax.core.choices import require_size
-from planner_jax.core.compiled import Fixed, cached_by_precision, with_run_time_numbers
+from planner_jax.core.compiled import with_run_time_numbers
 from planner_jax.core.errors import ArgumentError, ArgumentTypeError
 from planner_jax.core.protocol import Attempt
 from planner_jax.core.rules import NOT_NEGATIVE, Rule
 
-# Greatest number of L-BFGS iterations that may be a constant of a compiled program.
-COUNTED = 16
 MOST_DAMPING = 1e4  # greatest damping of one problem in Newton's method
 
 
@@ -128,7 +125,6 @@ Solver = LbfgsConfig | NewtonConfig
 Settings = tuple[tuple[str, object], ...]  # fields of a planner, and their values
 
 
-@with_run_time_numbers("frozen")
 @dataclasses.dataclass(frozen=True)
 class Stage:
     """A preliminary search on an easier problem; its result is the start of the next search."""
@@ -146,7 +142,6 @@ class Stage:
             require_size("keep", self.keep, 1)
 
 
-@with_run_time_numbers()
 @dataclasses.dataclass(frozen=True)
 class Round(Attempt):
     """One attempt (search) of a planner that minimises: solver, settings, preliminary searches."""
@@ -165,51 +160,3 @@ class Round(Attempt):
     def all_stages(self) -> tuple[Stage, ...]:
         """The preliminary searches of the round, and its own search as the last stage."""
         return (*self.stages, Stage(self.solver, self.settings))
-
-    @property
-    def is_divided(self) -> bool:
-        """Return whether each search of a case, from one starting point, is a problem of its own.
-
-        This is so for several starting points, for starting points other than the first guess, and
-        if `settings` changes fields of the planner. Rounds (attempts) with equal `settings` then
-        share a compiled program, for any number of starting points.
-        """
-        return self.starts > 1 or self.first > 0 or bool(self.settings)
-
-
-@with_run_time_numbers("tolerance", "patience")
-@dataclasses.dataclass(frozen=True)
-class CountedLbfgs(LbfgsConfig):
-    """Settings of L-BFGS whose number of iterations is a constant of the compiled program."""
-
-
-@cached_by_precision
-def load_round(attempt: Round, is_counted: bool) -> Round | Fixed:
-    """Convert a round (attempt) to an argument of compiled programs.
-
-    Rounds that differ only in L-BFGS's numbers of iterations and tolerances then share one program.
-    A round with a search of 0 iterations becomes a constant of its program, because without
-    iterations the program has no loop. If `is_counted`, numbers of up to `COUNTED` iterations are
-    constants: a GPU then need not ask the host after every iteration whether the loop has ended.
-    """
-    if any(stage.solver.max_steps == 0 for stage in attempt.all_stages):
-        return Fixed(attempt)
-    load = functools.partial(_load_solver, is_counted=is_counted)
-    stages = [dataclasses.replace(each, solver=load(each.solver)) for each in attempt.stages]
-    own = load(attempt.solver)
-    return dataclasses.replace(attempt, solver=own, stages=tuple(stages), within=None)
-
-
-@cached_by_precision
-def load_stage(stage: Stage, is_counted: bool) -> Stage | Fixed:
-    """Convert a stage (search) for compiled programs; `is_counted` is as in `load_round`."""
-    stage = dataclasses.replace(stage, keep=None)
-    if stage.solver.max_steps == 0:
-        return Fixed(stage)
-    return dataclasses.replace(stage, solver=_load_solver(stage.solver, is_counted))
-
-
-def _load_solver(solver: Solver, is_counted: bool) -> Solver:
-    if (not is_counted or solver.max_steps > COUNTED) or not isinstance(solver, LbfgsConfig):
-        return solver
-    return CountedLbfgs(**vars(solver))

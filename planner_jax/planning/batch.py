@@ -22,6 +22,7 @@ from planner_jax.core.errors import ArgumentError, ArgumentTypeError
 from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import (
     Attempt,
+    Score,
     is_resident,
     is_unsolved,
     mark_bad_input,
@@ -37,6 +38,7 @@ from planner_jax.planning.programs import (
     lane_sharding,
     on_devices,
     program_key,
+    score_of,
     sizes_of,
     solve_on_devices,
 )
@@ -99,7 +101,8 @@ class Watch:
         if self._progress is None:
             return
         seconds, rounds = time.monotonic() - self._start, tuple(planner.attempts)
-        place = rounds.index(attempt) + 1 if attempt in rounds else 1
+        own = rounds.index(attempt) if attempt in rounds else 0
+        place = getattr(attempt, "place", own) + 1  # a group of attempts knows its place
         last_place, last = self._reported
         if 0 < tried < cases and place == last_place and seconds - last < _QUIET:
             return
@@ -140,7 +143,7 @@ def plan_batch(
     # On one CPU, one thread for each core plans a part of the batch. NumPy divides the batch and
     # joins the plans, because JAX would compile a program for every new batch size.
     is_small = is_one_cpu(mesh) and num != batch.sizes(attempts[0]).next(num)
-    if resident and not is_small and not planner.divides(attempts[0]):
+    if resident and not is_small:
         from planner_jax.planning.resident import ResidentBatch  # NumPy arrays do not need it
 
         return ResidentBatch(**vars(batch)).plan(attempts, cases)
@@ -214,9 +217,7 @@ class Batch:
         calls = self._calls(attempt, lanes)
         found, tried = [], 0
         self.watch.report(self.planner, attempt, 0, lanes.size)
-        for one, (_, num) in zip(
-            self._results(attempt, cases, calls, plans is not None), calls, strict=True
-        ):
+        for one, (_, num) in zip(self._results(attempt, cases, calls, plans), calls, strict=True):
             found.append(one)
             if one is not None:
                 tried += num
@@ -244,24 +245,27 @@ class Batch:
         return calls
 
     def _results(
-        self, attempt: Attempt, cases: PyTree, calls: list[_Call], may_end: bool
+        self, attempt: Attempt, cases: PyTree, calls: list[_Call], before: PyTree
     ) -> Iterator[PyTree]:
-        """Yield the plans of each compiled call, or None after the time limit if `may_end`."""
+        """Yield the plans of each compiled call, or None after the time limit.
+
+        `before` are the plans of earlier attempts. Without such plans the limit ends nothing.
+        """
         watch, spec = self.watch, lane_sharding(self.mesh)
-        threads = 1
+        threads, lanes = 1, (cases, score_of(attempt, cases, before))
         if len(calls) > 1 and is_one_cpu(self.mesh):
             from planner_jax.host.machine import usable_cores  # small batches do not need it
 
             threads = min(len(calls), usable_cores() + 1)
 
         def solve(call: _Call) -> PyTree:
-            if may_end and watch.is_over:
+            if before is not None and watch.is_over:
                 return None
-            if self.planner.divides(attempt):
-                lanes, num = call
-                return self._divide(attempt, jax.tree.map(lambda leaf: leaf[lanes[:num]], cases))
-            part = jax.device_put(jax.tree.map(lambda leaf: leaf[call[0]], cases), spec)
-            found, _ = self._solve(attempt, part)
+            index, num = call
+            some, score = jax.tree.map(lambda leaf: leaf[index], lanes)
+            if score is not None:
+                score = score.without(np.arange(index.size) >= num)
+            found, _ = self._solve(attempt, *jax.device_put((some, score), spec))
             return jax.block_until_ready(found) if threads > 1 or watch.waits else found
 
         if threads == 1:  # JAX returns before a result is ready, so the next call is prepared early
@@ -278,15 +282,11 @@ class Batch:
             yield from alone
             yield from later
 
-    def _solve(self, attempt: Attempt, cases: PyTree) -> tuple[PyTree, Array]:
+    def _solve(self, attempt: Attempt, cases: PyTree, before: Score | None) -> tuple[PyTree, Array]:
+        quickly = self.compiles_quickly
         return solve_on_devices(
-            self.planner, attempt, self.mesh, cases, compiles_quickly=self.compiles_quickly
+            self.planner, attempt, self.mesh, cases, before, compiles_quickly=quickly
         )
 
     def _key(self, attempt: Attempt, num: int, cases: PyTree) -> Hashable:
         return program_key(self.planner, attempt, num, cases, self.compiles_quickly)
-
-    def _divide(self, attempt: Attempt, cases: PyTree) -> PyTree:
-        from planner_jax.planning.searches import divide_batch  # few cases need it
-
-        return divide_batch(self.planner, attempt, self.mesh, cases)

@@ -211,6 +211,10 @@ class Driver:
             plans = planner.plan_by(self, cases)
             return plans, is_unsolved(plans.status)
         attempts = attempts or planner.attempts_for(cases)
+        is_single = not self.is_pure and (cases.batch_shape != () or self.watch.waits)
+        attempts = planner.group_attempts(
+            attempts, cases, is_whole=self.is_pure, is_single=is_single
+        )
         if self.is_pure:
             from planner_jax.planning.pure import plan_purely  # only compiled functions need it
 
@@ -248,12 +252,7 @@ def _plan_one(planner: Planner, attempts: Sequence[Attempt], case: PyTree, watch
         if best is not None and watch.is_over:
             return mark_out_of_time(best, True)
         watch.report(planner, attempt, 0, 1)
-        if planner.divides(attempt):
-            from planner_jax.planning.searches import divide_one  # few cases need it
-
-            plan = divide_one(planner, attempt, case)
-        else:
-            plan = solve_one(planner, case, attempt)
+        plan = solve_one(planner, case, attempt, best)
         watch.report(planner, attempt, 1, 1)
         if best is None or is_better(plan, best):
             best = plan

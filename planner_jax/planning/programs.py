@@ -21,7 +21,7 @@ from jaxtyping import PyTree
 
 from planner_jax.core.compiled import QUICK_OPTIONS, Fixed, Options, trace_for
 from planner_jax.core.planner import Planner
-from planner_jax.core.protocol import Attempt, is_unsolved, mark_bad_input
+from planner_jax.core.protocol import Attempt, Score, is_unsolved, mark_bad_input
 from planner_jax.core.rules import require_shapes
 from planner_jax.planning.traced import Layout, Results, Stored, load_or_trace, settings
 
@@ -30,6 +30,8 @@ BUCKETS = (16, 128, 1024, 8192, 65536)
 # Greatest number of starting points in one call. More would not fit the cache of a CPU's core; on a
 # GPU this number keeps all processors busy.
 _CPU_CHUNK, _GPU_CHUNK = 256, 65536
+# Few and many lanes of a call, if the program of an attempt can hold fewer cases.
+_CPU_SIZES, _GPU_SIZES = (16, 256), (1024, 16384)
 _GPU_BUSY = 8192  # least number of starts in one call that keeps a GPU busy
 _GPU_LEAST = 128  # least number of lanes of a call on a GPU; fewer lanes take the same time
 _SPARED = 8  # a smaller last call must save more than 1/8 of the lanes of all calls before it
@@ -41,20 +43,21 @@ class Sizes:
     """Numbers of lanes (cases) that one compiled call of an attempt may solve on each device."""
 
     most: int  # greatest number of lanes of a call
-    busy: int  # least number of lanes that keeps a GPU busy
+    busy: int  # least number of lanes of a call that does not hold all remaining lanes
     least: int = BUCKETS[0]  # least number of lanes of a call
+    buckets: tuple[int, ...] = BUCKETS  # numbers of lanes of calls, up to `most`
 
     def next(self, num: int) -> int:
         """Return how many lanes (cases) the next compiled call has if `num` lanes are unsolved.
 
-        It is the smallest size in `BUCKETS` that holds `num` lanes, at most the field `most`. If
+        It is the smallest size in `buckets` that holds `num` lanes, at most the field `most`. If
         the lanes fill at most half of it, the next smaller size is used, provided it is at least
         the field `busy`. Further calls then plan the remaining lanes.
         """
         needed = max(num, self.least)
-        fits = next((bucket for bucket in BUCKETS if needed <= bucket <= self.most), self.most)
-        smaller = max((bucket for bucket in BUCKETS if bucket < fits), default=0)
-        return smaller if smaller >= self.busy and 2 * num <= fits else fits
+        fits = next((size for size in self.buckets if needed <= size <= self.most), self.most)
+        smaller = max((size for size in self.buckets if size < fits), default=0)
+        return smaller if smaller > 0 and smaller >= self.busy and 2 * num <= fits else fits
 
     def cuts(self, num: int) -> Iterator[tuple[int, int]]:
         """Yield first lane (case) and number of lanes of each compiled call, for `num` lanes.
@@ -73,12 +76,13 @@ class Sizes:
 
 def sizes_of(planner: Planner, attempt: Attempt, chunk: int | None, mesh: Mesh) -> Sizes:
     """Return how many cases one call may solve: `chunk`, or numbers that suit the device."""
-    busy = _GPU_BUSY // attempt.starts
-    if planner.divides(attempt) and mesh.devices[0].platform == "cpu":
-        return Sizes(BUCKETS[0], busy)
+    busy, is_cpu = _GPU_BUSY // attempt.starts, mesh.devices[0].platform == "cpu"
     if chunk is not None:
         return Sizes(chunk, busy)
-    if mesh.devices[0].platform != "cpu":
+    if attempt.continues:  # one program for many cases, and one for few
+        few, many = sizes = _CPU_SIZES if is_cpu else _GPU_SIZES
+        return Sizes(few if attempt.starts > 1 else many, 0 if is_cpu else many, few, sizes)
+    if not is_cpu:
         return Sizes(max(_GPU_LEAST, _GPU_CHUNK // attempt.starts), busy, _GPU_LEAST)
     # If a core solves cases one after another, small chunks of cases keep all cores busy.
     if planner.is_sequential:
@@ -165,17 +169,31 @@ COMPILER_OPTIONS: Options = {"xla_gpu_enable_triton_gemm": False}
 FEW = 256
 
 
-def solve_cases(planner: Planner, cases: PyTree, loaded: PyTree) -> PyTree:
+def solve_cases(
+    planner: Planner, cases: PyTree, loaded: PyTree, before: Score | None = None
+) -> PyTree:
     """Return the plans of one case, or of a batch with a leading axis on every leaf; pure.
 
     `loaded` is an attempt (settings of a search) from `Planner.load_attempt`. All compiled programs
     call this function. Cases with an invalid number, such as NaN, get the status `BAD_INPUT`.
+    `before` has the numbers of plans of earlier attempts, for planners that use them.
     """
     require_shapes(cases)
     attempt = loaded.attempt if isinstance(loaded, Fixed) else loaded
-    alone = cases.batch_shape == ()
-    plans = planner.solve(cases, attempt) if alone else planner.solve_lanes(cases, attempt)
+    solve: Callable = planner.solve if cases.batch_shape == () else planner.solve_lanes
+    plans = solve(cases, attempt) if before is None else solve(cases, attempt, before)
     return mark_bad_input(plans, cases)
+
+
+def score_of(attempt: Attempt, cases: PyTree, plans: PyTree) -> Score | None:
+    """Return the numbers of earlier plans (None: there are none) that an attempt needs, or None."""
+    if not attempt.continues:
+        return None
+    if plans is not None:
+        return Score.of(plans)
+    leaves = (leaf.dtype for leaf in jax.tree.leaves(cases))
+    dtype = next(dtype for dtype in leaves if np.issubdtype(dtype, np.floating))
+    return Score.none(cases.batch_shape, jax.dtypes.canonicalize_dtype(dtype))
 
 
 class PerDevice:
@@ -207,20 +225,27 @@ class PerDevice:
 
 
 def solve_on_devices(
-    planner: Planner, attempt: Attempt, mesh: Mesh, cases: PyTree, *, compiles_quickly: bool = False
+    planner: Planner,
+    attempt: Attempt,
+    mesh: Mesh,
+    cases: PyTree,
+    before: Score | None = None,
+    *,
+    compiles_quickly: bool = False,
 ) -> tuple[PyTree, Array]:
     """Return plans of all cases, and the number of unsolved cases on each device, (devices,).
 
-    With `compiles_quickly`, compilation is faster and large batches take about 10 % longer.
+    `before` has the numbers of earlier plans, see `score_of`. With `compiles_quickly`, compilation
+    is faster and large batches take about 10 % longer.
     """
     run = _solve_quickly if compiles_quickly and QUICK_OPTIONS else _solve_fast
-    return run(mesh, None, planner, planner.load_attempt(attempt, cases), cases)
+    return run(mesh, None, planner, planner.load_attempt(attempt, cases), (cases, before))
 
 
 def _solve_and_count(
-    _: None, planner: Planner, loaded: PyTree, cases: PyTree
+    _: None, planner: Planner, loaded: PyTree, lanes: tuple[PyTree, Score | None]
 ) -> tuple[PyTree, Array]:
-    return with_unsolved(solve_cases(planner, cases, loaded))
+    return with_unsolved(solve_cases(planner, lanes[0], loaded, lanes[1]))
 
 
 _solve_fast = PerDevice(_solve_and_count, COMPILER_OPTIONS)
@@ -247,16 +272,20 @@ def program_key(
     return tree, own, lanes, num, compiles_quickly, settings()
 
 
-def solve_one(planner: Planner, case: PyTree, attempt: Attempt) -> PyTree:
-    """Return the plan of one case in NumPy arrays; the case is sent to the device as one vector."""
+def solve_one(planner: Planner, case: PyTree, attempt: Attempt, before: PyTree = None) -> PyTree:
+    """Return the plan of one case in NumPy arrays; the case is sent to the device as one vector.
+
+    `before` is the best plan of earlier attempts, or None.
+    """
     own = planner, planner.load_attempt(attempt, case)
     quickly = planner.compiles_quickly(attempt)
-    return call_packed(_solve_one, None, own, case, compiles_quickly=quickly)
+    lane = case, score_of(attempt, case, before)
+    return call_packed(_solve_one, None, own, lane, compiles_quickly=quickly)
 
 
-def _solve_one(_: None, own: PyTree, case: PyTree) -> PyTree:
+def _solve_one(_: None, own: PyTree, lane: tuple[PyTree, Score | None]) -> PyTree:
     planner, loaded = own
-    return solve_cases(planner, case, loaded)
+    return solve_cases(planner, lane[0], loaded, lane[1])
 
 
 def call_packed(

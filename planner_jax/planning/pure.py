@@ -12,15 +12,15 @@ from jaxtyping import PyTree
 
 from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import Attempt, is_solved, is_unsolved, select
-from planner_jax.planning.programs import solve_cases
+from planner_jax.planning.programs import score_of, solve_cases
 
 
 def plan_purely(planner: Planner, attempts: Sequence[Attempt], cases: PyTree) -> PyTree:
     """Return plans as jax arrays; while any case is unsolved, searches are made for all cases."""
-    joined = (planner.join_attempts(attempts[k:], cases) for k in range(len(attempts)))
-    alone, finish = next(((k, each) for k, each in enumerate(joined) if each), (None, None))
     plans: PyTree = None
-    pairs = [(attempt, planner.load_attempt(attempt, cases)) for attempt in attempts[:alone]]
+    pairs = [(attempt, planner.load_attempt(attempt, cases)) for attempt in attempts]
+    if attempts[0].continues:
+        return _plan_in_groups(planner, pairs, cases)
     # Consecutive attempts (searches) with pytrees of equal structure share one compiled loop.
     for _, same in itertools.groupby(pairs, lambda pair: jax.tree.structure(pair[1])):
         group, loaded = zip(*same, strict=True)
@@ -53,7 +53,22 @@ def plan_purely(planner: Planner, attempts: Sequence[Attempt], cases: PyTree) ->
             return lax.cond(is_first | jnp.any(due), solve_again, lambda plans: plans, plans)
 
         plans = lax.fori_loop(0, len(group), try_next, plans)
-    return finish(plans) if finish else plans
+    return plans
+
+
+def _plan_in_groups(
+    planner: Planner, pairs: Sequence[tuple[Attempt, PyTree]], cases: PyTree
+) -> PyTree:
+    (first, loaded), *others = pairs
+    plans = solve_cases(planner, cases, loaded, score_of(first, cases, None))
+    for attempt, loaded in others:
+
+        def improve(plans: PyTree, attempt=attempt, loaded=loaded) -> PyTree:
+            before = score_of(attempt, cases, plans)
+            return select(solve_cases(planner, cases, loaded, before), plans)
+
+        plans = lax.cond(jnp.any(attempt.is_due(plans)), improve, lambda plans: plans, plans)
+    return plans
 
 
 def _solve_by(planner: Planner, cases: PyTree, loaded: Sequence[PyTree], k: Array | int) -> PyTree:

@@ -15,16 +15,23 @@ from jax import Array
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import PyTree
 
-from planner_jax.core.protocol import Attempt, Status, is_unsolved, mark_out_of_time, select
+from planner_jax.core.protocol import (
+    Attempt,
+    Score,
+    Status,
+    is_unsolved,
+    mark_out_of_time,
+    select,
+)
 from planner_jax.planning.batch import Batch
 from planner_jax.planning.programs import (
     LANES,
     compiled,
     count_lanes,
-    lane_sharding,
     place_lanes,
     put_number,
     run_per_device,
+    score_of,
     with_unsolved,
 )
 
@@ -32,12 +39,6 @@ from planner_jax.planning.programs import (
 @dataclasses.dataclass(frozen=True)
 class ResidentBatch(Batch):
     """A planner and the devices that hold batches of cases, and their plans."""
-
-    def _divide_resident(self, attempt: Attempt, cases: PyTree, is_case: np.ndarray) -> PyTree:
-        found = self._divide(attempt, jax.tree.map(lambda leaf: np.asarray(leaf)[is_case], cases))
-        row = np.maximum(np.cumsum(is_case) - 1, 0)  # repeats a plan for the padding
-        found = jax.tree.map(lambda leaf: leaf[row], found)
-        return jax.device_put(found, lane_sharding(self.mesh))
 
     def plan(self, attempts: Sequence[Attempt], cases: PyTree) -> tuple[PyTree, Array]:
         """Return plans of cases in jax arrays, and the number of unsolved cases of each device.
@@ -49,7 +50,6 @@ class ResidentBatch(Batch):
             cases = _take(cases, np.arange(-(-num // mesh.size) * mesh.size))
         cases = place_lanes(cases, mesh)
         first, *others = attempts
-        share = count_lanes(cases) // mesh.size
         watch.report(planner, first, 0, num)
         plans, unsolved = self._first_plans(first, cases)
         for attempt in others:
@@ -65,11 +65,9 @@ class ResidentBatch(Batch):
                 break
             watch.report(planner, attempt, 0, np.asarray(due).sum())
             for begin, size in self.sizes(attempt).cuts(most):
-                part, lanes = _cut_unsolved(mesh, size, cases, before, put_number(mesh, begin))
-                if planner.divides(attempt):
-                    later = self._divide_resident(attempt, part, np.asarray(lanes) < share)
-                else:
-                    later, _ = self._solve(attempt, part)
+                known = cases, score_of(attempt, cases, plans)
+                part, lanes = _cut_unsolved(mesh, size, known, before, put_number(mesh, begin))
+                later, _ = self._solve(attempt, *part)
                 plans, unsolved = _select_locally(mesh, plans, later, lanes)
         if num % mesh.size:  # JAX cannot shard an axis into unequal parts
             plans = _take(jax.device_put(plans, mesh.devices[0]), np.arange(num))
@@ -78,12 +76,12 @@ class ResidentBatch(Batch):
     def _first_plans(self, attempt: Attempt, cases: PyTree) -> tuple[PyTree, Array]:
         mesh, sizes, share = self.mesh, self.sizes(attempt), count_lanes(cases) // self.mesh.size
         if share == sizes.next(share):
-            return self._solve(attempt, cases)
+            return self._solve(attempt, cases, self._none(attempt, cases))
         cuts = list(sizes.cuts(share))
 
         def solve(begin: int, size: int) -> PyTree:
             part = _cut(mesh, size, cases, put_number(mesh, begin))
-            return self._solve(attempt, part)[0]
+            return self._solve(attempt, part, self._none(attempt, part))[0]
 
         firsts = {size: begin for begin, size in reversed(cuts)}
         keys = {self._key(attempt, size, cases) for size in firsts}
@@ -97,6 +95,16 @@ class ResidentBatch(Batch):
             compiled.update(keys)
         parts = [found[begin] if begin in found else solve(begin, size) for begin, size in cuts]
         return _join_locally(mesh, parts, share)
+
+    def _none(self, attempt: Attempt, cases: PyTree) -> Score | None:
+        score = score_of(attempt, cases, None)
+        return score and _place_none(self.mesh, count_lanes(cases), score.cost.dtype)
+
+
+@functools.lru_cache(maxsize=64)
+def _place_none(mesh: Mesh, num: int, dtype: np.dtype) -> Score:
+    """Return the numbers of `num` cases without plans, on their devices."""
+    return place_lanes(jax.tree.map(jnp.asarray, Score.none((num,), dtype)), mesh)
 
 
 @jax.jit
@@ -123,7 +131,8 @@ def _cut_unsolved(
         (num,) = status.shape
         (unsolved,) = jnp.nonzero(is_unsolved(status), size=num, fill_value=num)
         lanes = _take(unsolved, begin + jnp.arange(size))
-        return _take(tree, lanes), lanes
+        some, score = _take(tree, lanes)
+        return (some, score and score.without(lanes >= num)), lanes
 
     return run_per_device(mesh, cut, LANES, LANES, PartitionSpec())(tree, status, begin)
 

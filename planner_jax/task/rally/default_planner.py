@@ -156,9 +156,9 @@ class ExactRally(ChainPlanner[RallyCase, RallyPlan]):
         metric = self._metric(point.size)
         return point if metric is None else _multiply(metric.inverse, point)
 
-    def plain_guesses(self, context: RallyContext, num: int) -> Array:
+    def guesses(self, context: RallyContext, num: int) -> Array:
         """Return starting points (num, n) of the search, whose waypoint offsets are zero."""
-        points = super().plain_guesses(context, num)
+        points = super().guesses(context, num)
         metric = self._metric(points.shape[1])
         if metric is None:
             return points
