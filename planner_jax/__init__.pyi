@@ -39,8 +39,8 @@ from .plane.make_obstacles import obstacles as obstacles
 from .plane.obstacles import Obstacles as Obstacles
 from .plane.target import PolynomialPath as PolynomialPath
 from .plane.target import TurningPath as TurningPath
-from .planning.batch import Progress as Progress
 from .planning.gradient import gradient as gradient
+from .planning.plan import Progress as Progress
 from .planning.plan import plan as plan
 from .planning.plan import solve as solve
 from .planning.replan import replan as replan

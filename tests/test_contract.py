@@ -141,9 +141,9 @@ def test_a_second_batch_of_the_same_bucket_is_not_traced_again(entry, forbid_tra
     ("planner", "case", "num"),
     [
         # `num` is the number of compiled programs: attempts need different programs if they have
-        # other variables.
+        # other variables, or several starting points.
         (pj.hit.planner("exact"), pj.hit.draw(1), 2),
-        (pj.catch.planner("exact").planner, pj.catch.draw(1), 1),
+        (pj.catch.planner("exact").planner, pj.catch.draw(1), 2),
         (pj.intercept.planner("spacetime"), pj.intercept.draw(1), 2),
         (pj.intercept.planner("quick"), pj.intercept.draw(1), 1),
         (pj.block.planner("online"), pj.block.draw(1), 1),
@@ -154,7 +154,7 @@ def test_a_second_batch_of_the_same_bucket_is_not_traced_again(entry, forbid_tra
 def test_the_attempts_of_a_planner_share_programs(planner, case, num):
     loaded = []
     attempts = planner.attempts_for(case)
-    for attempt in planner.group_attempts(attempts, case, is_whole=False, is_single=True):
+    for attempt in planner.group_attempts(attempts, case, is_whole=False):
         loaded.append(planner.load_attempt(attempt, case))
     layouts = [[(leaf.shape, leaf.dtype) for leaf in jax.tree.leaves(each)] for each in loaded]
     programs = zip(map(jax.tree.structure, loaded), map(tuple, layouts), strict=True)

@@ -13,7 +13,7 @@ from derivatives import double
 import planner_jax as pj
 from planner_jax.core.protocol import is_solved
 from planner_jax.lanes import kernels, over_lanes
-from planner_jax.optimise.multistart import minimise_lanes
+from planner_jax.optimise.multistart import minimise
 from planner_jax.optimise.sensitivity import gradient_at
 from planner_jax.optimise.settings import LbfgsConfig, Round
 from planner_jax.planning.plan import plan
@@ -103,7 +103,9 @@ def test_gradients_at_the_same_points_are_those_of_a_cpu(devices, serves):
     def optima(cases):
         contexts = over_lanes(planner.prepare)(cases)
         starts = over_lanes(lambda context: planner.guesses(context, 1)[0])(contexts)
-        return minimise_lanes(planner.objective, starts, contexts, LbfgsConfig(max_steps=60)).point
+        config = LbfgsConfig(max_steps=60)
+        search = lambda start, c: minimise(lambda x: planner.objective(x, c), start, config)  # noqa: E731
+        return jax.vmap(search, in_axes=-1, out_axes=-1)(starts, contexts).point
 
     @jax.jit
     @over_lanes

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from planner_jax.cost.penalty import smooth_hinge
-from planner_jax.optimise.multistart import minimise, minimise_lanes
+from planner_jax.optimise.multistart import minimise
 from planner_jax.optimise.newton import by_products, solve_damped
+from planner_jax.optimise.newton_lanes import minimise_lanes
 from planner_jax.optimise.settings import Curvature, Evaluation, NewtonConfig
 
 CURVED = np.array([[3.0, 1.0, 0.2], [1.0, 2.0, 0.0], [0.2, 0.0, 1.0]])

@@ -12,7 +12,7 @@ from flax import struct
 from jax import Array
 
 import planner_jax as pj
-from planner_jax.planning import batch as watch
+from planner_jax.planning import plan as watch
 from planner_jax.planning.decided import DecidedPlanner
 from tests.trees import assert_same
 

@@ -114,13 +114,12 @@ class Planner(Generic[CaseT, PlanT]):
         return Fixed(attempt)
 
     def group_attempts(
-        self, attempts: Sequence[PyTree], cases: CaseT, /, *, is_whole: bool, is_single: bool
+        self, attempts: Sequence[PyTree], cases: CaseT, /, *, is_whole: bool
     ) -> Sequence[PyTree]:
         """Return the attempts (searches) in the form in which compiled programs make them.
 
-        By default they are unchanged. A planner may join attempts that one program makes in turn:
-        all that it can for `pj.solve`, which `is_whole` means, else those whose program is
-        compiled fast. With `is_single` each result makes one attempt of such a program.
+        By default they are unchanged. A planner may join attempts that one program makes in turn,
+        for `pj.solve`, which `is_whole` means.
         """
         return attempts
 

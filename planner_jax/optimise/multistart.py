@@ -1,8 +1,6 @@
-"""The search loops of planners that minimise, for one problem and for a batch of problems."""
+"""The search loop of planners that minimise for one problem, and plans at its result."""
 
 import dataclasses
-import math
-from collections.abc import Callable
 from types import ModuleType
 from typing import TYPE_CHECKING
 
@@ -13,10 +11,8 @@ from jax import Array, lax
 from jaxtyping import PyTree
 
 from planner_jax.core.protocol import Status, is_unsolved, status_of
-from planner_jax.lanes import over_lanes
 from planner_jax.optimise import lbfgs
 from planner_jax.optimise.settings import (
-    Curvature,
     Curved,
     Evaluation,
     LbfgsConfig,
@@ -50,66 +46,13 @@ def minimise(
     if _has_steps(config, 0):
         return optimum_at(start, objective(start), config)
     if isinstance(config, NewtonConfig):
-        config = _with_stragglers(config)
+        config = with_stragglers(config)
     step = lambda s: _step(objective, curved, s, config)  # noqa: E731
     state = _method(config).init(start, config)
     if _has_steps(config, 1):  # without a loop, so that XLA can fuse across the iteration
-        return _optimum_of(step(state), config)
+        return optimum_of(step(state), config)
     state = lax.while_loop(lambda s: _method(config).is_unfinished(s.numbers, config), step, state)
-    return _optimum_of(state, config)
-
-
-def minimise_lanes(
-    objective: Callable[[Array, PyTree], Evaluation],
-    starts: Array,
-    contexts: PyTree,
-    config: Solver,
-    curved: Callable[[Array, PyTree], Curvature] | None = None,
-) -> Optimum:
-    """Minimise B problems of n variables at once, each with its own start and context.
-
-    `starts` is (n, B). A context is the pytree of a problem's data. In all arrays of `contexts` and
-    of the result, the last axis counts problems. `objective` and `curved` take a point (n,) and the
-    context of one problem. `curved` returns the derivatives for Newton's method; if it is None,
-    they are computed from `objective` by automatic differentiation.
-    """
-    if _has_steps(config, 0):
-        evaluate = lambda x, context: optimum_at(x, objective(x, context), config)  # noqa: E731
-        return over_lanes(evaluate)(starts, contexts)
-
-    def search(state: PyTree, contexts: PyTree, config: Solver, steps: int | Array) -> PyTree:
-        @over_lanes
-        def step(state: PyTree, context: PyTree) -> PyTree:
-            own = curved
-            by_point = own and (lambda x: own(x, context))
-            return _step(lambda x: objective(x, context), by_point, state, config)
-
-        return lax.while_loop(
-            lambda s: jnp.any(_method(config).is_unfinished(s.numbers, config)),
-            lambda s: step(s, contexts),
-            state,
-        )
-
-    state = over_lanes(lambda start: _method(config).init(start, config))(starts)
-    state = search(state, contexts, config, config.max_steps)
-    if isinstance(config, NewtonConfig) and config.stragglers is not None:
-        newton, (share, steps, groups) = _method(config), config.stragglers
-        longer, num = _with_stragglers(config), math.ceil(share * starts.shape[-1])
-
-        def next_group(progress: tuple[Array, PyTree]) -> tuple[Array, PyTree]:
-            number, state = progress
-            lanes = newton.most_to_gain(state.numbers, longer, num)
-            some, own = jax.tree.map(lambda leaf: leaf[..., lanes], (state, contexts))
-            later = search(some, own, longer, steps)
-            place = lambda old, new: old.at[..., lanes].set(new)  # noqa: E731
-            return number + 1, jax.tree.map(place, state, later)
-
-        def is_open(progress: tuple[Array, PyTree]) -> Array:
-            number, state = progress
-            return (number < groups) & jnp.any(newton.is_unfinished(state.numbers, longer))
-
-        _, state = lax.while_loop(is_open, next_group, (jnp.zeros((), jnp.int32), state))
-    return _optimum_of(state, config)
+    return optimum_of(state, config)
 
 
 def _has_steps(config: Solver, num: int) -> bool:
@@ -131,14 +74,16 @@ def _step(objective: Objective, curved: Curved | None, state: PyTree, config: So
     return newton.step(objective, curved or newton.by_products(objective), state, config)
 
 
-def _with_stragglers(config: NewtonConfig) -> NewtonConfig:
+def with_stragglers(config: NewtonConfig) -> NewtonConfig:
+    """Return settings with which every problem may make the iterations of stragglers."""
     if config.stragglers is None:
         return config
     _, steps, groups = config.stragglers
     return dataclasses.replace(config, max_steps=config.max_steps + steps * groups, stragglers=None)
 
 
-def _optimum_of(state: PyTree, config: Solver) -> Optimum:
+def optimum_of(state: PyTree, config: Solver) -> Optimum:
+    """Return the result of a search in its last state."""
     return Optimum(
         point=state.best_point,
         evaluation=state.numbers.best,

@@ -157,7 +157,7 @@ class OptimisedPlanner(Planner[CaseT, PlanT], abc.ABC):
         return attempt
 
     def group_attempts(
-        self, attempts: Sequence[Round], cases: PyTree, *, is_whole: bool, is_single: bool
+        self, attempts: Sequence[Round], cases: PyTree, *, is_whole: bool
     ) -> list[Group]:
         """Join rounds (attempts) that share a compiled program."""
         known, places = tuple(self.attempts), tuple(range(len(attempts)))
@@ -166,12 +166,12 @@ class OptimisedPlanner(Planner[CaseT, PlanT], abc.ABC):
             if -1 in places:  # rounds that the planner does not have
                 known, places = tuple(attempts), tuple(range(len(attempts)))
         fitted = tuple([self.fit_attempt(each, cases) for each in known])
-        return group_rounds(self, fitted, places, is_whole, is_single)
+        return group_rounds(self, fitted, places, is_whole)
 
     def load_attempt(self, attempt: Round | Group, cases: PyTree) -> Table:
         """Convert a round, or a group of rounds (attempts), to an argument of compiled programs."""
         if isinstance(attempt, Round):
-            attempt = Group.of((self.fit_attempt(attempt, cases),), (0,), True, 0)
+            attempt = Group.of((self.fit_attempt(attempt, cases),), (0,))
         return load_group(self, attempt)
 
     def solve(self, case: PyTree, attempt: Round | Table, before: Score | None = None) -> PyTree:

@@ -8,25 +8,24 @@ can share a program are one `Group`, whose table `load_group` makes.
 """
 
 import dataclasses
-import functools
 import itertools
-from collections.abc import Callable, Hashable, Sequence
-from typing import TYPE_CHECKING, Any, TypeVar
+from collections.abc import Hashable, Sequence
+from typing import TYPE_CHECKING, Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jax import Array
 
-from planner_jax.core.compiled import cached_by_precision
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.protocol import Attempt
+from planner_jax.lanes import kernels
 from planner_jax.optimise.settings import LbfgsConfig, Round, Settings, Solver, Stage
 
 if TYPE_CHECKING:
     from planner_jax.optimise.planner import OptimisedPlanner
 
-Result = TypeVar("Result")
 Number = Array | float | int | bool
 _TURNS = 8  # greatest number of iterations on a GPU after which the host asks for unfinished lanes
 
@@ -56,7 +55,7 @@ class Model:
     """The constants of a loop that is compiled once for several rows."""
 
     settings: Settings  # fields of the planner
-    solver: Solver  # for L-BFGS, `max_steps` are the turns of `search._minimise_lanes`
+    solver: Solver  # for L-BFGS, `max_steps` are the turns of `tiles.minimise_tile`
     varying: tuple[str, ...]  # fields of the planner that differ among its rows
     # The indices of the variables among those of the finest planner; None: all of them.
     free: tuple[int, ...] | None
@@ -71,6 +70,14 @@ class Table:
     finest: Settings = struct.field(pytree_node=False)  # of the planner that decodes all plans
     starts: int = struct.field(pytree_node=False)  # greatest number of starting points of a case
     guesses: int = struct.field(pytree_node=False)  # number of guesses among which rows start
+    # Whether the number of iterations is that of the model's solver, for GPUs: the host then need
+    # not ask whether the loop has ended.
+    is_counted: bool = struct.field(pytree_node=False)
+
+    @property
+    def is_plain(self) -> bool:
+        """Return whether the table is one search from one starting point of each case."""
+        return len(self.numbers) == 1 and self.starts == 1
 
     @property
     def rows(self) -> Row:
@@ -96,8 +103,11 @@ class Group(Attempt):
 
     rounds: tuple[Round, ...] = ()  # all rounds for which the program is compiled
     made: tuple[int, ...] = ()  # indices of the rounds that are made
+    is_whole: bool = False  # whether the program has no other rounds
     is_first: bool = True  # whether no attempt has been made before
     place: int = 0  # index of its first round among the planner's attempts
+    # Its table in float32 and float64, after the first use.
+    tables: dict[bool, Table] = dataclasses.field(default_factory=dict, compare=False, repr=False)
 
     @property
     def continues(self) -> bool:
@@ -106,7 +116,12 @@ class Group(Attempt):
 
     @classmethod
     def of(
-        cls, rounds: tuple[Round, ...], made: tuple[int, ...], is_first: bool, place: int
+        cls,
+        rounds: tuple[Round, ...],
+        made: tuple[int, ...],
+        is_whole: bool = True,
+        is_first: bool = True,
+        place: int = 0,
     ) -> "Group":
         """Return a group that makes some of these rounds, for the cases that need one of them."""
         own = [rounds[k] for k in made]
@@ -117,20 +132,15 @@ class Group(Attempt):
             improves=any(each.improves for each in own),
             rounds=rounds,
             made=made,
+            is_whole=is_whole,
             is_first=is_first,
             place=place,
         )
 
 
-def _unless_arrays(cached: Callable[..., Result], function: Callable[..., Result]) -> Callable:
-    """Return a cached function of a planner and more, without the cache if it holds arrays."""
-
-    @functools.wraps(function)
-    def call(planner: "OptimisedPlanner", *args: object) -> Result:
-        has_arrays = bool(jax.tree.leaves(planner))
-        return (function if has_arrays else cached)(planner, *args)
-
-    return call
+# Groups by the identity of their planner, since it takes long to hash a planner.
+_RECENT: dict[int, tuple] = {}
+_MOST_RECENT = 256
 
 
 def group_rounds(
@@ -138,41 +148,51 @@ def group_rounds(
     rounds: tuple[Round, ...],
     places: tuple[int, ...],
     is_whole: bool,
-    is_single: bool,
 ) -> list[Group]:
     """Return groups of those rounds (attempts) whose indices are `places`, in order.
 
-    With `is_single` each group makes one round, though its program can make others as well.
+    Unless `is_whole`, each group makes one round, though other rounds can share its program. The
+    last groups of each planner are stored.
     """
+    key, known = (rounds, places, is_whole), _RECENT.get(id(planner))
+    if known is None or known[0] is not planner or known[1] != key:
+        if len(_RECENT) >= _MOST_RECENT:
+            _RECENT.clear()
+        known = _RECENT[id(planner)] = planner, key, _group_rounds(planner, *key)
+    return known[2]
+
+
+def _group_rounds(
+    planner: "OptimisedPlanner",
+    rounds: tuple[Round, ...],
+    places: tuple[int, ...],
+    is_whole: bool,
+) -> list[Group]:
     groups: list[Group] = []
     for part in _divide(planner, rounds, is_whole):
         own, made = rounds[part.start : part.stop], [k for k in places if k in part]
-        for some in [[k] for k in made] if is_single else [made][: len(made)]:
+        for some in [made][: len(made)] if is_whole else [[k] for k in made]:
             indices = tuple(k - part.start for k in some)
-            groups.append(Group.of(own, indices, not groups, some[0]))
+            groups.append(Group.of(own, indices, is_whole, not groups, some[0]))
     return groups
-
-
-group_rounds = _unless_arrays(functools.lru_cache(maxsize=1024)(group_rounds), group_rounds)
 
 
 def _divide(planner: "OptimisedPlanner", rounds: tuple[Round, ...], is_whole: bool) -> list[range]:
     """Return the indices of consecutive rounds (attempts) that one compiled program can make.
 
     These rounds have equal values of all fields of the planner that `weights` and `refinements` do
-    not list. Unless `is_whole`, they also have the same models, so that the program of the first
-    rounds, which are often the only ones, is compiled fast.
+    not list. Unless `is_whole`, they also have the same models. The first rounds of one stage and
+    one starting point are then apart, because their program is compiled fast.
     """
     names = {name for each in rounds for stage in each.all_stages for name, _ in stage.settings}
     fixed = sorted(names - {*planner.weights, *planner.refinements})
-
-    def key(each: Round) -> Hashable:
-        shared = _key_of_fields(planner, each.all_stages[-1], fixed)
-        return (
-            shared if is_whole else (shared, {_key_of_model(planner, s) for s in each.all_stages})
-        )
-
-    keys = [key(each) for each in rounds]
+    keys: list[Hashable] = []
+    leads = True
+    for each in rounds:
+        shared, stages = _key_of_fields(planner, each.all_stages[-1], fixed), each.all_stages
+        models = frozenset(_key_of_model(planner, stage) for stage in stages)
+        leads = leads and _is_plain(each) and (not keys or keys[0] == (shared, models, True))
+        keys.append(shared if is_whole else (shared, models, leads))
     groups: list[range] = []
     for k in range(len(rounds)):
         if groups and keys[groups[-1].start] == keys[k]:
@@ -180,6 +200,10 @@ def _divide(planner: "OptimisedPlanner", rounds: tuple[Round, ...], is_whole: bo
         else:
             groups.append(range(k, k + 1))
     return groups
+
+
+def _is_plain(each: Round) -> bool:
+    return each.starts == 1 and not each.stages
 
 
 def _key_of_fields(planner: "OptimisedPlanner", stage: Stage, names: Sequence[str]) -> tuple:
@@ -197,32 +221,42 @@ def _key_of_model(planner: "OptimisedPlanner", stage: Stage) -> tuple:
 
 
 def load_group(planner: "OptimisedPlanner", group: Group) -> Table:
-    """Return the table of a group of rounds (attempts), whose numbers are an array."""
+    """Return the table of a group of rounds (attempts) of this planner, with a jax array."""
+    is_double = bool(jax.config.jax_enable_x64)  # type: ignore[attr-defined]
+    if is_double not in group.tables:
+        table = _make_table(planner, group)
+        with jax.ensure_compile_time_eval():
+            numbers = jnp.asarray(table.numbers)
+            group.tables[is_double] = dataclasses.replace(table, numbers=numbers)
+    return group.tables[is_double]
+
+
+def _make_table(planner: "OptimisedPlanner", group: Group) -> Table:
     stages = list(dict.fromkeys(s for each in group.rounds for s in each.all_stages))
     models = list_models(planner, stages)
     lists = [_rows_of(planner, each, models) for each in group.rounds]
-    for k, rows in enumerate(lists):
-        is_first = group.is_first and k == group.made[0]
-        changes = {"is_first": is_first} if k in group.made else {"within": -np.inf}
-        if k not in group.made:
-            changes["improves"] = False
-        lists[k] = [dataclasses.replace(row, **changes) for row in rows]
-    rows = list(itertools.chain(*lists))
+    rows = list(itertools.chain(*(lists[k] for k in group.made)))
+    every = list(itertools.chain(*lists))
+    for k in range(len(lists[group.made[0]]) if group.is_first else 0):
+        rows[k] = dataclasses.replace(rows[k], is_first=True)
+    if not group.is_whole:  # rows that are never made fill the table
+        most = max(map(len, lists))
+        unmade = dataclasses.replace(lists[0][0], within=-np.inf, improves=False)
+        rows += [unmade] * (most - len(rows))
     lasts = [each.all_stages[-1] for each in group.rounds]
     sizes = [planner.with_settings(stage.settings).size for stage in lasts]
     finest = lasts[sizes.index(max(sizes))].settings
     numbers = np.array([[float(x) for x in jax.tree.leaves(row)] for row in rows])
+    is_gpu, turns = kernels.has_gpu(), models[lasts[0]].solver.max_steps
     is_double = jax.config.jax_enable_x64  # type: ignore[attr-defined]
     return Table(
         numbers=numbers.astype(np.float64 if is_double else np.float32),
         models=tuple(dict.fromkeys(models.values())),
         finest=finest,
-        starts=max(int(row.width) for row in rows),
-        guesses=max(int(row.first) + int(row.width) for row in rows if row.starts),
+        starts=max(int(row.width) for row in every),
+        guesses=max(int(row.first) + int(row.width) for row in every if row.starts),
+        is_counted=bool(is_gpu and len(rows) == 1 and rows[0].solver[0] <= turns),
     )
-
-
-load_group = _unless_arrays(cached_by_precision(load_group), load_group)
 
 
 def list_models(planner: "OptimisedPlanner", stages: Sequence[Stage]) -> dict[Stage, Model]:

@@ -13,6 +13,7 @@ Hessian. lambda^T cost_utheta is a part of the derivative of the cost's gradient
 import dataclasses
 import functools
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -100,6 +101,10 @@ class Differentiated(OptimisedPlanner):
     def with_settings(self, settings: Settings) -> "Differentiated":
         """Return a copy with other values of some fields of the inner planner."""
         return dataclasses.replace(self, planner=self.planner.with_settings(settings))
+
+    def setting(self, name: str) -> Any:
+        """Return the value of a field of the inner planner."""
+        return self.planner.setting(name)
 
     def prepare(self, case: PyTree) -> _Context:
         """Return a case, and the data that the inner planner prepares for it."""

@@ -7,9 +7,9 @@ other device. A `Watch` reports progress to the caller and ends the attempts at 
 
 import dataclasses
 import functools
-import time
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING
 
 import jax
 import numpy as np
@@ -17,8 +17,6 @@ from jax import Array
 from jax.sharding import Mesh
 from jaxtyping import PyTree
 
-from planner_jax.core.checks import require_scalar
-from planner_jax.core.errors import ArgumentError, ArgumentTypeError
 from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import (
     Attempt,
@@ -37,78 +35,15 @@ from planner_jax.planning.programs import (
     is_one_cpu,
     lane_sharding,
     on_devices,
+    place_lanes,
     program_key,
     score_of,
     sizes_of,
     solve_on_devices,
 )
 
-_QUIET = 1.0  # [s] least time between two progress reports of one round
-
-
-@dataclasses.dataclass(frozen=True)
-class Progress:
-    """Report of `plan` on the progress of an attempt (search); `str` formats it as one line."""
-
-    round: int  # number of this round, counted from 1
-    rounds: int  # greatest number of rounds that the planner makes
-    tried: int  # number of cases that this round has tried so far
-    cases: int  # number of cases of this round: all that earlier rounds left unsolved
-    seconds: float  # [s] time since the start of planning
-
-    def __str__(self) -> str:
-        return (
-            f"round {self.round} of at most {self.rounds}: {self.tried:,} of {self.cases:,} cases "
-            f"tried, after {self.seconds:.1f} s"
-        )
-
-
-class Watch:
-    """The clock of one call of `plan`: it reports progress and knows when the time limit passes.
-
-    Args:
-        time_limit: [s] time after the construction from which no search starts; None: no limit.
-        progress: function that receives a `Progress` for each report; None: no reports.
-
-    Raises:
-        TypeError: the time limit is not a number, or `progress` is not callable.
-        ValueError: the time limit is negative or NaN.
-    """
-
-    def __init__(
-        self, time_limit: float | None = None, progress: Callable[[Progress], object] | None = None
-    ) -> None:
-        if time_limit is not None:
-            if not require_scalar("time_limit", time_limit) >= 0.0:
-                raise ArgumentError("time_limit", ">= 0 s", time_limit)
-        if progress is not None and not callable(progress):
-            raise ArgumentTypeError("progress", "callable, such as print", progress)
-        self._start, self._limit, self._progress = time.monotonic(), time_limit, progress
-        self._reported = (0, 0.0)  # number of the attempt, and time [s], of the last report
-
-    @property
-    def waits(self) -> bool:
-        """Return whether the host waits for each call, as a time limit or progress reports need."""
-        return self._limit is not None or self._progress is not None
-
-    @property
-    def is_over(self) -> bool:
-        """True if the time limit has passed."""
-        return self._limit is not None and time.monotonic() - self._start >= self._limit
-
-    def report(self, planner: Planner, attempt: Attempt, tried: int, cases: int) -> None:
-        """Report progress at the start and end of a search, and else at most once a second."""
-        if self._progress is None:
-            return
-        seconds, rounds = time.monotonic() - self._start, tuple(planner.attempts)
-        own = rounds.index(attempt) if attempt in rounds else 0
-        place = getattr(attempt, "place", own) + 1  # a group of attempts knows its place
-        last_place, last = self._reported
-        if 0 < tried < cases and place == last_place and seconds - last < _QUIET:
-            return
-        self._reported = place, seconds
-        self._progress(Progress(place, max(len(rounds), place), int(tried), int(cases), seconds))
-
+if TYPE_CHECKING:
+    from planner_jax.planning.plan import Watch
 
 # One compiled call: the indices of its cases in the batch, padded to a fixed length with copies of
 # the first index, and the number of cases without the padding.
@@ -121,7 +56,7 @@ def plan_batch(
     cases: PyTree,
     chunk: int | None,
     devices: Sequence[jax.Device] | None,  # pyright: ignore[reportInvalidTypeForm]
-    watch: Watch,
+    watch: "Watch",
 ) -> tuple[PyTree, PyTree]:
     """Return plans of a batch, by attempts (searches), each made at the cases still unsolved.
 
@@ -153,7 +88,7 @@ def plan_batch(
 
 
 def plan_on_host(
-    planner: Planner, attempts: Sequence[Attempt], cases: PyTree, watch: Watch
+    planner: Planner, attempts: Sequence[Attempt], cases: PyTree, watch: "Watch"
 ) -> tuple[PyTree, int]:
     """Return NumPy plans, and the number of unsolved ones, by a planner that runs on the host."""
     alone = cases.batch_shape == ()
@@ -173,7 +108,7 @@ def plan_on_host(
 def _try_in_turn(
     attempts: Sequence[Attempt],
     num: int,
-    watch: Watch,
+    watch: "Watch",
     try_lanes: Callable[[Attempt, np.ndarray, PyTree], PyTree],
 ) -> tuple[PyTree, int]:
     """Return plans of `num` cases after all attempts (searches), and the number of unsolved plans.
@@ -202,7 +137,7 @@ class Batch:
     planner: Planner
     chunk: int | None
     mesh: Mesh
-    watch: Watch
+    watch: "Watch"
 
     compiles_quickly: bool  # for a batch of few cases on a CPU
 
@@ -251,7 +186,7 @@ class Batch:
 
         `before` are the plans of earlier attempts. Without such plans the limit ends nothing.
         """
-        watch, spec = self.watch, lane_sharding(self.mesh)
+        watch = self.watch
         threads, lanes = 1, (cases, score_of(attempt, cases, before))
         if len(calls) > 1 and is_one_cpu(self.mesh):
             from planner_jax.host.machine import usable_cores  # small batches do not need it
@@ -265,7 +200,7 @@ class Batch:
             some, score = jax.tree.map(lambda leaf: leaf[index], lanes)
             if score is not None:
                 score = score.without(np.arange(index.size) >= num)
-            found, _ = self._solve(attempt, *jax.device_put((some, score), spec))
+            found, _ = self._solve(attempt, *place_lanes((some, score), self.mesh))
             return jax.block_until_ready(found) if threads > 1 or watch.waits else found
 
         if threads == 1:  # JAX returns before a result is ready, so the next call is prepared early

@@ -1,6 +1,7 @@
 """`plan`, for one case or a large batch on any devices, and `solve`, its pure counterpart."""
 
 import dataclasses
+import time
 from collections.abc import Callable, Sequence
 
 import jax
@@ -10,8 +11,9 @@ from jax import lax
 from jax.core import Tracer
 from jaxtyping import PyTree
 
+from planner_jax.core.checks import require_scalar
 from planner_jax.core.choices import require_size
-from planner_jax.core.compiled import with_own_precision
+from planner_jax.core.compiled import has_only_cpu, with_own_precision
 from planner_jax.core.errors import ArgumentError, ArgumentTypeError, NotOffered
 from planner_jax.core.origin import with_origin, without_origin
 from planner_jax.core.planner import CaseT, Kind, Planner, PlanT, require_fit
@@ -27,10 +29,75 @@ from planner_jax.core.protocol import (
 )
 from planner_jax.core.rules import Case, has_rules, require_shapes, require_sound
 from planner_jax.host.compile_cache import keep_compiled_programs
-from planner_jax.planning.batch import Progress, Watch, plan_batch, plan_on_host
 from planner_jax.planning.programs import solve_one
 
 _ARRAYS = (jax.Array, np.ndarray, np.generic)
+
+_QUIET = 1.0  # [s] least time between two progress reports of one round
+
+
+@dataclasses.dataclass(frozen=True)
+class Progress:
+    """Report of `plan` on the progress of an attempt (search); `str` formats it as one line."""
+
+    round: int  # number of this round, counted from 1
+    rounds: int  # greatest number of rounds that the planner makes
+    tried: int  # number of cases that this round has tried so far
+    cases: int  # number of cases of this round: all that earlier rounds left unsolved
+    seconds: float  # [s] time since the start of planning
+
+    def __str__(self) -> str:
+        return (
+            f"round {self.round} of at most {self.rounds}: {self.tried:,} of {self.cases:,} cases "
+            f"tried, after {self.seconds:.1f} s"
+        )
+
+
+class Watch:
+    """The clock of one call of `plan`: it reports progress and knows when the time limit passes.
+
+    Args:
+        time_limit: [s] time after the construction from which no search starts; None: no limit.
+        progress: function that receives a `Progress` for each report; None: no reports.
+
+    Raises:
+        TypeError: the time limit is not a number, or `progress` is not callable.
+        ValueError: the time limit is negative or NaN.
+    """
+
+    def __init__(
+        self, time_limit: float | None = None, progress: Callable[[Progress], object] | None = None
+    ) -> None:
+        if time_limit is not None:
+            if not require_scalar("time_limit", time_limit) >= 0.0:
+                raise ArgumentError("time_limit", ">= 0 s", time_limit)
+        if progress is not None and not callable(progress):
+            raise ArgumentTypeError("progress", "callable, such as print", progress)
+        self._start, self._limit, self._progress = time.monotonic(), time_limit, progress
+        self._reported = (0, 0.0)  # number of the attempt, and time [s], of the last report
+
+    @property
+    def waits(self) -> bool:
+        """Return whether the host waits for each call, as a time limit or progress reports need."""
+        return self._limit is not None or self._progress is not None
+
+    @property
+    def is_over(self) -> bool:
+        """True if the time limit has passed."""
+        return self._limit is not None and time.monotonic() - self._start >= self._limit
+
+    def report(self, planner: Planner, attempt: Attempt, tried: int, cases: int) -> None:
+        """Report progress at the start and end of a search, and else at most once a second."""
+        if self._progress is None:
+            return
+        seconds, rounds = time.monotonic() - self._start, tuple(planner.attempts)
+        own = rounds.index(attempt) if attempt in rounds else 0
+        place = getattr(attempt, "place", own) + 1  # a group of attempts knows its place
+        last_place, last = self._reported
+        if 0 < tried < cases and place == last_place and seconds - last < _QUIET:
+            return
+        self._reported = place, seconds
+        self._progress(Progress(place, max(len(rounds), place), int(tried), int(cases), seconds))
 
 
 def plan(
@@ -211,10 +278,7 @@ class Driver:
             plans = planner.plan_by(self, cases)
             return plans, is_unsolved(plans.status)
         attempts = attempts or planner.attempts_for(cases)
-        is_single = not self.is_pure and (cases.batch_shape != () or self.watch.waits)
-        attempts = planner.group_attempts(
-            attempts, cases, is_whole=self.is_pure, is_single=is_single
-        )
+        attempts = planner.group_attempts(attempts, cases, is_whole=self.is_pure)
         if self.is_pure:
             from planner_jax.planning.pure import plan_purely  # only compiled functions need it
 
@@ -222,10 +286,18 @@ class Driver:
             plans = plan_purely(planner, attempts, cases)
             return plans, is_unsolved(plans.status)
         if planner.kind is Kind.HOST:
+            from planner_jax.planning.batch import plan_on_host  # compiled programs do not need it
+
             return plan_on_host(planner, attempts, cases, self.watch)
         if cases.batch_shape == ():
             plans = _plan_one(planner, attempts, cases, self.watch)
             return plans, is_unsolved(int(plans.status))
+        if cases.batch_shape == (1,) and has_only_cpu():
+            case = jax.tree.map(lambda leaf: np.asarray(leaf)[0], cases)
+            plan = _plan_one(planner, attempts, case, self.watch)
+            return jax.tree.map(lambda leaf: leaf[None], plan), is_unsolved(plan.status[None])
+        from planner_jax.planning.batch import plan_batch  # single cases do not need it
+
         return plan_batch(planner, attempts, cases, self.chunk, self.devices, self.watch)
 
     def plan_again(

@@ -147,9 +147,14 @@ def run_per_device(mesh: Mesh, function: Callable, *specs: PartitionSpec) -> Cal
 def place_lanes(tree: PyTree, mesh: Mesh) -> PyTree:
     """Return the tree with its lanes (cases) divided equally among the devices of a mesh.
 
-    The arrays are committed to these devices, so that all attempts of a call of `plan` share
-    compiled programs: JAX compiles another program for uncommitted arrays.
+    They are committed to these devices, so that all attempts of a call of `plan` share compiled
+    programs. On the default device arrays stay as they are, since it takes time to commit them.
     """
+    default = jax.config.jax_default_device or jax.local_devices()[0]  # type: ignore[attr-defined]
+    if mesh.size == 1 and mesh.devices[0] == default:
+        leaves, here = jax.tree.leaves(tree), {default}
+        is_here = all(isinstance(leaf, Array) and leaf.devices() == here for leaf in leaves)
+        return tree if is_here else jax.device_put(tree)
     target = lane_sharding(mesh)
 
     def is_there(leaf: Array) -> bool:

@@ -17,8 +17,7 @@ from planner_jax.core.compiled import QUICK_OPTIONS
 from planner_jax.core.planner import Kind, Planner
 from planner_jax.core.protocol import Attempt, is_solved
 from planner_jax.host.machine import as_here
-from planner_jax.planning.batch import Watch
-from planner_jax.planning.plan import Driver
+from planner_jax.planning.plan import Driver, Watch
 from planner_jax.planning.plan import plan as plan_all
 from planner_jax.sims.loop import predict_balls
 from planner_jax.sims.loop_state import FlightState, Loop
