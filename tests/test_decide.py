@@ -10,7 +10,7 @@ from planner_jax.ball.flight import BallState
 from planner_jax.ball.target import BallPath
 from planner_jax.core.protocol import Status, is_solved, is_unsolved
 from planner_jax.optimise.settings import LbfgsConfig, Round
-from planner_jax.planning import plan as planning
+from planner_jax.planning import batch
 from planner_jax.planning.decided import DecidedPlanner, first_choice
 from planner_jax.planning.plan import plan
 from planner_jax.referee.catch import referee_catches
@@ -195,13 +195,13 @@ def test_later_rounds_are_for_cases_without_any_solved_order(kind, num, calls, p
     horizon = np.array(pairs.horizon)
     horizon[1, 1] = 0.7
     pairs = dataclasses.replace(pairs, horizon=horizon)
-    planned, plan_batch = [], planning.plan_batch
+    planned, plan_batch = [], batch.plan_batch
 
     def note_call(planner, attempts, cases, *where):
         planned.append((len(attempts), cases.order.shape[0]))
         return plan_batch(planner, attempts, cases, *where)
 
-    monkeypatch.setattr(planning, "plan_batch", note_call)
+    monkeypatch.setattr(batch, "plan_batch", note_call)
     plans = plan(by(Best(), kind(rounds=num * PLANNER.rounds[:1])), pairs)
     assert is_solved(np.delete(plans.status, [1, 2])).all()
     assert is_unsolved(plans.status[1]) and plans.status[2] == Status.TOO_FAR

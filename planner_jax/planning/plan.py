@@ -295,7 +295,8 @@ class Driver:
         if cases.batch_shape == (1,) and has_only_cpu():
             case = jax.tree.map(lambda leaf: np.asarray(leaf)[0], cases)
             plan = _plan_one(planner, attempts, case, self.watch)
-            return jax.tree.map(lambda leaf: leaf[None], plan), is_unsolved(plan.status[None])
+            plans = jax.tree.map(lambda leaf: np.array(leaf)[None], plan)
+            return plans, is_unsolved(plans.status)
         from planner_jax.planning.batch import plan_batch  # single cases do not need it
 
         return plan_batch(planner, attempts, cases, self.chunk, self.devices, self.watch)
