@@ -5,6 +5,7 @@ first one, and a new last hit is guessed. So every plan looks K hits ahead.
 """
 
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -110,6 +111,10 @@ class ReplanRally(OptimisedPlanner):
         own = {name: value for name, value in settings if name == "rounds"}
         planner = self.planner.with_settings(tuple(each for each in settings if each[0] not in own))
         return dataclasses.replace(self, planner=planner, **own)
+
+    def setting(self, name: str) -> Any:
+        """Return the value of a field of the planner of rallies."""
+        return self.planner.setting(name)
 
     def prepare(self, task: Replanning) -> ReplanRallyContext:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Return the data of the remaining hits, and the previous plan as a starting point."""
