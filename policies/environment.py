@@ -10,7 +10,6 @@ different numbers of targets.
 """
 
 import contextlib
-import functools
 import io
 from collections.abc import Mapping
 from typing import Any
@@ -25,6 +24,7 @@ with contextlib.redirect_stdout(io.StringIO()):  # hides the message that Warp i
 
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.protocol import is_solved
+from planner_jax.optimise.rows import Group, Table, load_group
 from planner_jax.optimise.settings import LbfgsConfig, Round
 from planner_jax.policies.observation import FEATURES, PER_TARGET, choice_of, observe
 from planner_jax.policies.settings import WEIGHTS
@@ -220,12 +220,12 @@ def evaluate_actions(cases: CatchCase, actions: Array, iterations: int) -> dict[
 
 def _plan(cases: CatchCase, choices: CatchChoice, iterations: int) -> tuple[CatchChoice, Any]:
     if not cases.optional:
-        return choices, ExactCatch().solve_lanes(cases.with_choice(choices), _attempt(iterations))
+        return choices, ExactCatch().solve_lanes(cases.with_choice(choices), _search(iterations))
     several = jax.vmap(in_several_lengths)(cases, jax.tree.map(lambda x: x[:, None], choices))
     num = several.times.shape[1]
     flat = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), several)
     tried = jax.tree.map(lambda leaf: jnp.repeat(leaf, num, axis=0), cases).with_choice(flat)
-    found = ExactCatch().solve_lanes(tried, _attempt(iterations))
+    found = ExactCatch().solve_lanes(tried, _search(iterations))
     each = jax.tree.map(lambda leaf: leaf.reshape(-1, num, *leaf.shape[1:]), (flat, found))
     # Each decision was also planned without its last catches. These variants are sorted by falling
     # number of catches, so that the first solved variant has the most catches.
@@ -233,9 +233,9 @@ def _plan(cases: CatchCase, choices: CatchChoice, iterations: int) -> tuple[Catc
     return jax.tree.map(lambda leaf: leaf[jnp.arange(len(best)), best], each)
 
 
-@functools.cache
-def _attempt(iterations: int) -> Round:
-    return Round(starts=1, solver=LbfgsConfig(max_steps=iterations))
+def _search(iterations: int) -> Table:
+    attempt = Round(starts=1, solver=LbfgsConfig(max_steps=iterations))
+    return load_group(ExactCatch(), Group.of((attempt,), (0,)))
 
 
 def weight_terms(terms: Mapping[str, Array], weights: Mapping[str, Any]) -> Array:

@@ -22,7 +22,7 @@ from jax import Array, lax
 from jax.custom_derivatives import SymbolicZero
 
 from planner_jax.core.arithmetic import reciprocal
-from planner_jax.core.compiled import has_only_cpu, traced_platform
+from planner_jax.lanes.kernels import is_on_gpu
 
 _NODES = 5  # number of nodes of the climb, and of the fall
 _ITERATIONS = 3  # number of times that the speed is computed from the rates
@@ -130,7 +130,7 @@ def _repeat_first(
     """Return time of the apex and speed after `_FIRST` iterations; on a CPU only if they help."""
     is_strong = drag * jnp.max(speed) > _WEAK
     found = top, speed
-    if has_only_cpu() or traced_platform() == "cpu":
+    if not is_on_gpu():
         last = jnp.where(is_strong, _FIRST, 0)
         advance = lambda state: (state[0] + 1, *improve(*state[1:]))  # noqa: E731
         state = lax.while_loop(lambda s: s[0] < last, advance, (jnp.zeros_like(last), *found))

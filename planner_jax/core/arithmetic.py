@@ -35,6 +35,12 @@ def to_host(value: object) -> Numbers:
     return value if isinstance(value, Tracer) else np.asarray(value)
 
 
+def float_type(tree: object) -> np.dtype:
+    """Return the type of the first array of floating-point numbers in a pytree."""
+    leaves = (x if hasattr(x, "dtype") else np.asarray(x) for x in jax.tree.leaves(tree))
+    return next(leaf.dtype for leaf in leaves if leaf.dtype.kind == "f")
+
+
 @jax.custom_jvp
 def reciprocal(x: Array) -> Array:
     """Return 1 / x for x (...) != 0; the derivative needs no second division."""

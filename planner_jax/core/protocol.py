@@ -3,6 +3,7 @@
 import dataclasses
 import enum
 import os
+from collections.abc import Sequence
 from typing import Protocol, Self, TypeVar, runtime_checkable
 
 import jax
@@ -199,6 +200,10 @@ class Attempt:
         if self.within is not None:
             require_number("within", self.within, POSITIVE)
 
+    def place_among(self, attempts: Sequence["Attempt"]) -> int:
+        """Return its index among a planner's attempts, or 0 if it is none of them."""
+        return attempts.index(self) if self in attempts else 0
+
     @property
     def continues(self) -> bool:
         """Return whether the compiled search needs the numbers of the best plans so far."""
@@ -233,7 +238,7 @@ class Score:
 
     @classmethod
     def none(cls, batch: tuple[int, ...], dtype: np.dtype) -> "Score":
-        """Return NumPy numbers of cases without plans, than which every finite plan is better."""
+        """Return NumPy numbers of cases without plans; every finite plan is better."""
         unsolved = np.full(batch, Status.INFEASIBLE, np.int32)
         return cls(np.zeros(batch, dtype), np.full(batch, np.inf, dtype), unsolved)
 

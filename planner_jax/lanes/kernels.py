@@ -21,7 +21,7 @@ from jax import Array
 from jax.extend.core import JaxprEqn
 
 from planner_jax.core.choices import require_one_of
-from planner_jax.core.compiled import Treedef
+from planner_jax.core.compiled import Treedef, traced_platform
 
 SWITCH = "PLANNER_JAX_KERNELS"
 
@@ -50,6 +50,12 @@ def kernels() -> Kernels:
 def in_use() -> bool:
     """Return whether functions that JAX traces use CUDA kernels, which need Triton and a GPU."""
     return is_switched_on() and has_gpu() and _has_triton()
+
+
+def is_on_gpu() -> bool:
+    """Return whether the program that is being traced runs on a GPU."""
+    platform = traced_platform()
+    return has_gpu() if platform is None else platform != "cpu"
 
 
 def has_gpu() -> bool:

@@ -1,5 +1,6 @@
-"""Newton's method for many problems at once, of which those with most to gain continue."""
+"""Newton's method for many problems at once; problems with most to gain continue longest."""
 
+import functools
 import math
 from collections.abc import Callable
 
@@ -11,7 +12,7 @@ from jaxtyping import PyTree
 from planner_jax.lanes import over_lanes
 from planner_jax.optimise import newton
 from planner_jax.optimise.multistart import Optimum, optimum_of, with_stragglers
-from planner_jax.optimise.settings import Curvature, Curved, Evaluation, NewtonConfig
+from planner_jax.optimise.settings import Curvature, Evaluation, NewtonConfig
 
 
 def minimise_lanes(
@@ -29,34 +30,28 @@ def minimise_lanes(
     they are computed from `objective` by automatic differentiation.
     """
 
-    def advance(state: PyTree, contexts: PyTree, config: NewtonConfig, steps: int) -> PyTree:
-        @over_lanes
-        def step(state: PyTree, context: PyTree) -> PyTree:
-            own = lambda x: objective(x, context)  # noqa: E731
-            by_point = newton.by_products(own)
-            if curved is not None:
-                by_point = _curved_at(curved, context)
-            return newton.step(own, by_point, state, config)
+    def step(config: NewtonConfig, state: PyTree, context: PyTree) -> PyTree:
+        own = lambda x: objective(x, context)  # noqa: E731
+        by_point = (lambda x: curved(x, context)) if curved else newton.by_products(own)  # pyright: ignore[reportOptionalCall]
+        return newton.step(own, by_point, state, config)
 
-        return lax.fori_loop(0, steps, lambda _, s: step(s, contexts), state)
-
-    def search(state: PyTree) -> PyTree:
-        return lax.while_loop(
-            lambda s: jnp.any(newton.is_unfinished(s.numbers, config)),
-            lambda s: advance(s, contexts, config, 1),
-            state,
-        )
-
-    state = search(over_lanes(lambda start: newton.init(start, config))(starts))
+    advance = over_lanes(functools.partial(step, config))
+    state = lax.while_loop(
+        lambda s: jnp.any(newton.is_unfinished(s.numbers, config)),
+        lambda s: advance(s, contexts),
+        over_lanes(lambda start: newton.init(start, config))(starts),
+    )
     if config.stragglers is not None:
         share, steps, groups = config.stragglers
         longer, num = with_stragglers(config), math.ceil(share * starts.shape[-1])
+
+        advance_longer = over_lanes(functools.partial(step, longer))
 
         def next_group(progress: tuple[Array, PyTree]) -> tuple[Array, PyTree]:
             number, state = progress
             lanes = newton.most_to_gain(state.numbers, longer, num)
             some, own = jax.tree.map(lambda leaf: leaf[..., lanes], (state, contexts))
-            later = advance(some, own, longer, steps)
+            later = lax.fori_loop(0, steps, lambda _, s: advance_longer(s, own), some)
             place = lambda old, new: old.at[..., lanes].set(new)  # noqa: E731
             return number + 1, jax.tree.map(place, state, later)
 
@@ -66,7 +61,3 @@ def minimise_lanes(
 
         _, state = lax.while_loop(is_open, next_group, (jnp.zeros((), jnp.int32), state))
     return optimum_of(state, config)
-
-
-def _curved_at(curved: Callable[[Array, PyTree], Curvature], context: PyTree) -> Curved:
-    return lambda x: curved(x, context)

@@ -4,7 +4,7 @@ import abc
 import copy
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import Any, ClassVar, Self
+from typing import ClassVar, Self
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +12,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import PyTree
 
+from planner_jax.core.arithmetic import float_type
 from planner_jax.core.checks import require_numeric
 from planner_jax.core.choices import EFFORTS, require_one_of
 from planner_jax.core.planner import CaseT, Planner, PlanT
@@ -192,8 +193,7 @@ class OptimisedPlanner(Planner[CaseT, PlanT], abc.ABC):
         cases = jax.tree.map(jnp.asarray, cases)
         table = self.load_attempt(attempt, cases) if isinstance(attempt, Round) else attempt
         if before is None:
-            dtype = next(x.dtype for x in jax.tree.leaves(cases) if jnp.issubdtype(x, jnp.floating))
-            before = Score.none(cases.batch_shape, dtype)
+            before = Score.none(cases.batch_shape, float_type(cases))
         return solve_table(self, table, cases, jax.tree.map(jnp.asarray, before))
 
     def settle(
@@ -209,7 +209,7 @@ class OptimisedPlanner(Planner[CaseT, PlanT], abc.ABC):
         """Return a copy of the planner with the field values in `settings`, pairs (name, value)."""
         return dataclasses.replace(self, **dict(settings))  # type: ignore[type-var]
 
-    def setting(self, name: str) -> Any:
+    def setting(self, name: str) -> PyTree:
         """Return the value of a field that `with_settings` changes."""
         return getattr(self, name)
 

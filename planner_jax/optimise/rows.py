@@ -10,13 +10,14 @@ can share a program are one `Group`, whose table `load_group` makes.
 import dataclasses
 import itertools
 from collections.abc import Hashable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jax import Array
+from jaxtyping import PyTree
 
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.protocol import Attempt
@@ -57,7 +58,7 @@ class Model:
     settings: Settings  # fields of the planner
     solver: Solver  # for L-BFGS, `max_steps` are the turns of `tiles.minimise_tile`
     varying: tuple[str, ...]  # fields of the planner that differ among its rows
-    # The indices of the variables among those of the finest planner; None: all of them.
+    # Indices of the searched variables among the variables of the finest planner; None: all.
     free: tuple[int, ...] | None
 
 
@@ -70,8 +71,8 @@ class Table:
     finest: Settings = struct.field(pytree_node=False)  # of the planner that decodes all plans
     starts: int = struct.field(pytree_node=False)  # greatest number of starting points of a case
     guesses: int = struct.field(pytree_node=False)  # number of guesses among which rows start
-    # Whether the number of iterations is that of the model's solver, for GPUs: the host then need
-    # not ask whether the loop has ended.
+    # Whether a GPU makes as many iterations as the model's solver states. The host then never waits
+    # to read whether the loop has ended.
     is_counted: bool = struct.field(pytree_node=False)
 
     @property
@@ -87,7 +88,7 @@ class Table:
         columns = iter(self.numbers.T)
         solver = tuple(next(columns) for _ in range(3))
         weights = {name: next(columns) for name in names}
-        fields: dict[str, Any] = {
+        fields: dict[str, PyTree] = {
             "solver": (solver[0].astype(np.int32), solver[1], solver[2].astype(np.int32))
         }
         for name in [field.name for field in dataclasses.fields(Row)][2:]:
@@ -108,6 +109,10 @@ class Group(Attempt):
     place: int = 0  # index of its first round among the planner's attempts
     # Its table in float32 and float64, after the first use.
     tables: dict[bool, Table] = dataclasses.field(default_factory=dict, compare=False, repr=False)
+
+    def place_among(self, attempts: Sequence[Attempt]) -> int:
+        """Return the index of its first round among a planner's attempts."""
+        return self.place
 
     @property
     def continues(self) -> bool:
@@ -155,25 +160,18 @@ def group_rounds(
     last groups of each planner are stored.
     """
     key, known = (rounds, places, is_whole), _RECENT.get(id(planner))
-    if known is None or known[0] is not planner or known[1] != key:
-        if len(_RECENT) >= _MOST_RECENT:
-            _RECENT.clear()
-        known = _RECENT[id(planner)] = planner, key, _group_rounds(planner, *key)
-    return known[2]
-
-
-def _group_rounds(
-    planner: "OptimisedPlanner",
-    rounds: tuple[Round, ...],
-    places: tuple[int, ...],
-    is_whole: bool,
-) -> list[Group]:
+    if known is not None and known[0] is planner and known[1] == key:
+        return known[2]
     groups: list[Group] = []
     for part in _divide(planner, rounds, is_whole):
         own, made = rounds[part.start : part.stop], [k for k in places if k in part]
-        for some in [made][: len(made)] if is_whole else [[k] for k in made]:
+        together = [made] if is_whole and made else [[k] for k in made]
+        for some in together:
             indices = tuple(k - part.start for k in some)
             groups.append(Group.of(own, indices, is_whole, not groups, some[0]))
+    if len(_RECENT) >= _MOST_RECENT:
+        _RECENT.clear()
+    _RECENT[id(planner)] = planner, key, groups
     return groups
 
 
@@ -244,13 +242,11 @@ def _make_table(planner: "OptimisedPlanner", group: Group) -> Table:
         unmade = dataclasses.replace(lists[0][0], within=-np.inf, improves=False)
         rows += [unmade] * (most - len(rows))
     lasts = [each.all_stages[-1] for each in group.rounds]
-    sizes = [planner.with_settings(stage.settings).size for stage in lasts]
-    finest = lasts[sizes.index(max(sizes))].settings
+    finest = max(lasts, key=lambda stage: planner.with_settings(stage.settings).size).settings
     numbers = np.array([[float(x) for x in jax.tree.leaves(row)] for row in rows])
     is_gpu, turns = kernels.has_gpu(), models[lasts[0]].solver.max_steps
-    is_double = jax.config.jax_enable_x64  # type: ignore[attr-defined]
     return Table(
-        numbers=numbers.astype(np.float64 if is_double else np.float32),
+        numbers=numbers,
         models=tuple(dict.fromkeys(models.values())),
         finest=finest,
         starts=max(int(row.width) for row in every),
@@ -260,11 +256,11 @@ def _make_table(planner: "OptimisedPlanner", group: Group) -> Table:
 
 
 def list_models(planner: "OptimisedPlanner", stages: Sequence[Stage]) -> dict[Stage, Model]:
-    """Return the model of each stage, of which stages with equal constants share one.
+    """Return the model of each stage; stages with equal constants share a model.
 
     Raises:
-        ArgumentError: the variables of a stage are neither those of the finest planner nor those
-            that it does not hold constant in a search with `frozen` variables.
+        ArgumentError: a stage has fewer variables than the finest planner, and they are not the
+            variables that remain when this planner's `held` variables are constant.
     """
     own = {stage: planner.with_settings(stage.settings) for stage in stages}
     groups: dict[tuple, list[Stage]] = {}
@@ -284,9 +280,8 @@ def list_models(planner: "OptimisedPlanner", stages: Sequence[Stage]) -> dict[St
             held = finest.held
             free = () if held is None else tuple(np.flatnonzero(~held).tolist())
             if len(free) != first.size:
-                raise ArgumentError(
-                    "rounds", "whose variables are those of the finest one that are not held"
-                )
+                rule = "of stages that search all variables, or all that are not `held`"
+                raise ArgumentError("rounds", rule, shown="")
         pairs, solver = tuple(settings.items()), group[0].solver
         if isinstance(solver, LbfgsConfig):  # the rows have the numbers
             most = min(_TURNS, *(stage.solver.max_steps for stage in group))

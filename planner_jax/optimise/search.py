@@ -15,10 +15,9 @@ from flax import struct
 from jax import Array, lax
 from jaxtyping import PyTree
 
-from planner_jax.core.compiled import traced_platform
 from planner_jax.core.protocol import Score, is_better, is_solved, is_unsolved
 from planner_jax.core.rules import has_rules, is_sound
-from planner_jax.lanes import kernels, over_lanes
+from planner_jax.lanes import over_lanes
 from planner_jax.optimise.multistart import (
     Optimum,
     minimise,
@@ -28,7 +27,7 @@ from planner_jax.optimise.multistart import (
     put_lanes_last,
 )
 from planner_jax.optimise.planner import OptimisedPlanner
-from planner_jax.optimise.rows import Model, Number, Row, Table
+from planner_jax.optimise.rows import Model, Row, Table
 from planner_jax.optimise.settings import Evaluation, LbfgsConfig
 
 
@@ -43,11 +42,10 @@ class Item:
 def solve_table(planner: OptimisedPlanner, table: Table, cases: PyTree, before: Score) -> PyTree:
     """Return the best plans of B cases over the rows of a table; pure.
 
-    `before` has the numbers of the plans (B,) that earlier attempts found, of which a new plan must
-    be better. Where none is, cost, violation and status are those of `before`, and all other arrays
-    of the plan are zero.
+    `before` has the numbers (B,) of the plans that earlier attempts found. Where no new plan is
+    better, the result has these numbers, and its other arrays are not meaningful.
     """
-    search = Search(planner, planner.with_settings(table.finest), table, table.rows)
+    search = Search(planner, planner.with_settings(table.finest), table)
     if table.is_plain:
         return search.once(cases, before)
     from planner_jax.optimise.tiles import solve_in_tiles  # first attempts do not need it
@@ -62,11 +60,10 @@ class Search:
     planner: OptimisedPlanner
     finest: OptimisedPlanner  # prepares cases, guesses and decodes for all models
     table: Table
-    rows: Row  # leaves (R,)
 
     def once(self, cases: PyTree, before: Score) -> PyTree:
         """Search once for each case, by a table of one row, without tiles."""
-        row = jax.tree.map(lambda column: column[0], self.rows)
+        row = jax.tree.map(lambda column: column[0], self.table.rows)
         lanes = put_lanes_last(cases)
         index = jnp.broadcast_to(row.first, cases.batch_shape)
         _, plan = self.run(row, lanes, index, None)
@@ -93,10 +90,8 @@ class Search:
             return jnp.sum(jnp.where(is_own, points, 0.0), axis=0)
 
         old = None if before is None else before.optimum
-        stay = lambda *_: old.point if old else index  # noqa: E731
-        is_start = None if before is None else row.starts
-        points = _if_starts(is_start, over(guess), stay, contexts, index)
-        run = functools.partial(_minimise, self.planner, self.table, row, before is None)
+        points = self._if_starts(row, over(guess), old and old.point, contexts, index)
+        run = functools.partial(self._minimise, row)
         loops = [functools.partial(run, model) for model in self.table.models]
         given = points, inputs, contexts, index
         found = loops[0](*given) if len(loops) == 1 else lax.switch(row.model, loops, *given)
@@ -108,6 +103,66 @@ class Search:
         evaluation = dataclasses.replace(found.evaluation, violation=plan.violation)
         found = dataclasses.replace(found, evaluation=evaluation)
         return Item(found, plan.status), plan
+
+    def _if_starts(self, row: Row, function: Callable, otherwise: PyTree, *args: PyTree) -> PyTree:
+        """Return a function's result if a row is the first one of a round, else an array."""
+        if self.table.is_plain:
+            return function(*args)
+        return lax.cond(row.starts, function, lambda *_: otherwise, *args)
+
+    def _minimise(
+        self,
+        row: Row,
+        model: Model,
+        starts: Array,
+        inputs: Array,
+        contexts: PyTree,
+        index: Array,
+    ) -> Optimum:
+        """Minimise from points (n, lanes) of the finest model."""
+        weights = {name: row.weights[name] for name in model.varying}
+        planner = self.planner.with_settings(model.settings).with_weights(weights)
+        solver = model.solver
+        size, free = len(starts), None if model.free is None else jnp.array(model.free)
+        if free is not None:
+            starts = starts[free]
+
+        def select(start: Array, inputs: Array, context: PyTree, index: Array) -> Array:
+            return jnp.where(index == 0, planner.first_start(start, inputs, context), start)
+
+        starts = self._if_starts(row, over(select), starts, starts, inputs, contexts, index)
+        held = None if planner.held is None else row.frozen & planner.held
+
+        def objective(point: Array, given: tuple[Array, PyTree]) -> Evaluation:
+            start, context = given
+            if held is not None:
+                point = jnp.where(held, start, point)
+            return planner.objective(point, context)
+
+        given = starts, contexts
+        if isinstance(solver, LbfgsConfig) and solver.max_steps > 0:
+            config = jax.tree.unflatten(jax.tree.structure(solver), row.solver)
+            if self.table.is_plain and starts.shape[-1] == 1:
+                alone = lambda x, given: minimise(lambda x: objective(x, given), x, config)  # noqa: E731
+                found = over(alone)(starts, given)
+            else:
+                from planner_jax.optimise.tiles import minimise_tile  # single cases do not need it
+
+                found = minimise_tile(
+                    objective, starts, given, config, solver.max_steps, self.table
+                )
+        elif isinstance(solver, LbfgsConfig):
+            stay = lambda x, given: optimum_at(x, objective(x, given), solver)  # noqa: E731
+            found = over(stay)(starts, given)
+        else:
+            from planner_jax.optimise.newton_lanes import minimise_lanes  # few searches need it
+
+            curved = lambda x, given: planner.curvature_at(x, given[1])  # noqa: E731
+            found = minimise_lanes(objective, starts, given, solver, curved)
+        if free is None:
+            return found
+        point = jnp.zeros((size, *found.point.shape[1:]), found.point.dtype)
+        return dataclasses.replace(found, point=point.at[free].set(found.point))
 
 
 def over(function: Callable) -> Callable:
@@ -127,70 +182,3 @@ def find_due(row: Row, score: Score, is_usable: Array | bool) -> Array:
     again = is_unsolved(score.status) & (score.violation <= row.within)
     again = (again | is_solved(score.status) & row.improves) & is_usable
     return again | row.is_first & is_unsolved(score.status)
-
-
-def _if_starts(starts: Number | None, then: Callable, otherwise: Callable, *args: PyTree) -> Array:
-    """Return one of two functions' results by whether a row is the first of a round; None: yes."""
-    return then(*args) if starts is None else lax.cond(starts, then, otherwise, *args)
-
-
-def is_on_gpu() -> bool:
-    """Return whether the program that is being traced runs on a GPU."""
-    platform = traced_platform()
-    return kernels.has_gpu() if platform is None else platform != "cpu"
-
-
-def _minimise(
-    own: OptimisedPlanner,
-    table: Table,
-    row: Row,
-    is_plain: bool,
-    model: Model,
-    starts: Array,
-    inputs: Array,
-    contexts: PyTree,
-    index: Array,
-) -> Optimum:
-    """Minimise from points (n, lanes) of the finest model."""
-    weights = {name: row.weights[name] for name in model.varying}
-    planner, solver = own.with_settings(model.settings).with_weights(weights), model.solver
-    size, free = len(starts), None if model.free is None else jnp.array(model.free)
-    if free is not None:
-        starts = starts[free]
-
-    def select(start: Array, inputs: Array, context: PyTree, index: Array) -> Array:
-        return jnp.where(index == 0, planner.first_start(start, inputs, context), start)
-
-    keep = lambda starts, *_: starts  # noqa: E731
-    is_start = None if is_plain else row.starts
-    starts = _if_starts(is_start, over(select), keep, starts, inputs, contexts, index)
-    held = None if planner.held is None else row.frozen & planner.held
-
-    def objective(point: Array, given: tuple[Array, PyTree]) -> Evaluation:
-        start, context = given
-        if held is not None:
-            point = jnp.where(held, start, point)
-        return planner.objective(point, context)
-
-    given = starts, contexts
-    if isinstance(solver, LbfgsConfig) and solver.max_steps > 0:
-        config = jax.tree.unflatten(jax.tree.structure(solver), row.solver)
-        if table.is_plain and starts.shape[-1] == 1:
-            alone = lambda x, given: minimise(lambda x: objective(x, given), x, config)  # noqa: E731
-            found = over(alone)(starts, given)
-        else:
-            from planner_jax.optimise.tiles import minimise_tile  # single cases do not need it
-
-            found = minimise_tile(objective, starts, given, config, solver.max_steps, table)
-    elif isinstance(solver, LbfgsConfig):
-        stay = lambda x, given: optimum_at(x, objective(x, given), solver)  # noqa: E731
-        found = over(stay)(starts, given)
-    else:
-        from planner_jax.optimise.newton_lanes import minimise_lanes  # few searches need it
-
-        curved = lambda x, given: planner.curvature_at(x, given[1])  # noqa: E731
-        found = minimise_lanes(objective, starts, given, solver, curved)
-    if free is None:
-        return found
-    point = jnp.zeros((size, *found.point.shape[1:]), found.point.dtype)
-    return dataclasses.replace(found, point=point.at[free].set(found.point))

@@ -13,7 +13,6 @@ Hessian. lambda^T cost_utheta is a part of the derivative of the cost's gradient
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -102,7 +101,7 @@ class Differentiated(OptimisedPlanner):
         """Return a copy with other values of some fields of the inner planner."""
         return dataclasses.replace(self, planner=self.planner.with_settings(settings))
 
-    def setting(self, name: str) -> Any:
+    def setting(self, name: str) -> PyTree:
         """Return the value of a field of the inner planner."""
         return self.planner.setting(name)
 

@@ -16,6 +16,7 @@ from jaxtyping import PyTree
 
 from planner_jax.core.protocol import Score, is_better, is_solved
 from planner_jax.core.rules import has_rules, is_sound
+from planner_jax.lanes.kernels import is_on_gpu
 from planner_jax.lanes.packing import Packing
 from planner_jax.optimise import lbfgs
 from planner_jax.optimise.multistart import (
@@ -26,7 +27,7 @@ from planner_jax.optimise.multistart import (
     start_at,
 )
 from planner_jax.optimise.rows import Row, Table
-from planner_jax.optimise.search import Item, Search, find_due, is_on_gpu, over
+from planner_jax.optimise.search import Item, Search, find_due, over
 from planner_jax.optimise.settings import Evaluation, LbfgsConfig
 
 # Greatest number of lanes that run together; a tile lasts until its slowest lane ends.
@@ -50,7 +51,7 @@ def solve_in_tiles(search: Search, cases: PyTree, before: Score) -> PyTree:
         return (lax.cond(jnp.any(due), run, lambda x: x, found), due), None
 
     state = (of_plans.zeros(num), before, of_items.zeros(num * starts)), jnp.ones(num, bool)
-    (found, _), _ = lax.scan(take_row, state, search.rows)
+    (found, _), _ = lax.scan(take_row, state, search.table.rows)
     plans = put_lanes_first(of_plans.unpack(found[0]))
     score = found[1]
     return plans.replace(cost=score.cost, violation=score.violation, status=score.status)
@@ -98,9 +99,8 @@ def _run(
         is_new = is_own & row.writes
         is_new &= row.is_first | is_better(plan, _take(score, owner))
         target = jnp.where(is_new, owner, num)
-        later = Score(plan.cost, plan.violation, plan.status)
         best = _put(best, target, of_plans.pack(plan))
-        score = _put(score, target, later)
+        score = _put(score, target, Score.of(plan))
         items = _put(items, jnp.where(is_own, index, num * starts), of_items.pack(item))
         return done + tile, (best, score, items)
 

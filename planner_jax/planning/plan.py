@@ -91,8 +91,7 @@ class Watch:
         if self._progress is None:
             return
         seconds, rounds = time.monotonic() - self._start, tuple(planner.attempts)
-        own = rounds.index(attempt) if attempt in rounds else 0
-        place = getattr(attempt, "place", own) + 1  # a group of attempts knows its place
+        place = attempt.place_among(rounds) + 1
         last_place, last = self._reported
         if 0 < tried < cases and place == last_place and seconds - last < _QUIET:
             return
@@ -215,8 +214,9 @@ def solve(planner: Planner[CaseT, PlanT], cases: CaseT) -> PlanT:
     """Plan cases as a pure function, for compiled functions, `vmap` and `scan`.
 
     Each attempt (search) after the first is made at all cases of a batch if one is unsolved. `plan`
-    removes solved cases from the batch, and is faster where few cases are left. On a CPU, hits,
-    catches and rallies are also removed here, except for attempts that use Newton's method.
+    removes solved cases from the batch, and is faster where few cases are left. Planners that
+    minimise by L-BFGS or Newton's method, such as those of hits, catches and rallies, also search
+    only the unsolved cases here.
 
     Args:
         planner: as for `plan`.
@@ -292,7 +292,7 @@ class Driver:
         if cases.batch_shape == ():
             plans = _plan_one(planner, attempts, cases, self.watch)
             return plans, is_unsolved(int(plans.status))
-        if cases.batch_shape == (1,) and has_only_cpu():
+        if cases.batch_shape == (1,) and has_only_cpu() and self.devices is None:
             case = jax.tree.map(lambda leaf: np.asarray(leaf)[0], cases)
             plan = _plan_one(planner, attempts, case, self.watch)
             plans = jax.tree.map(lambda leaf: np.array(leaf)[None], plan)

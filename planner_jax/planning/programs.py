@@ -19,6 +19,7 @@ from jax import Array
 from jax.sharding import Mesh, NamedSharding, PartitionSpec, Sharding, SingleDeviceSharding
 from jaxtyping import PyTree
 
+from planner_jax.core.arithmetic import float_type
 from planner_jax.core.compiled import QUICK_OPTIONS, Fixed, Options, trace_for
 from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import Attempt, Score, is_unsolved, mark_bad_input
@@ -196,9 +197,7 @@ def score_of(attempt: Attempt, cases: PyTree, plans: PyTree) -> Score | None:
         return None
     if plans is not None:
         return Score.of(plans)
-    leaves = (leaf.dtype for leaf in jax.tree.leaves(cases))
-    dtype = next(dtype for dtype in leaves if np.issubdtype(dtype, np.floating))
-    return Score.none(cases.batch_shape, jax.dtypes.canonicalize_dtype(dtype))
+    return Score.none(cases.batch_shape, jax.dtypes.canonicalize_dtype(float_type(cases)))
 
 
 class PerDevice:

@@ -10,7 +10,7 @@ from jax import Array
 from jax.core import Tracer
 from jaxtyping import PyTree
 
-from planner_jax.core.arithmetic import Numbers, to_host
+from planner_jax.core.arithmetic import Numbers, float_type, to_host
 from planner_jax.core.checks import numbers_of, require_kind
 from planner_jax.core.compiled import with_own_precision
 from planner_jax.core.errors import ArgumentError
@@ -44,9 +44,7 @@ def check_elapsed(cases: Case, elapsed: PyTree) -> Numbers:
         TypeError: `elapsed` is not a number.
         ValueError: `elapsed` is negative, not finite, or of another shape.
     """
-    dtypes = (to_host(leaf).dtype for leaf in jax.tree.leaves(cases))
-    dtype = next(dtype for dtype in dtypes if dtype.kind == "f")
-    elapsed = numbers_of("elapsed", elapsed, cases.batch_shape, ()).astype(dtype)
+    elapsed = numbers_of("elapsed", elapsed, cases.batch_shape, ()).astype(float_type(cases))
     if isinstance(elapsed, Tracer):
         return jnp.where((elapsed >= 0.0) & (elapsed < np.inf), elapsed, np.nan)
     # For a single number, minimum and maximum take a third of the time that `np.all` takes.

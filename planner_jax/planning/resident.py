@@ -15,6 +15,7 @@ from jax import Array
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import PyTree
 
+from planner_jax.core.arithmetic import float_type
 from planner_jax.core.protocol import (
     Attempt,
     Score,
@@ -97,8 +98,9 @@ class ResidentBatch(Batch):
         return _join_locally(mesh, parts, share)
 
     def _none(self, attempt: Attempt, cases: PyTree) -> Score | None:
-        score = score_of(attempt, cases, None)
-        return score and _place_none(self.mesh, count_lanes(cases), score.cost.dtype)
+        if not attempt.continues:
+            return None
+        return _place_none(self.mesh, count_lanes(cases), float_type(cases))
 
 
 @functools.lru_cache(maxsize=64)

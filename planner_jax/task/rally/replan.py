@@ -5,13 +5,13 @@ first one, and a new last hit is guessed. So every plan looks K hits ahead.
 """
 
 import dataclasses
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jax import Array
+from jaxtyping import PyTree
 from numpy.typing import ArrayLike
 
 from planner_jax.ball.flight import BallState
@@ -112,7 +112,7 @@ class ReplanRally(OptimisedPlanner):
         planner = self.planner.with_settings(tuple(each for each in settings if each[0] not in own))
         return dataclasses.replace(self, planner=planner, **own)
 
-    def setting(self, name: str) -> Any:
+    def setting(self, name: str) -> PyTree:
         """Return the value of a field of the planner of rallies."""
         return self.planner.setting(name)
 
