@@ -1,37 +1,43 @@
 """The compiled programs of default planners: their equations and compile times.
 
+    python -m benchmarks.compilation [--tasks "hit,catch throws"] [--num 64] [--out DIR]
+
 A program is a function that JAX compiles. The table shows the size of each program, and how long
-its compilation takes without the cache on the disk.
+its compilation takes without the cache on the disk, for four calls: `pj.plan` of one case and of a
+batch, and `jax.jit` of `pj.solve` for one case, without and with `pj.quick_options()`. The CPU time
+of the first call includes tracing, compiling and planning.
 """
 
 import collections
 import contextlib
 import dataclasses
+import functools
 import re
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import jax
 import numpy as np
 
 from planner_jax.benchmarks.run import Bench, argument_parser, begin
+from planner_jax.core.compiled import quick_options
 from planner_jax.core.protocol import take
 from planner_jax.core.registry import task_named
-from planner_jax.planning.plan import plan
+from planner_jax.planning.plan import plan, solve
 
 BATCH = 64  # number of cases of the batch whose programs are listed
 # Tasks whose default planners are examined, as "TASK" or "TASK SUITE": the suite is the family of
 # random cases that are planned, by default the first of the task.
-EXAMINED = ("hit", "catch throws", "catch triangle3", "intercept hard", "block")
+EXAMINED = ("hit", "catch throws", "catch triangle3", "rally", "intercept hard", "block")
 _SMALL = 0.05  # [s] programs that compile faster have no row, and only count in the sums
 # NAME of JAX's event /jax/core/compile/NAME_duration -> field of `Program` that sums its durations.
 _EVENTS = dict(jaxpr_trace="tracing", jaxpr_to_mlir_module="lowering", backend_compile="compiling")
 _HEAD = (
-    "| planner | cases | program | versions | equations | tracing [s] | lowering [s] "
-    "| compiling [s] | first plan [s] |",
-    "|---|---|---|---|---|---|---|---|---|",
+    "| planner | call | cases | program | versions | equations | tracing [s] | lowering [s] "
+    "| compiling [s] | first call, CPU [s] |",
+    "|---|---|---|---|---|---|---|---|---|---|",
 )
 
 
@@ -76,19 +82,22 @@ def record_programs() -> Iterator[dict[str, Program]]:
         del programs[name]
 
 
-def format_rows(planner: str, num: int, seconds: float, programs: dict[str, Program]) -> list[str]:
-    """Format the table rows of one planner: a row for each slow program, then a row of sums.
+def format_rows(
+    planner: str, call: str, num: int, seconds: float, programs: dict[str, Program]
+) -> list[str]:
+    """Format the table rows of one call: a row for each slow program, then a row of sums.
 
-    `num` is the number of cases that were planned together, and `seconds` how long the first plan
-    took. A program that compiles in less than 0.05 s has no row of its own.
+    `num` is the number of cases that were planned together, and `seconds` the CPU time of the first
+    call. A program that compiles in less than 0.05 s has no row of its own.
     """
     columns = zip(*map(dataclasses.astuple, programs.values()), strict=True)
     shown = [row for row in programs.items() if row[1].compiling >= _SMALL]
     shown.sort(key=lambda row: -row[1].compiling)
     rows = [*shown, ("all", Program(*map(sum, columns)))]
     return [
-        f"| {planner} | {num} | {name} | {made.versions} | {made.equations:,} | {made.tracing:.1f} "
-        f"| {made.lowering:.1f} | {made.compiling:.1f} | {f'{seconds:.1f}' * (name == 'all')} |"
+        f"| {planner} | {call} | {num} | {name} | {made.versions} | {made.equations:,} "
+        f"| {made.tracing:.1f} | {made.lowering:.1f} | {made.compiling:.1f} "
+        f"| {f'{seconds:.1f}' * (name == 'all')} |"
         for name, made in rows
     ]
 
@@ -104,19 +113,30 @@ def main() -> None:
 
 
 def measure(bench: Bench, tasks: Sequence[str], size: int) -> None:
-    """Print the programs of each task's default planner, for one case and for a batch."""
+    """Print the programs of each task's default planner, for each kind of call."""
     jax.config.update("jax_enable_compilation_cache", False)
     bench.say(*_HEAD)
     for name in tasks:
         task, *suite = name.split()
+        planner, judge = task_named(task).planner(), task_named(task).judge
         batch = jax.tree.map(np.asarray, task_named(task).draw(size, *suite))
-        for num, cases in ((1, take(batch, 0)), (size, batch)):
-            start = time.perf_counter()
+        solve_one = functools.partial(solve, planner)
+        quick = jax.jit(solve_one, compiler_options=quick_options())
+        calls: list[tuple[str, int, Callable]] = [
+            ("pj.plan", 1, functools.partial(plan, planner)),
+            ("pj.plan", size, functools.partial(plan, planner)),
+            ("jit(pj.solve)", 1, jax.jit(solve_one)),
+            ("jit(pj.solve), quick", 1, quick),
+        ]
+        for call, num, function in calls:
+            cases = take(batch, 0) if num == 1 else batch
+            jax.clear_caches()
+            start = time.process_time()
             with record_programs() as programs:
-                plans = jax.block_until_ready(plan(task_named(task).planner(), cases))
-            seconds = time.perf_counter() - start
-            bench.say(*format_rows(name, num, seconds, programs))
-            bench.count(np.atleast_1d(task_named(task).judge(cases, plans).success))
+                plans = jax.block_until_ready(function(cases))
+            seconds = time.process_time() - start
+            bench.say(*format_rows(name, call, num, seconds, programs))
+            bench.count(np.atleast_1d(judge(cases, plans).success))
 
 
 if __name__ == "__main__":

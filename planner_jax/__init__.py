@@ -11,7 +11,8 @@ other installed packages register. Every task has the functions `case`, `draw`, 
 `judge`. These functions apply to every task:
 
 * `plan`: plans one case or a batch, on all devices; `solve`: plans inside `jax.jit` or `jax.vmap`
-* `keep_compiled_programs`: stores on disk programs that are compiled before the first plan
+* `keep_compiled_programs`: stores on disk programs that are compiled before the first plan;
+  `quick_options`: compiler options with which loops over single cases compile faster on a CPU
 * `replan`: updates a plan while a robot executes it
 * `gradient`: differentiates one number of every plan by parts of its case; `optimal_plan`: a plan
   that `jax.grad` can differentiate, for use inside a loss function

@@ -7,6 +7,7 @@ from .ball.prediction import target_at as target_at
 from .ball.table import table_path as table_path
 from .ball.target import BallPath as BallPath
 from .ball.target import HarmonicPath as HarmonicPath
+from .core.compiled import quick_options as quick_options
 from .core.errors import ArgumentError as ArgumentError
 from .core.errors import CaseError as CaseError
 from .core.errors import PlannerJaxError as PlannerJaxError

@@ -14,12 +14,14 @@ def test_rows_show_slow_programs_and_sums_of_all():
         "refine": compilation.Program(2, 10_000, 1.0, 0.25, 7.96),
         "tiny": compilation.Program(3, 6, 0.0, 0.0, 0.04),
     }
-    assert compilation.format_rows("hit", 64, 11.31, programs) == [
-        "| hit | 64 | refine | 2 | 10,000 | 1.0 | 0.2 | 8.0 |  |",
-        "| hit | 64 | finish | 1 | 200 | 0.1 | 0.0 | 0.5 |  |",
-        "| hit | 64 | all | 6 | 10,206 | 1.1 | 0.3 | 8.5 | 11.3 |",
+    assert compilation.format_rows("hit", "pj.plan", 64, 11.31, programs) == [
+        "| hit | pj.plan | 64 | refine | 2 | 10,000 | 1.0 | 0.2 | 8.0 |  |",
+        "| hit | pj.plan | 64 | finish | 1 | 200 | 0.1 | 0.0 | 0.5 |  |",
+        "| hit | pj.plan | 64 | all | 6 | 10,206 | 1.1 | 0.3 | 8.5 | 11.3 |",
     ]
-    assert compilation.format_rows("hit", 1, 0.0, {})[0].startswith("| hit | 1 | all | 0 | 0 |")
+    assert compilation.format_rows("hit", "f", 1, 0.0, {})[0].startswith(
+        "| hit | f | 1 | all | 0 | 0 |"
+    )
 
 
 def test_programs_are_recorded_with_their_equations():
@@ -49,6 +51,12 @@ def test_the_programs_of_planners_are_listed_with_their_sums(tmp_path):
         jax.config.update("jax_enable_compilation_cache", usual)
     lines = (tmp_path / "run" / "table.md").read_text().splitlines()
     sums = [line for line in lines if "| all |" in line]
-    expected = [[f"| {name}", num] for name in ("hit", "catch throws") for num in "12"]
-    assert [line.split(" | ")[:2] for line in sums] == expected
-    assert all(int(line.split(" | ")[4].replace(",", "")) > 1000 for line in sums)
+    calls = (
+        ["pj.plan", "1"],
+        ["pj.plan", "2"],
+        ["jit(pj.solve)", "1"],
+        ["jit(pj.solve), quick", "1"],
+    )
+    expected = [[f"| {name}", *call] for name in ("hit", "catch throws") for call in calls]
+    assert [line.split(" | ")[:3] for line in sums] == expected
+    assert all(int(line.split(" | ")[5].replace(",", "")) > 1000 for line in sums)

@@ -11,13 +11,14 @@ import zstandard
 from planner_jax.cli import doctor
 from planner_jax.host import compile_cache
 
-# A call of `plan` with wrong arguments raises an error, but only after the cache is set up.
+# A call of `plan` or `solve` with wrong arguments raises an error, but only after the cache is set
+# up.
 SCRIPT = """
 from concurrent.futures import ThreadPoolExecutor
 import jax
 import planner_jax as pj
 def fail(_):
-    try: pj.plan(None, None)
+    try: pj.CALL(None, None)
     except (TypeError, AttributeError): pass
 list(ThreadPoolExecutor(4).map(fail, range(4)))
 hits = []
@@ -29,11 +30,12 @@ print(pj.keep_compiled_programs(), "/jax/compilation_cache/cache_hits" in hits)
 CONTENTS = (np.random.default_rng(1).bytes(300_000), b"short", bytes(100_000))
 
 
-def run(**environment):
-    """Compile a program in a new process; return its output without the line's end."""
+def run(call="plan", **environment):
+    """Compile a program in a new process after a `call`; return its output, without line's end."""
     usual = {name: text for name, text in os.environ.items() if not name.startswith("JAX_COMP")}
     usual.pop("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", None)
-    command, env = [sys.executable, "-c", SCRIPT], {**usual, **environment}
+    command = [sys.executable, "-c", SCRIPT.replace("CALL", call)]
+    env = {**usual, **environment}
     done = subprocess.run(command, env=env, capture_output=True, text=True, check=True)
     assert done.stderr == ""
     return done.stdout.strip()
@@ -44,6 +46,7 @@ def test_the_first_plan_of_a_process_uses_the_cache_of_the_user(tmp_path):
     assert run(XDG_CACHE_HOME=str(tmp_path)) == f"{folder} False"
     assert any(folder.iterdir())
     assert run(XDG_CACHE_HOME=str(tmp_path)) == f"{folder} True"
+    assert run("solve", XDG_CACHE_HOME=str(tmp_path)) == f"{folder} True"
 
 
 def test_a_folder_that_the_user_set_in_jax_is_used_instead(tmp_path):

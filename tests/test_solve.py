@@ -1,6 +1,7 @@
 """`pj.plan` with a toy planner: new searches for unsolved cases, padded batches and statuses."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -110,6 +111,51 @@ def test_chunks_and_padding_change_nothing():
     chunked = pj.plan(WellPlanner(), Well(goals), chunk=16)
     np.testing.assert_array_equal(whole.status, chunked.status)
     np.testing.assert_allclose(whole.point, chunked.point, rtol=1e-5, atol=1e-5)
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class ShiftedWellPlanner(WellPlanner):
+    """A planner whose goal is shifted by a number that may differ from lane to lane."""
+
+    rounds: tuple[Round, ...] = dataclasses.field(
+        default=WellPlanner.rounds, metadata={"static": True}
+    )
+    shift: Array | float = 0.0
+
+    def prepare(self, case):
+        return Well(case.goal + self.shift)
+
+
+def test_vmap_of_solve_is_one_batch():
+    goals = jnp.linspace(-1.0, 5.0, 24, dtype=jnp.float32)
+    solve = functools.partial(pj.solve, WellPlanner())
+    expected = jax.jit(solve)(Well(goals))
+    assert_same(jax.jit(jax.vmap(solve))(Well(goals)), expected)
+    by_two = jax.jit(lambda cases: jax.vmap(jax.vmap(solve))(cases))(Well(goals.reshape(4, 6)))
+    of_batches = jax.jit(jax.vmap(solve))(Well(goals.reshape(4, 6)))
+    for found in (by_two, of_batches):
+        assert_same(jax.tree.map(lambda x: x.reshape(24, *x.shape[2:]), found), expected)
+
+
+def test_vmap_over_planners_or_over_nothing_of_a_case():
+    shifts, case = np.float32([0.0, 0.5, 2.5]), Well(jnp.float32(1.0))
+    by_shift = lambda shift, case: pj.solve(ShiftedWellPlanner(shift=shift), case)  # noqa: E731
+    found = jax.jit(jax.vmap(by_shift, (0, None)))(shifts, case)
+    for k, shift in enumerate(shifts):
+        plan = by_shift(shift, case)
+        np.testing.assert_allclose(found.point[k], plan.point, rtol=1e-5)
+        assert found.status[k] == plan.status
+    both = jax.jit(jax.vmap(lambda x: (x, pj.solve(WellPlanner(), case))))(shifts)[1]
+    np.testing.assert_array_equal(both.status, pj.solve(WellPlanner(), case).status)
+
+
+def test_quick_options_are_of_this_jax_and_change_no_plan():
+    solve, cases = functools.partial(pj.solve, WellPlanner()), Well(jnp.asarray(GOALS))
+    quick = jax.jit(solve, compiler_options=pj.quick_options())
+    plans = [function(cases) for function in (quick, jax.jit(solve))]
+    np.testing.assert_array_equal(plans[0].status, plans[1].status)
+    np.testing.assert_allclose(plans[0].point, plans[1].point, rtol=1e-5, atol=1e-5)
 
 
 def test_all_chunks_are_computed_in_the_callers_type_of_numbers():

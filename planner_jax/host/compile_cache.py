@@ -33,8 +33,8 @@ def is_on() -> bool:
 def keep_compiled_programs() -> Path | None:
     """Let JAX write compiled programs to a folder on the disk and read them from there.
 
-    The first `pj.plan` of a process and all commands call this function. Call it yourself to store
-    programs that are compiled before the first plan. The folder is
+    The first `pj.plan` or `pj.solve` of a process and all commands call this function. Call it
+    yourself to store programs that are compiled before the first plan. The folder is
     JAX_COMPILATION_CACHE_DIR or JAX's option `jax_compilation_cache_dir` where one of them is set,
     else planner-jax/jax in the user's cache folder, which is limited to 2 GB. With the environment
     variable PLANNER_JAX_CACHE=off, JAX's options are unchanged.

@@ -213,10 +213,10 @@ def require_batch(cases: Case) -> int:
 def solve(planner: Planner[CaseT, PlanT], cases: CaseT) -> PlanT:
     """Plan cases as a pure function, for compiled functions, `vmap` and `scan`.
 
-    Each attempt (search) after the first is made at all cases of a batch if one is unsolved. `plan`
-    removes solved cases from the batch, and is faster where few cases are left. Planners that
-    minimise by L-BFGS or Newton's method, such as those of hits, catches and rallies, also search
-    only the unsolved cases here.
+    Planners that minimise by L-BFGS or Newton's method, such as those of hits, catches and rallies,
+    search only the unsolved cases of a batch again. For other planners each attempt (search) after
+    the first is made at all cases if one is unsolved. `vmap` of this function plans its lanes as
+    one batch. As for `plan`, compiled programs are stored on the disk.
 
     Args:
         planner: as for `plan`.
@@ -229,6 +229,7 @@ def solve(planner: Planner[CaseT, PlanT], cases: CaseT) -> PlanT:
         TypeError: the planner works on the host, or the result is differentiated: the derivative of
             a solver's iterations is not the derivative of the optimum.
     """
+    keep_compiled_programs()
     require_fit(planner, cases)
     require_pure(planner)
     require_shapes(cases)
@@ -241,7 +242,9 @@ def solve(planner: Planner[CaseT, PlanT], cases: CaseT) -> PlanT:
 @jax.custom_jvp
 def _solve(planner: PyTree, cases: PyTree) -> PyTree:
     """Return plans; a derivative of this function raises `TypeError`."""
-    return Driver(is_pure=True)(planner, cases)[0]
+    from planner_jax.planning.pure import plan_mapped  # only compiled functions need it
+
+    return plan_mapped(Driver(is_pure=True), planner, cases)
 
 
 @_solve.defjvp

@@ -8,11 +8,39 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
+from jax.custom_batching import custom_vmap
 from jaxtyping import PyTree
 
-from planner_jax.core.planner import Planner
+from planner_jax.core.planner import Drive, Planner
 from planner_jax.core.protocol import Attempt, is_solved, is_unsolved, select
 from planner_jax.planning.programs import score_of, solve_cases
+
+
+def plan_mapped(drive: Drive, planner: Planner, cases: PyTree) -> PyTree:
+    """Return plans by `drive`; `vmap` makes one batch of its lanes, where solved ones take no time.
+
+    If each lane has a planner of its own, `drive` is mapped over the lanes instead.
+    """
+
+    @custom_vmap
+    def plan_together(planner: PyTree, cases: PyTree) -> PyTree:
+        return drive(planner, cases)[0]
+
+    @plan_together.def_vmap
+    def _(size: int, is_mapped: Sequence[PyTree], planner: PyTree, cases: PyTree) -> tuple:
+        if any(jax.tree.leaves(is_mapped[0])):
+            axes = jax.tree.map(lambda each: 0 if each else None, tuple(is_mapped))
+            plans = jax.vmap(drive, axes, axis_size=size)(planner, cases)[0]
+        else:
+            spread = lambda x, own: x if own else jnp.broadcast_to(x, (size, *jnp.shape(x)))  # noqa: E731
+            cases = jax.tree.map(spread, cases, is_mapped[1])
+            inner = tuple(cases.batch_shape)[1:]  # the axis of a batch below `vmap`
+            flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[1 + len(inner) :]), cases)
+            plans = plan_together(planner, flat)
+            plans = jax.tree.map(lambda x: x.reshape(size, *inner, *x.shape[1:]), plans)
+        return plans, jax.tree.map(lambda _: True, plans)
+
+    return plan_together(planner, cases)
 
 
 def plan_purely(planner: Planner, attempts: Sequence[Attempt], cases: PyTree) -> PyTree:
