@@ -48,6 +48,7 @@ def test_rows_list_the_stages_of_all_rounds(task, programs, models):
     assert len(table.models) == models
     parts = tables_of(planner, cases, is_whole=False)
     assert len(parts) == len(planner.attempts) and parts[0].is_plain
+    assert len(parts[-1].models) == models  # apart by their numbers of nodes
     layouts = {(jax.tree.structure(each), each.numbers.shape) for each in parts}
     assert len(layouts) == programs
 

@@ -213,7 +213,7 @@ def test_a_later_round_takes_only_what_is_unsolved(monkeypatch):
     goals = np.full(300, 0.5, np.float32)
     goals[[7, -1]] = 3.5
     assert is_solved(pj.plan(WellPlanner(), Well(jnp.asarray(goals))).status).all()
-    assert sorted(sizes[:4]) == [16, 16, 16, 256] and sizes[4:] == [16]
+    assert sorted(sizes[:2]) == [128, 256] and sizes[2:] == [16]
 
 
 def retry_within(within):

@@ -32,7 +32,7 @@ BUCKETS = (16, 128, 1024, 8192, 65536)
 # GPU this number keeps all processors busy.
 _CPU_CHUNK, _GPU_CHUNK = 256, 65536
 # Numbers of lanes of a call, if the program of an attempt can hold fewer cases.
-_CPU_SIZES, _GPU_SIZES = (16, 256), (1024, 8192, 65536)
+_CPU_SIZES, _GPU_SIZES = (16, 128, 256), (1024, 8192, 65536)
 _GPU_BUSY = 8192  # least number of starts in one call that keeps a GPU busy
 _GPU_LEAST = 128  # least number of lanes of a call on a GPU; fewer lanes take the same time
 _SPARED = 8  # a smaller last call must save more than 1/8 of the lanes of all calls before it
@@ -80,9 +80,9 @@ def sizes_of(planner: Planner, attempt: Attempt, chunk: int | None, mesh: Mesh) 
     busy, is_cpu = _GPU_BUSY // attempt.starts, mesh.devices[0].platform == "cpu"
     if chunk is not None:
         return Sizes(chunk, busy)
-    if attempt.continues:  # one program for many cases, and one for few
+    if attempt.continues:
         few, *_, many = sizes = _CPU_SIZES if is_cpu else _GPU_SIZES
-        return Sizes(few if attempt.starts > 1 else many, 0 if is_cpu else busy, few, sizes)
+        return Sizes(few if attempt.starts > 1 else many, busy, few, sizes)
     if not is_cpu:
         return Sizes(max(_GPU_LEAST, _GPU_CHUNK // attempt.starts), busy, _GPU_LEAST)
     # If a core solves cases one after another, small chunks of cases keep all cores busy.
