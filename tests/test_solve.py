@@ -158,6 +158,17 @@ def test_quick_options_are_of_this_jax_and_change_no_plan():
     np.testing.assert_allclose(plans[0].point, plans[1].point, rtol=1e-5, atol=1e-5)
 
 
+@pytest.mark.parametrize(("nums", "least"), [((2, 9, 16), 16), ((17, 60, 128), 128)])
+def test_a_plan_has_the_same_bits_at_any_place_of_batches_that_share_a_program(nums, least):
+    goals = np.random.default_rng(3).permutation(np.linspace(-1.0, 5.0, least)).astype(np.float32)
+    whole = pj.plan(WellPlanner(), Well(goals))
+    assert len(set(is_solved(whole.status))) == 2  # late searches are made, too
+    for num in nums:
+        some = np.random.default_rng(num).permutation(least)[:num]
+        found = pj.plan(WellPlanner(), Well(goals[some]))
+        assert_same(found, jax.tree.map(lambda leaf, some=some: leaf[some], whole))
+
+
 def test_all_chunks_are_computed_in_the_callers_type_of_numbers():
     goals = np.pi / 4.0 * np.linspace(-1.0, 1.0, 64)
     with jax.enable_x64(True):

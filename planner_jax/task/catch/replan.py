@@ -10,7 +10,6 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
-from flax import struct
 from jax import Array
 from numpy.typing import ArrayLike
 
@@ -18,10 +17,9 @@ from planner_jax.ball.target import TargetPath
 from planner_jax.core.arithmetic import numpy_of, to_host
 from planner_jax.core.paths import require_path
 from planner_jax.optimise.chain_remainder import evaluate_pieces, fit_offsets
-from planner_jax.optimise.planner import OptimisedPlanner
 from planner_jax.optimise.settings import Evaluation, LbfgsConfig, Round
 from planner_jax.planning.replan import Replanning, check_elapsed, planned_state, resolve_argument
-from planner_jax.robot.heading import continue_heading
+from planner_jax.planning.replanner import ReplanContext, Replanner
 from planner_jax.robot.quadrotor import add_drag, body_z
 from planner_jax.task.catch.case import CatchCase
 from planner_jax.task.catch.context import CatchContext, targets_at
@@ -38,19 +36,9 @@ _BINOMIALS, _SHIFTS = polynomial.shift_basis(8)
 _TRIALS = (1.0, 0.2, 0.04)
 
 
-@struct.dataclass
-class ReplanContext:
-    """Data of a re-plan: the remaining catches, the previous plan, and the starting point."""
-
-    catch: CatchContext
-    task: Replanning
-    start: Array  # (n,), decision variables of the previous plan, fitted to the new targets
-    keep: Array  # () bool, whether the previous plan is returned because too little time is left
-
-
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
-class ReplanCatch(OptimisedPlanner):
+class ReplanCatch(Replanner[CatchPlan]):
     """A planner that re-plans catches from the previous plan, for `pj.replan`.
 
     The search starts at the remainder of the previous trajectory, sampled at the new waypoints. Its
@@ -66,7 +54,6 @@ class ReplanCatch(OptimisedPlanner):
     the real-time iteration of [Diehl2005]. One iteration usually suffices to keep all limits.
     """
 
-    case_type = Replanning
     plan_type = CatchPlan
     planner: ExactCatch = ExactCatch()
     rounds: tuple[Round, ...] = (
@@ -75,11 +62,6 @@ class ReplanCatch(OptimisedPlanner):
         Round(starts=3, solver=LbfgsConfig(max_steps=80)),
     )
     shortest: float = 0.05  # [s], least time to the next catch for which a new plan is made
-
-    @property
-    def inner(self) -> ExactCatch:
-        """The planner of catches that this planner uses, also for plans from scratch."""
-        return self.planner
 
     def begin(
         self,
@@ -125,19 +107,8 @@ class ReplanCatch(OptimisedPlanner):
         )
         return Replanning(case=left, previous=previous, elapsed=elapsed)
 
-    def prepare(self, task: Replanning) -> ReplanContext:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Return the remaining catches, and the previous plan as a starting point of the search."""
-        case = continue_heading(task.case, task.previous, task.elapsed)
-        task, context = dataclasses.replace(task, case=case), self.planner.prepare(case)
-        left = _segments(task)[1][0]
-        return ReplanContext(
-            catch=context,
-            task=task,
-            start=self._start(task, context),
-            keep=(left < self.shortest) | ~context.active[0],
-        )
-
-    def _start(self, task: Replanning, context: CatchContext) -> Array:
+    def start_from(self, task: Replanning, context: CatchContext) -> Array:
+        """Return the decision variables (n,) of the previous plan, fitted to the new targets."""
         planner, net = self.planner, task.case.net
         trajectory = task.previous.trajectory
         segments, times = _segments(task)
@@ -160,23 +131,20 @@ class ReplanCatch(OptimisedPlanner):
         offsets = fit_offsets(planner, trajectory, begins, durations, tails)
         return planner.encode(context, durations, tails, offsets)
 
-    def guesses(self, context: ReplanContext, num: int) -> Array:
-        """Return `num` starting points: the previous plan, then guesses for new catches."""
-        first = context.start[None]
-        if num == 1:
-            return first
-        return jnp.concatenate([first, self.planner.guesses(context.catch, num - 1)])
+    def _is_kept(self, context: ReplanContext) -> Array:
+        """Return whether too little time is left for a new plan, () bool."""
+        left = _segments(context.task)[1][0]
+        return (left < self.shortest) | ~context.inner.active[0]
 
     def objective(self, point: Array, context: ReplanContext) -> Evaluation:
         """Return cost and violation at `point`, or if too little time is left, of the old plan."""
-        return self.planner.objective(jnp.where(context.keep, context.start, point), context.catch)
+        return super().objective(jnp.where(self._is_kept(context), context.start, point), context)
 
     def decode(self, point: Array, context: ReplanContext) -> CatchPlan:
         """Return the plan at `point`, or if too little time is left, the old plan's remainder."""
-        plan = self.planner.decode(point, context.catch)
-        return jax.lax.cond(
-            context.keep, lambda: _remainder(context.task, context.catch), lambda: plan
-        )
+        plan = super().decode(point, context)
+        remainder = lambda: _remainder(context.task, context.inner)  # noqa: E731
+        return jax.lax.cond(self._is_kept(context), remainder, lambda: plan)
 
 
 def _segments(task: Replanning) -> tuple[Array, Array]:

@@ -9,9 +9,7 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
-from flax import struct
 from jax import Array
-from jaxtyping import PyTree
 from numpy.typing import ArrayLike
 
 from planner_jax.ball.flight import BallState
@@ -19,10 +17,9 @@ from planner_jax.core.arithmetic import Numbers, numpy_of, to_host
 from planner_jax.core.checks import require_kind
 from planner_jax.core.paths import require_beginning
 from planner_jax.optimise.chain_remainder import evaluate_pieces, fit_offsets
-from planner_jax.optimise.planner import OptimisedPlanner
-from planner_jax.optimise.settings import Evaluation, Round, Settings
+from planner_jax.optimise.settings import Round
 from planner_jax.planning.replan import Replanning, check_elapsed, planned_state, resolve_argument
-from planner_jax.robot.heading import continue_heading
+from planner_jax.planning.replanner import Replanner
 from planner_jax.robot.quadrotor import add_drag, net_thrust, tangent_basis
 from planner_jax.task.rally.case import RallyCase
 from planner_jax.task.rally.default_planner import ROUNDS, ExactRally, RallyContext
@@ -33,32 +30,18 @@ _MOST_SHARE = 0.98  # greatest distance of a place from its box's centre in a st
 _NEW_APEX, _NEW_THRUST = 0.5, 1.1  # of a new last hit, as in the first row of the planner's guesses
 
 
-@struct.dataclass
-class ReplanRallyContext:
-    """Data of a re-plan: the remaining hits, and the starting point from the previous plan."""
-
-    rally: RallyContext
-    start: Array  # (n,), values of the n decision variables
-
-
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
-class ReplanRally(OptimisedPlanner):
+class ReplanRally(Replanner[RallyPlan]):
     """A planner that re-plans rallies for `pj.replan`, from previous plans of `ExactRally`.
 
     A hit counts as done from its planned time on. The plan then continues with the next hits, and
     with as many new hits as are done. Then `ball` is the ball after the last contact.
     """
 
-    case_type = Replanning
     plan_type = RallyPlan
     planner: ExactRally = ExactRally()
     rounds: tuple[Round, ...] = ROUNDS
-
-    @property
-    def inner(self) -> ExactRally:
-        """The planner of rallies that plans what remains of each rally."""
-        return self.planner
 
     def begin(
         self,
@@ -106,22 +89,8 @@ class ReplanRally(OptimisedPlanner):
         now = dataclasses.replace(cases, ball=ball, ball_time=start, **news)
         return Replanning(case=now, previous=previous, elapsed=elapsed)
 
-    def with_settings(self, settings: Settings) -> "ReplanRally":
-        """Return a copy whose planner of rallies has the field values in `settings`."""
-        own = {name: value for name, value in settings if name == "rounds"}
-        planner = self.planner.with_settings(tuple(each for each in settings if each[0] not in own))
-        return dataclasses.replace(self, planner=planner, **own)
-
-    def setting(self, name: str) -> PyTree:
-        """Return the value of a field of the planner of rallies."""
-        return self.planner.setting(name)
-
-    def prepare(self, task: Replanning) -> ReplanRallyContext:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Return the data of the remaining hits, and the previous plan as a starting point."""
-        case = continue_heading(task.case, task.previous, task.elapsed)
-        return ReplanRallyContext(rally=self.planner.prepare(case), start=self._start(task))
-
-    def _start(self, task: Replanning) -> Array:
+    def start_from(self, task: Replanning, context: RallyContext) -> Array:  # noqa: ARG002
+        """Return the decision variables (n,) of the hits that follow, and of new last hits."""
         planner, case, previous = self.planner, task.case, task.previous
         path, strokes, size = previous.trajectory, previous.strokes, case.places.shape[0]
         index = count_done(previous, task.elapsed) + np.arange(size)
@@ -157,21 +126,6 @@ class ReplanRally(OptimisedPlanner):
         )
         offsets = fit_offsets(planner, path, begins + task.elapsed, durations, tails)
         return planner.join(jnp.where(is_new[..., None], 0.0, offsets), natural)
-
-    def guesses(self, context: ReplanRallyContext, num: int) -> Array:
-        """Return `num` starting points: the previous plan, then guesses for new hits."""
-        first = context.start[None]
-        if num == 1:
-            return first
-        return jnp.concatenate([first, self.planner.guesses(context.rally, num - 1)])
-
-    def objective(self, point: Array, context: ReplanRallyContext) -> Evaluation:
-        """Return the cost, and the largest relative excess over a limit, at n variables `point`."""
-        return self.planner.objective(point, context.rally)
-
-    def decode(self, point: Array, context: ReplanRallyContext) -> RallyPlan:
-        """Return the plan of the next hits that the n decision variables `point` describe."""
-        return self.planner.decode(point, context.rally)
 
 
 def count_done(plan: RallyPlan, elapsed: Array | np.ndarray):
