@@ -34,8 +34,8 @@ def quick_options() -> Options:
     """Return options of XLA that shorten the compilation of your own function on a CPU.
 
     They are an argument of `jax.jit`, as in  jax.jit(f, compiler_options=pj.quick_options()) , and
-    suit loops over single cases: batches run up to half as long again. With JAX 0.11 and later, and
-    on a GPU, there are no such options, and the dictionary is empty.
+    suit loops over single cases: batches take about a tenth longer. With JAX 0.11 and later, and on
+    a GPU, there are no such options, and the dictionary is empty.
     """
     return dict(QUICK_OPTIONS) if jax.default_backend() == "cpu" else {}
 
