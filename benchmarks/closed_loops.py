@@ -3,95 +3,102 @@
     taskset -c 0 python -m benchmarks.closed_loops [--num 64] [--steps 18] [--turns 5] [--out DIR]
 
 Each of --num robots plans the catch of a thrown ball, moves along its plan for 0.03 s, and plans
-again for the ball that is then nearer, --steps times in all. The program compares ways to write
-this loop:
+again for the ball that is then nearer. The program compares ways to write this loop of --steps
+steps:
 * a Python loop that calls `pj.plan` for all robots in each step;
 * one compiled `lax.scan` over the steps, with `pj.solve` of all robots in each step;
 * `jax.vmap` of the compiled loop of a single robot, which calls `pj.solve`;
-* the scan and the Python loop with `pj.replan` from the plan of the step before, too.
+* a Python loop and a scan that make first plans, and in each step re-plan by `pj.replan`.
 
-For each way the table has the CPU time of the first call, which compiles, the CPU time of a later
-call (the median of --turns calls, in turns), and how many of all plans solve their case. The
-referee judges all plans.
+The table has for each way the CPU time of the first call, which compiles, and of a later call (the
+median of --turns calls, in turns). The cache on the disk is not used, but a way may use programs of
+an earlier one. Further columns count the plans of all steps that solve their case, and those that
+the referee accepts. The cost gap is the median excess of their costs over those of a longer search.
 """
 
 import functools
 import time
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 import planner_jax as pj
+from planner_jax.benchmarks.cost_gap import cost_gaps, gap_figures
 from planner_jax.benchmarks.run import argument_parser, begin
 from planner_jax.trajectory.polynomial import evaluate
 
 PERIOD = 0.03  # [s] between two plans
 PLANNER = pj.catch.planner("exact")
 
+Move = Callable[[PyTree, PyTree], PyTree]  # returns cases one period later, from cases and plans
+Step = Callable[[PyTree], tuple[PyTree, PyTree]]  # as for `lax.scan`: returns state and result
 
-def advance(case: Any, plan: Any) -> Any:
+
+def advance(case: PyTree, plan: PyTree) -> PyTree:
     """Return a case one period later, of a robot that moves as planned."""
     time = jnp.asarray(PERIOD, case.horizon.dtype)
     state = [evaluate(plan.trajectory, time, order) for order in range(4)]
-    ball = jax.vmap(lambda path: path.at(time))(case.targets)
-    targets = case.targets.replace(ball=ball)
+    targets = case.targets.replace(ball=jax.vmap(lambda path: path.at(time))(case.targets))
     return case.replace(head_state=jnp.stack(state), targets=targets, horizon=case.horizon - PERIOD)
 
 
-def scan(cases: Any, *, steps: int, again: bool = False) -> tuple[Any, Any]:
-    """Return cases and plans of all steps, of one robot or of a batch, in a compiled loop."""
-    move = advance if cases.batch_shape == () else jax.vmap(advance)
-
-    def step(cases: Any, _: None) -> tuple[Any, Any]:
-        plans = pj.solve(PLANNER, cases)
-        return move(cases, plans), (cases, plans)
-
-    def step_again(now: tuple[Any, Any], _: None) -> tuple[Any, Any]:
-        cases, plans = now
-        later = move(cases, plans)
-        news = {"targets": later.targets, "head_state": later.head_state}
-        time = jnp.full(cases.batch_shape, PERIOD, later.horizon.dtype)
-        new = pj.replan(PLANNER, cases, plans, time, **news)
-        return (later, new), (later, new)
-
-    if not again:
-        return jax.lax.scan(step, cases, length=steps)[1]
-    first = cases, pj.solve(PLANNER, cases)
-    others = jax.lax.scan(step_again, first, length=steps - 1)[1]
-    return jax.tree.map(lambda one, more: jnp.concatenate([one[None], more]), first, others)
+def plan_anew(move: Move, cases: PyTree) -> tuple[PyTree, PyTree]:
+    """Plan cases from scratch; return the cases one period later, and (cases, plans)."""
+    plans = pj.plan(PLANNER, cases)  # `pj.solve` inside a compiled function
+    return move(cases, plans), (cases, plans)
 
 
-def loop(cases: Any, move: Callable, *, steps: int, again: bool = False) -> tuple[Any, Any]:
-    """Return cases and plans of all steps, by a Python loop over the steps."""
-    found, plans = [], None
+def plan_again(move: Move, now: tuple[PyTree, PyTree]) -> tuple[PyTree, PyTree]:
+    """Re-plan the cases of `now`, (cases, plans), one period later; return twice the new pair."""
+    later = move(*now)
+    news = {"targets": later.targets, "head_state": later.head_state}
+    new = later, pj.replan(PLANNER, *now, PERIOD, **news)
+    return new, new
+
+
+def with_first_plans(cases: PyTree) -> tuple[PyTree, PyTree]:
+    """Return cases and their plans from scratch."""
+    return cases, pj.plan(PLANNER, cases)
+
+
+def scan(step: Step, state: PyTree, steps: int) -> PyTree:
+    """Return the results of all steps of a compiled loop."""
+    return jax.lax.scan(lambda state, _: step(state), state, length=steps)[1]
+
+
+def loop(step: Step, state: PyTree, steps: int) -> PyTree:
+    """Return the results of all steps of a Python loop."""
+    found = []
     for _ in range(steps):
-        if again and plans is not None:
-            later = jax.device_get(move(cases, plans))
-            news = {"targets": later.targets, "head_state": later.head_state}
-            plans = pj.replan(PLANNER, cases, plans, PERIOD, **news)
-            cases = later
-        else:
-            plans = pj.plan(PLANNER, cases)
-        found.append((cases, plans))
-        if not again:
-            cases = jax.device_get(move(cases, plans))
+        state, result = step(state)
+        found.append(result)
     return jax.tree.map(lambda *leaves: np.stack(leaves), *found)
 
 
-def ways(steps: int) -> dict[str, Callable]:
+def ways(steps: int) -> dict[str, Callable[[PyTree], tuple[PyTree, PyTree]]]:
     """Return each way to write the loop: a function of the cases of all robots."""
-    move = jax.jit(jax.vmap(advance))
-    lanes = lambda found: jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 1, 0), found)  # noqa: E731
-    alone = functools.partial(scan, steps=steps)
+    together = jax.vmap(advance)
+    compiled = jax.jit(together)
+    on_host = lambda cases, plans: jax.device_get(compiled(cases, plans))  # noqa: E731
+    each, anew, again = (
+        functools.partial(plan_anew, advance),
+        functools.partial(plan_anew, together),
+        functools.partial(plan_again, together),
+    )
+    anew_on_host = functools.partial(plan_anew, on_host)
+    again_on_host = functools.partial(plan_again, on_host)
+    alone = jax.vmap(lambda case: scan(each, case, steps), out_axes=1)
     return {
-        "Python loop, pj.plan": functools.partial(loop, move=move, steps=steps),
-        "scan, pj.solve of the batch": jax.jit(functools.partial(scan, steps=steps)),
-        "vmap of a scan, pj.solve": jax.jit(lambda cases: lanes(jax.vmap(alone)(cases))),
-        "Python loop, pj.replan": functools.partial(loop, move=move, steps=steps, again=True),
-        "scan, pj.replan of the batch": jax.jit(functools.partial(scan, steps=steps, again=True)),
+        "Python loop, pj.plan": lambda cases: loop(anew_on_host, cases, steps),
+        "scan, pj.solve of the batch": jax.jit(lambda cases: scan(anew, cases, steps)),
+        "vmap of a scan, pj.solve": jax.jit(alone),
+        "Python loop, pj.replan": lambda cases: loop(again_on_host, with_first_plans(cases), steps),
+        "scan, pj.replan of the batch": jax.jit(
+            lambda cases: scan(again, with_first_plans(cases), steps)
+        ),
     }
 
 
@@ -99,32 +106,38 @@ def main() -> None:
     """Run the benchmark."""
     parser = argument_parser("closed_loops", __doc__, num=64, steps=18, turns=5, seed=0)
     options = parser.parse_args()
-    cases = pj.catch.draw(options.num, "throws", seed=options.seed)
-    functions, times, found = ways(options.steps), {}, {}
+    jax.config.update("jax_enable_compilation_cache", False)
+    cases = jax.device_get(pj.catch.draw(options.num, "throws", seed=options.seed))
+    functions, found = ways(options.steps), {}
+    times: dict[str, list[float]] = {name: [] for name in functions}
     with begin(parser, options) as bench:
-        for turn in range(options.turns + 1):
+        for _ in range(options.turns + 1):
             for name, function in functions.items():
                 began = time.process_time()
                 found[name] = jax.block_until_ready(function(cases))
-                times.setdefault(name, []).append(time.process_time() - began)
-                if turn == 0:
-                    print(name, times[name], flush=True)
+                times[name].append(time.process_time() - began)
         bench.say(
-            "| loop | first call, CPU s | later, CPU s | solved | accepted |",
-            "|---|---|---|---|---|",
+            "| loop | first call, CPU s | later, CPU s | solved | accepted | cost gap, median |",
+            "|---|---|---|---|---|---|",
         )
-        for name, (each, plans) in found.items():
-            flat = jax.tree.map(lambda x: np.asarray(x).reshape(-1, *x.shape[2:]), (each, plans))
-            first, *later = times[name]
-            success = pj.catch.judge(*flat).success
-            solved, median = int(pj.are_solved(flat[1]).sum()), float(np.median(later))
-            bench.count(success)
+        for name, pair in found.items():
+            flat = jax.tree.map(lambda leaf: np.asarray(leaf).reshape(-1, *leaf.shape[2:]), pair)
+            first, later = times[name][0], float(np.median(times[name][1:]))
+            success, solved = pj.catch.judge(*flat).success, pj.are_solved(flat[1])
+            gaps = cost_gaps(PLANNER, *flat)
+            figures = gap_figures(gaps)
+            bench.count(success, gaps)
             bench.say(
-                f"| {name} | {first:.1f} | {median:.2f} | {solved} of {len(success)} "
-                f"| {success.sum()} |"
+                f"| {name} | {first:.1f} | {later:.2f} | {solved.sum()} of {solved.size} "
+                f"| {success.sum()} | {100 * (figures['cost_gap_median'] or 0.0):.2g} % |"
             )
             bench.row(
-                loop=name, first=first, later=median, solved=solved, accepted=int(success.sum())
+                loop=name,
+                first=first,
+                later=later,
+                solved=int(solved.sum()),
+                accepted=int(success.sum()),
+                **figures,
             )
 
 

@@ -20,6 +20,7 @@ from pathlib import Path
 
 import jax
 import numpy as np
+from jaxtyping import PyTree
 
 from planner_jax.benchmarks.run import Bench, argument_parser, begin
 from planner_jax.core.compiled import quick_options
@@ -120,16 +121,15 @@ def measure(bench: Bench, tasks: Sequence[str], size: int) -> None:
         task, *suite = name.split()
         planner, judge = task_named(task).planner(), task_named(task).judge
         batch = jax.tree.map(np.asarray, task_named(task).draw(size, *suite))
-        solve_one = functools.partial(solve, planner)
-        quick = jax.jit(solve_one, compiler_options=quick_options())
-        calls: list[tuple[str, int, Callable]] = [
-            ("pj.plan", 1, functools.partial(plan, planner)),
-            ("pj.plan", size, functools.partial(plan, planner)),
-            ("jit(pj.solve)", 1, jax.jit(solve_one)),
-            ("jit(pj.solve), quick", 1, quick),
+        one, solve_one = take(batch, 0), functools.partial(solve, planner)
+        plan_all = functools.partial(plan, planner)
+        calls: list[tuple[str, int, PyTree, Callable]] = [
+            ("pj.plan", 1, one, plan_all),
+            ("pj.plan", size, batch, plan_all),
+            ("jit(pj.solve)", 1, one, jax.jit(solve_one)),
+            ("jit(pj.solve), quick", 1, one, jax.jit(solve_one, compiler_options=quick_options())),
         ]
-        for call, num, function in calls:
-            cases = take(batch, 0) if num == 1 else batch
+        for call, num, cases, function in calls:
             jax.clear_caches()
             start = time.process_time()
             with record_programs() as programs:

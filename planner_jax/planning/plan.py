@@ -213,10 +213,10 @@ def require_batch(cases: Case) -> int:
 def solve(planner: Planner[CaseT, PlanT], cases: CaseT) -> PlanT:
     """Plan cases as a pure function, for compiled functions, `vmap` and `scan`.
 
-    Planners that minimise by L-BFGS or Newton's method, such as those of hits, catches and rallies,
-    search only the unsolved cases of a batch again. For other planners each attempt (search) after
-    the first is made at all cases if one is unsolved. `vmap` of this function plans its lanes as
-    one batch. As for `plan`, compiled programs are stored on the disk.
+    After the first attempt (search) only unsolved cases are searched again. This holds for hits,
+    catches, rallies, and every `OptimisedPlanner`; other planners repeat each attempt for all cases
+    while one case is unsolved. `vmap` of this function plans its lanes as one batch. As for `plan`,
+    compiled programs are stored on the disk.
 
     Args:
         planner: as for `plan`.

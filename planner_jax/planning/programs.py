@@ -31,10 +31,10 @@ BUCKETS = (16, 128, 1024, 8192, 65536)
 # Greatest number of starting points in one call. More would not fit the cache of a CPU's core; on a
 # GPU this number keeps all processors busy.
 _CPU_CHUNK, _GPU_CHUNK = 256, 65536
-# Numbers of lanes of a call, if the program of an attempt can hold fewer cases.
-_CPU_SIZES, _GPU_SIZES = (16, 128, 256), (1024, 8192, 65536)
 _GPU_BUSY = 8192  # least number of starts in one call that keeps a GPU busy
-_GPU_LEAST = 128  # least number of lanes of a call on a GPU; fewer lanes take the same time
+# Least number of lanes of a call on a GPU; fewer lanes take the same time. The second number is for
+# attempts whose padding is never searched.
+_GPU_LEAST, _GPU_LEAST_PADDED = 128, 1024
 _SPARED = 8  # a smaller last call must save more than 1/8 of the lanes of all calls before it
 LANES = PartitionSpec("lanes")
 
@@ -46,19 +46,18 @@ class Sizes:
     most: int  # greatest number of lanes of a call
     busy: int  # least number of lanes of a call that does not hold all remaining lanes
     least: int = BUCKETS[0]  # least number of lanes of a call
-    buckets: tuple[int, ...] = BUCKETS  # numbers of lanes of calls, up to `most`
 
     def next(self, num: int) -> int:
         """Return how many lanes (cases) the next compiled call has if `num` lanes are unsolved.
 
-        It is the smallest size in `buckets` that holds `num` lanes, at most the field `most`. If
+        It is the smallest size in `BUCKETS` that holds `num` lanes, at most the field `most`. If
         the lanes fill at most half of it, the next smaller size is used, provided it is at least
-        the field `busy`. Further calls then plan the remaining lanes.
+        the fields `busy` and `least`. Further calls then plan the remaining lanes.
         """
         needed = max(num, self.least)
-        fits = next((size for size in self.buckets if needed <= size <= self.most), self.most)
-        smaller = max((size for size in self.buckets if size < fits), default=0)
-        return smaller if smaller > 0 and smaller >= self.busy and 2 * num <= fits else fits
+        fits = next((size for size in BUCKETS if needed <= size <= self.most), self.most)
+        smaller = max((size for size in BUCKETS if size < fits), default=0)
+        return smaller if smaller >= max(self.busy, self.least) and 2 * num <= fits else fits
 
     def cuts(self, num: int) -> Iterator[tuple[int, int]]:
         """Yield first lane (case) and number of lanes of each compiled call, for `num` lanes.
@@ -80,13 +79,13 @@ def sizes_of(planner: Planner, attempt: Attempt, chunk: int | None, mesh: Mesh) 
     busy, is_cpu = _GPU_BUSY // attempt.starts, mesh.devices[0].platform == "cpu"
     if chunk is not None:
         return Sizes(chunk, busy)
-    if attempt.continues:
-        few, *_, many = sizes = _CPU_SIZES if is_cpu else _GPU_SIZES
-        return Sizes(few if attempt.starts > 1 else many, busy, few, sizes)
     if not is_cpu:
-        return Sizes(max(_GPU_LEAST, _GPU_CHUNK // attempt.starts), busy, _GPU_LEAST)
-    # If a core solves cases one after another, small chunks of cases keep all cores busy.
-    if planner.is_sequential:
+        least = _GPU_LEAST_PADDED if attempt.continues else _GPU_LEAST
+        many = least if attempt.continues and attempt.starts > 1 else _GPU_CHUNK // attempt.starts
+        return Sizes(max(least, many), busy, least)
+    # If a core solves cases one after another, small chunks of cases keep all cores busy. Small
+    # tiles of starting points do not wait for one slow search.
+    if planner.is_sequential or (attempt.continues and attempt.starts > 1):
         return Sizes(BUCKETS[0], busy)
     starts = 1 << (attempt.starts - 1).bit_length()  # number of starts, up to a power of two
     return Sizes(max(BUCKETS[0], _CPU_CHUNK // starts), busy)

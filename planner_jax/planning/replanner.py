@@ -2,7 +2,7 @@
 
 import abc
 import dataclasses
-from typing import Any, Self, TypeVar
+from typing import Self
 
 import jax.numpy as jnp
 from flax import struct
@@ -15,8 +15,6 @@ from planner_jax.optimise.settings import Evaluation, Settings
 from planner_jax.planning.replan import Replanning
 from planner_jax.robot.heading import continue_heading
 
-InnerT = TypeVar("InnerT", bound=OptimisedPlanner)
-
 
 @struct.dataclass
 class ReplanContext:
@@ -25,6 +23,8 @@ class ReplanContext:
     inner: PyTree  # what remains, as the inner planner prepares it
     task: Replanning
     start: Array  # (n,), the inner planner's variables for the previous plan
+    # () bool, whether what remains of the previous plan is returned; None: a new plan is made.
+    is_kept: PyTree = None
 
 
 class Replanner(OptimisedPlanner[Replanning, PlanT], abc.ABC):
@@ -35,10 +35,10 @@ class Replanner(OptimisedPlanner[Replanning, PlanT], abc.ABC):
     """
 
     case_type = Replanning
-    planner: Any  # an `OptimisedPlanner`, whose type subclasses state
+    planner: PyTree  # an `OptimisedPlanner`, whose type subclasses state
 
     @property
-    def inner(self) -> Any:
+    def inner(self) -> PyTree:
         """The planner that plans what remains of each case, also for plans from scratch."""
         return self.planner
 

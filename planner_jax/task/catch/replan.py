@@ -131,20 +131,22 @@ class ReplanCatch(Replanner[CatchPlan]):
         offsets = fit_offsets(planner, trajectory, begins, durations, tails)
         return planner.encode(context, durations, tails, offsets)
 
-    def _is_kept(self, context: ReplanContext) -> Array:
-        """Return whether too little time is left for a new plan, () bool."""
+    def prepare(self, case: Replanning) -> ReplanContext:
+        """Return the remaining catches, a starting point, and whether too little time is left."""
+        context = super().prepare(case)
         left = _segments(context.task)[1][0]
-        return (left < self.shortest) | ~context.inner.active[0]
+        is_kept = (left < self.shortest) | ~context.inner.active[0]
+        return dataclasses.replace(context, is_kept=is_kept)
 
     def objective(self, point: Array, context: ReplanContext) -> Evaluation:
         """Return cost and violation at `point`, or if too little time is left, of the old plan."""
-        return super().objective(jnp.where(self._is_kept(context), context.start, point), context)
+        return super().objective(jnp.where(context.is_kept, context.start, point), context)
 
     def decode(self, point: Array, context: ReplanContext) -> CatchPlan:
         """Return the plan at `point`, or if too little time is left, the old plan's remainder."""
         plan = super().decode(point, context)
         remainder = lambda: _remainder(context.task, context.inner)  # noqa: E731
-        return jax.lax.cond(self._is_kept(context), remainder, lambda: plan)
+        return jax.lax.cond(context.is_kept, remainder, lambda: plan)
 
 
 def _segments(task: Replanning) -> tuple[Array, Array]:
