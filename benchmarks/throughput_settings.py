@@ -27,7 +27,7 @@ class ThroughputSettings:
     task: str = option("hit", "NAME", "task whose cases are planned")
     planner: str | None = option(None, "NAME", "(default: the first of the task)")
     suite: str | None = option(None, "NAME", "(default: the first of the task)")
-    batch: tuple[int, ...] = option((1024, 8192), "B", "plans in one call, one or more sizes")
+    batch: tuple[int, ...] = option((1024, 16384), "B", "plans in one call, one or more sizes")
     devices: int | None = option(None, "N", "number of devices that share a batch (default: all)")
     iterations: int | None = option(
         None, "K", "iterations of the first round (default: the planner's own)"

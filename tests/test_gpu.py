@@ -79,9 +79,10 @@ def test_hits_are_those_of_a_process_without_kernels(devices, serves, tmp_path):
     off = {kernels.SWITCH: "off", "XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
     command = [sys.executable, "-c", WITHOUT_KERNELS, str(LANES), str(without)]
     subprocess.run(command, env={**os.environ, **off}, check=True)
-    ours, theirs = plan(ExactHit(), serves, devices=devices[:1]), np.load(without)
-    np.testing.assert_array_equal(ours.status, theirs["status"])
-    np.testing.assert_allclose(ours.stroke.time, theirs["time"], atol=1e-3)
+    ours = plan(ExactHit(), serves, devices=devices[:1])
+    with np.load(without) as theirs:
+        np.testing.assert_array_equal(ours.status, theirs["status"])
+        np.testing.assert_allclose(ours.stroke.time, theirs["time"], atol=1e-3)
 
 
 def test_catches_are_those_of_a_cpu(devices):

@@ -23,7 +23,7 @@ def test_the_learnt_guess_costs_a_hundredth_and_little_more_than_the_optimum(tas
 
     def costs(case, planner):
         context = planner.prepare(case)
-        return planner.objective(planner.guesses(context, 1)[0], context).cost
+        return planner.objective(planner.first_guess(context), context).cost
 
     learnt, smooth = (
         np.asarray(jax.jit(jax.vmap(lambda case, own=own: costs(case, own)))(cases))

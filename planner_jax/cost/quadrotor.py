@@ -13,7 +13,7 @@ from typing import ClassVar, Protocol
 
 import jax
 import jax.numpy as jnp
-from jax import Array, lax
+from jax import Array
 from jaxtyping import PyTree
 
 from planner_jax.core.arithmetic import Components, at_least, components, inverse_sqrt, reciprocal
@@ -99,7 +99,7 @@ def tilt_excess(acc: Components, gravity: Array, limits: QuadrotorLimits) -> Arr
 
 
 _OVERTURN_NODES = 4  # intervals of a piece, at whose ends `overturn_excess` evaluates the motion
-_WEAK_STEPS = 4  # number of evaluations that minimise the thrust within an interval
+_WEAK_STEPS = 3  # number of steps that minimise the thrust within an interval
 
 
 class QuadrotorCase(Protocol):
@@ -322,13 +322,11 @@ def overturn_excess(
     (x, y, z), (a, b, _) = (jnp.moveaxis(each, 2, 0) for each in (pull, jerk))
     squared = jnp.minimum(jnp.maximum(((x * b - y * a) / size) ** 2 / rate, 1e-12), 1.0)
     level, z = jnp.sqrt(1.0 - squared), z / jnp.sqrt(size)
-    is_met = -z >= level * jnp.cos(jnp.minimum(jnp.sqrt(rate) * step, 1.0))
-    top = rate * (1.0 + (1.0 + level) ** 2 / squared)
-    top = jnp.where(is_met & (z < 0.0), top, rate)
-    is_flown = step > 0.0  # absent targets have segments of duration 0
-    found = top, _rate_of_weak_thrust(pull, jerk, step)
-    greatest = [jnp.max(jnp.where(is_flown, each, 0.0)) for each in found]
-    return relative(jnp.maximum(*greatest) / limits.body_rate**2 - 1.0)
+    is_met = (z < 0.0) & (-z >= level * jnp.cos(jnp.minimum(jnp.sqrt(rate) * step, 1.0)))
+    top = jnp.where(is_met, rate * (1.0 + (1.0 + level) ** 2 / squared), rate)
+    top = jnp.where(step > 0.0, top, 0.0)  # segments of absent targets have duration 0
+    greatest = jnp.maximum(jnp.max(top), _rate_of_weak_thrust(pull, jerk, step))
+    return relative(greatest / limits.body_rate**2 - 1.0)
 
 
 def _dot(a: Array, b: Array) -> Array:
@@ -336,27 +334,41 @@ def _dot(a: Array, b: Array) -> Array:
 
 
 def _rate_of_weak_thrust(pull: Array, jerk: Array, step: Array) -> Array:
-    """Return the squared turning rate w^2 (P, K) where the thrust is least between two samples.
+    """Return the squared turning rate w^2 () at the greatest peak between two samples.
 
     The thrust per mass f has the samples `pull` (P, K + 1, 3), and between two of them, `step` (P,
-    1) [s] apart, it is the cubic function with the derivatives `jerk`. Gauss-Newton steps minimise
-    |f|; there  w = |f x f'| / |f|^2 .
+    1) [s] apart, it is the cubic function with the derivatives `jerk`. The rate peaks where |f| is
+    least. An estimate selects one interval, in which Gauss-Newton steps minimise |f|.
     """
     slopes = jerk * step[..., None]
     start, way = pull[:, :-1], pull[:, 1:] - pull[:, :-1]
     first, last = slopes[:, :-1], slopes[:, 1:]
-    square, cube = 3.0 * way - 2.0 * first - last, first + last - 2.0 * way
+    curve = [start, first, 3.0 * way - 2.0 * first - last, first + last - 2.0 * way]
+    share = jnp.clip(-_dot(start, way) / at_least(_dot(way, way), 1e-6), 0.0, 1.0)
+    share, peak = _approach_least(curve, share)
+    per_time = jnp.broadcast_to(jnp.where(step > 0.0, 1.0 / step**2, 0.0), peak.shape)
+    chosen = jnp.argmax(peak * per_time)
+    get = lambda x: x.at[chosen].get(mode="promise_in_bounds")  # noqa: E731
+    curve, share = [get(each.reshape(-1, 3)) for each in curve], get(share.ravel())
+    for _ in range(_WEAK_STEPS):
+        share, peak = _approach_least(curve, share)
+    return peak * get(per_time.ravel())
 
-    def descend(_: Array | int, state: tuple[Array, Array]) -> tuple[Array, Array]:
-        u = state[0][..., None]
-        f = start + u * (first + u * (square + u * cube))
-        rate = first + u * (2.0 * square + 3.0 * u * cube)
-        mixed, speed, size = _dot(f, rate), _dot(rate, rate) + 1e-6, _dot(f, f)
-        share = jnp.minimum(jnp.maximum(state[0] - mixed / speed, 0.0), 1.0)
-        return share, (size * speed - mixed * mixed) / (jnp.maximum(size, 1e-8) * step) ** 2
 
-    half = jnp.full(start.shape[:2], 0.5, start.dtype)
-    return lax.fori_loop(0, _WEAK_STEPS, descend, (half, half))[1]
+def _approach_least(curve: list[Array], share: Array) -> tuple[Array, Array]:
+    """Return the `share` in [0, 1] after a Gauss-Newton step to the least |f|, and a squared rate.
+
+    `curve` has the coefficients (..., 3) of the cubic function f of the share, constant first. The
+    squared rate is  |f'|^4 / |f x f'|^2 , where the tangent has its least |f|. If this place is not
+    in [0, 1], it is the squared rate  |f x f'|^2 / |f|^4  at the given share.
+    """
+    u = share[..., None]
+    f = curve[0] + u * (curve[1] + u * (curve[2] + u * curve[3]))
+    slope = curve[1] + u * (2.0 * curve[2] + 3.0 * u * curve[3])
+    mixed, speed, size = _dot(f, slope), _dot(slope, slope) + 1e-6, _dot(f, f)
+    apart, nearest = size * speed - mixed * mixed, share - mixed / speed
+    after, rate = jnp.clip(nearest, 0.0, 1.0), apart / at_least(size, 1e-8) ** 2
+    return after, jnp.where(after == nearest, speed**2 / jnp.maximum(apart, 1e-8 * speed), rate)
 
 
 def greatest_excess(

@@ -172,7 +172,7 @@ def minimise_tile(
     if is_on_gpu():
         step = lambda s, given, _: lax.fori_loop(0, turns, lambda _, s: advance(s, given), s)  # noqa: E731
     state = over(lambda start: lbfgs.init(start, config))(starts)
-    if table.is_counted:
+    if table.is_counted and is_on_gpu():
         state = step(state, contexts, config)
     else:
         state = lax.while_loop(

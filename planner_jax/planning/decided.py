@@ -63,7 +63,7 @@ class DecidedPlanner(PlannerAround[CaseT, PlanT]):
             best = self._plan_all(drive, cases, choices)
             decided, plans = jax.tree.map(lambda leaf: leaf[0], best) if alone else best
             unsolved = is_unsolved(plans.status)
-        if not drive.is_pure and not np.any(unsolved):
+        if not drive.is_pure and not np.asarray(unsolved).any():
             return plans
         status = _explain(self.decision, decided, plans.status)
         on_devices = isinstance(plans.status, jax.Array)

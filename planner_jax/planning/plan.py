@@ -275,11 +275,10 @@ class Driver:
     ) -> tuple[PyTree, PyTree]:
         """Plan by these attempts (searches), or by all attempts of the planner.
 
-        Returns the plans, and a count or mask of unsolved cases, which is zero if all are solved.
+        Returns the plans, and a count or mask of unsolved cases; None for composite planners.
         """
         if planner.kind is Kind.COMPOSITE:
-            plans = planner.plan_by(self, cases)
-            return plans, is_unsolved(plans.status)
+            return planner.plan_by(self, cases), None
         attempts = attempts or planner.attempts_for(cases)
         attempts = planner.group_attempts(attempts, cases, is_whole=self.is_pure)
         if self.is_pure:
@@ -332,7 +331,6 @@ def _plan_one(planner: Planner, attempts: Sequence[Attempt], case: PyTree, watch
         watch.report(planner, attempt, 1, 1)
         if best is None or is_better(plan, best):
             best = plan
-        # an int is checked faster than an array
         if not is_unsolved(int(best.status)) and not any(each.improves for each in attempts):
             break
     return best

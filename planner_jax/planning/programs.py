@@ -27,7 +27,7 @@ from planner_jax.core.rules import require_shapes
 from planner_jax.planning.traced import Layout, Results, Stored, load_or_trace, settings
 
 # Numbers of lanes (cases) that a device solves in one call. Each number needs its own program.
-BUCKETS = (16, 128, 1024, 8192, 65536)
+BUCKETS = (16, 128, 1024, 16384, 65536)
 # Greatest number of starting points in one call. More would not fit the cache of a CPU's core; on a
 # GPU this number keeps all processors busy.
 _CPU_CHUNK, _GPU_CHUNK = 256, 65536
@@ -157,9 +157,11 @@ def place_lanes(tree: PyTree, mesh: Mesh) -> PyTree:
         return tree if is_here else jax.device_put(tree)
     target = lane_sharding(mesh)
 
-    def is_there(leaf: Array) -> bool:
-        own = leaf.sharding  # == is the faster test, so it is tried first
-        return leaf.committed and (own == target or own.is_equivalent_to(target, leaf.ndim))
+    def is_there(leaf: Array | np.ndarray) -> bool:
+        if not isinstance(leaf, Array) or not leaf.committed:
+            return False
+        # == is the faster test, so it is tried first
+        return leaf.sharding == target or leaf.sharding.is_equivalent_to(target, leaf.ndim)
 
     if all(map(is_there, jax.tree.leaves(tree))):
         return tree

@@ -53,11 +53,13 @@ class ResidentBatch(Batch):
         first, *others = attempts
         watch.report(planner, first, 0, num)
         plans, unsolved = self._first_plans(first, cases)
+        unsolved.copy_to_host_async()  # the copy starts as soon as the number is computed
         for attempt in others:
+            if not (attempt.improves or np.asarray(unsolved).any()):
+                continue
             before, due = plans.status, unsolved
             if attempt.within is not None or attempt.improves:
                 before, due = _mark_due(mesh, attempt, plans)
-            due.copy_to_host_async()  # the copy starts as soon as the number is computed
             most = np.asarray(due).max()  # greatest number of due cases on one device
             if most == 0:
                 continue

@@ -36,7 +36,7 @@ from planner_jax.trajectory.proportional_minco import (
 
 _ORDER = 4  # derivative whose square is minimised: snap
 _COST_UNIT = 1e4  # divisor of the cost, so that the Hessian has moderate entries
-_DECODE_NODES = 24  # number of samples per piece at which the plan's violation is evaluated
+_DECODE_NODES = 96  # number of samples per piece at which the plan's violation is evaluated
 
 # Fractions of segments in `transition_point` [Yu2023bat, Section VI-A]. Point A is at alpha from
 # the quadrotor's start to the hit, point B at phi (assumed) from the ball's origin to its target.
@@ -300,7 +300,7 @@ class BatHit(OptimisedPlanner):
         return is_too_far(context)
 
     def decode(self, point: Array, context: HitContext) -> HitPlan:
-        """Convert the variables `point` to a plan; its violation is sampled 24 times per piece."""
+        """Convert the variables `point` to a plan; its violation is sampled 96 times per piece."""
         case = context.case
         offsets, rows, duration, impact, defect = self._unpack(point, context)
         columns = jnp.concatenate([rows, offsets])

@@ -83,7 +83,7 @@ class JuggleHit(Planner):
     thrust_z: float = 1.1  # vertical thrust at the impact, divided by gravity
     racket_vel_xy: tuple[float, float] = (0.0, 0.0)  # [m/s], of the quadrotor at the impact
     ease: float = 0.02  # [s], duration of the ramp of the jerk at the start
-    nodes: int = 60  # number of intervals per piece, at whose ends limits are evaluated
+    nodes: int = 240  # number of intervals per piece, at whose ends limits are evaluated
 
     def __post_init__(self) -> None:
         require_settings(self)

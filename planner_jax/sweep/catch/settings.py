@@ -38,7 +38,7 @@ class CatchSettings(QuadrotorSettings):
     JUDGE: ClassVar[tuple[str, ...]] = ("tolerance", "net_test")
     # Number of cases in a batch on a GPU. It is small, because evaluating the 720 orders of six
     # targets takes 1 MB of memory for each case.
-    GPU_BATCH: ClassVar[int] = 8192
+    GPU_BATCH: ClassVar[int] = 16384
 
     def __post_init__(self) -> None:
         super().__post_init__()
