@@ -235,7 +235,7 @@ def _plan(cases: CatchCase, choices: CatchChoice, iterations: int) -> tuple[Catc
 
 def _search(iterations: int) -> Table:
     attempt = Round(starts=1, solver=LbfgsConfig(max_steps=iterations))
-    return load_group(ExactCatch(), Group.of((attempt,), (0,)))
+    return load_group(ExactCatch(), Group.of((attempt,), (0,)))[1]
 
 
 def weight_terms(terms: Mapping[str, Array], weights: Mapping[str, Any]) -> Array:

@@ -155,7 +155,7 @@ def test_the_attempts_of_a_planner_share_programs(planner, case, num):
     loaded = []
     attempts = planner.attempts_for(case)
     for attempt in planner.group_attempts(attempts, case, is_whole=False):
-        loaded.append(planner.load_attempt(attempt, case))
+        loaded.append(planner.load(attempt, case)[1])
     layouts = [[(leaf.shape, leaf.dtype) for leaf in jax.tree.leaves(each)] for each in loaded]
     programs = zip(map(jax.tree.structure, loaded), map(tuple, layouts), strict=True)
     assert len(set(programs)) == num < len(planner.attempts)

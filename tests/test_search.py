@@ -15,6 +15,7 @@ from planner_jax.optimise import lbfgs
 from planner_jax.optimise.settings import LbfgsConfig, NewtonConfig, Round
 from planner_jax.recovery.case import RecoveryCase
 from planner_jax.recovery.planner import RecoveryPlanner
+from planner_jax.runs.timing import CompileClock
 from planner_jax.task.catch.default_planner import ExactCatch
 from planner_jax.task.hit.default_planner import ExactHit
 from tests.jaxpr import equations
@@ -35,7 +36,7 @@ PLANNERS = {"hit": ExactHit(), "catch": ExactCatch()}
 
 def tables_of(planner, cases, *, is_whole):
     groups = planner.group_attempts(planner.attempts, cases, is_whole=is_whole)
-    return [planner.load_attempt(each, cases) for each in groups]
+    return [planner.load(each, cases)[1] for each in groups]
 
 
 @pytest.mark.parametrize(("task", "programs", "models"), [("hit", 2, 2), ("catch", 2, 1)])
@@ -53,15 +54,28 @@ def test_rows_list_the_stages_of_all_rounds(task, programs, models):
     assert len(layouts) == programs
 
 
-def test_other_numbers_of_rounds_are_data_of_the_same_program():
+def test_other_numbers_of_rounds_and_of_the_cost_are_data_of_the_same_program():
     cases, planner = pj.catch.draw(1), ExactCatch()
     first, second, *others = planner.rounds
     solver = dataclasses.replace(second.solver, max_steps=31, tolerance=1e-5)
     longer = dataclasses.replace(second, solver=solver, within=0.1)
-    changed = dataclasses.replace(planner, rounds=(first, longer, *others))
-    before, after = (tables_of(each, cases, is_whole=True)[0] for each in (planner, changed))
+    rounds = (first, longer, *others)
+    changed = dataclasses.replace(planner, rounds=rounds, margin=0.1, energy_weight=1e-7)
+    before, after = (
+        each.load(each.group_attempts(each.attempts, cases, is_whole=True)[0], cases)
+        for each in (planner, changed)
+    )
     assert jax.tree.structure(before) == jax.tree.structure(after)
-    assert np.any(np.asarray(before.numbers) != np.asarray(after.numbers))
+    assert np.sum(np.asarray(before[1].numbers) != np.asarray(after[1].numbers)) > 4
+
+
+def test_another_margin_compiles_nothing_and_is_kept():
+    case, planner = pj.take(pj.catch.draw(1), 0), ExactCatch()
+    usual = pj.plan(planner, case)
+    with CompileClock() as clock:
+        wide = pj.plan(dataclasses.replace(planner, margin=0.3), case)
+    assert not clock.compiled
+    assert pj.are_solved(wide) and wide.violation < usual.violation - 0.05
 
 
 @pytest.mark.parametrize(

@@ -90,8 +90,9 @@ def test_rotors_with_limits_have_two_lines_and_others_none(hit):
     found = single.margins(dataclasses.replace(answer, case=case, verdict=verdict))
     least, most = (margin for margin in found if "rotor" in margin.limit)
     assert (least.allowed, most.allowed) == pytest.approx(robot.rotor_range, rel=1e-6)
-    assert least.reached == pytest.approx(float(verdict.min_rotor_thrust), rel=1e-3)
-    assert most.reached == pytest.approx(float(verdict.max_rotor_thrust), rel=1e-3)
+    unit = robot.rotor_range[1]  # the referee, which samples less often, has errors in this unit
+    assert least.reached == pytest.approx(float(verdict.min_rotor_thrust), abs=1e-3 * unit)
+    assert most.reached == pytest.approx(float(verdict.max_rotor_thrust), abs=1e-3 * unit)
     end = float(np.sum(answer.plan.whole.durations))
     assert all(0.0 <= margin.time <= end + 1e-6 for margin in (least, most))
     assert least.least and not most.least

@@ -113,6 +113,10 @@ class Planner(Generic[CaseT, PlanT]):
         """
         return Fixed(attempt)
 
+    def load(self, attempt: PyTree, cases: CaseT, /) -> tuple[PyTree, PyTree]:
+        """Return the first and second argument of the compiled `solve`: planner and attempt."""
+        return self, self.load_attempt(attempt, cases)
+
     def group_attempts(
         self, attempts: Sequence[PyTree], cases: CaseT, /, *, is_whole: bool
     ) -> Sequence[PyTree]:

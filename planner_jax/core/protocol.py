@@ -4,7 +4,7 @@ import dataclasses
 import enum
 import os
 from collections.abc import Sequence
-from typing import Protocol, Self, TypeVar, runtime_checkable
+from typing import ClassVar, Protocol, Self, TypeVar, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -189,6 +189,7 @@ def require_attempts(name: str, value: object, kind: type) -> None:
 class Attempt:
     """Settings of one search for cases that earlier attempts left unsolved; static under jit."""
 
+    continues: ClassVar[bool] = False  # whether a search needs the numbers of the best plans so far
     starts: int = 1  # number of starting points from which each case is solved
     # Greatest violation (relative excess over a limit) for a further search; None: no bound.
     within: float | None = dataclasses.field(default=None, kw_only=True)
@@ -203,11 +204,6 @@ class Attempt:
     def place_among(self, attempts: Sequence["Attempt"]) -> int:
         """Return its index among a planner's attempts, or 0 if it is none of them."""
         return attempts.index(self) if self in attempts else 0
-
-    @property
-    def continues(self) -> bool:
-        """Return whether the compiled search needs the numbers of the best plans so far."""
-        return False
 
     def is_due(self, plans: "Plan") -> Array:
         """Return which plans need this search, bool: unsolved, and violation <= `within`.

@@ -114,7 +114,7 @@ def _state_in(task: Replanning) -> Array:
 
 
 def _solve(attempt: Round, planner: OptimisedPlanner, case: PyTree) -> PyTree:
-    return solve_cases(planner, case, planner.load_attempt(attempt, case))
+    return solve_cases(planner, case, attempt)
 
 
 def _hit_again(attempt: Round, planner: ReplanHit, task: Replanning) -> HitPlan:

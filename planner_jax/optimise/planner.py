@@ -169,8 +169,8 @@ class OptimisedPlanner(Planner[CaseT, PlanT], abc.ABC):
         fitted = tuple([self.fit_attempt(each, cases) for each in known])
         return group_rounds(self, fitted, places, is_whole)
 
-    def load_attempt(self, attempt: Round | Group, cases: PyTree) -> Table:
-        """Convert a round, or a group of rounds (attempts), to an argument of compiled programs."""
+    def load(self, attempt: Round | Group, cases: PyTree) -> tuple[PyTree, Table]:
+        """Return arguments of compiled programs for a round, or a group of rounds (attempts)."""
         if isinstance(attempt, Round):
             attempt = Group.of((self.fit_attempt(attempt, cases),), (0,))
         return load_group(self, attempt)
@@ -191,7 +191,7 @@ class OptimisedPlanner(Planner[CaseT, PlanT], abc.ABC):
         from planner_jax.optimise.search import solve_table  # reads this class
 
         cases = jax.tree.map(jnp.asarray, cases)
-        table = self.load_attempt(attempt, cases) if isinstance(attempt, Round) else attempt
+        table = self.load(attempt, cases)[1] if isinstance(attempt, Round) else attempt
         if before is None:
             before = Score.none(cases.batch_shape, float_type(cases))
         return solve_table(self, table, cases, jax.tree.map(jnp.asarray, before))

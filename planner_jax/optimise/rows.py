@@ -10,7 +10,7 @@ can share a program are one `Group`, whose table `load_group` makes.
 import dataclasses
 import itertools
 from collections.abc import Hashable, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -36,7 +36,7 @@ class Row:
     """The settings of one search, as Python numbers, or as arrays in a compiled program."""
 
     solver: tuple[Number, ...]  # the numbers of an `LbfgsConfig`: iterations, tolerance, patience
-    weights: dict[str, Number]  # fields of the planner that differ among rows of one model
+    weights: dict[str, Number]  # values of the planner's fields `weights`
     model: Number  # () int32, index of the model
     width: Number  # () int32, number of starting points of a case
     keep: Number  # () int32, number of starting points that the next row continues
@@ -57,7 +57,6 @@ class Model:
 
     settings: Settings  # fields of the planner
     solver: Solver  # for L-BFGS, `max_steps` are the turns of `tiles.minimise_tile`
-    varying: tuple[str, ...]  # fields of the planner that differ among its rows
     # Indices of the searched variables among the variables of the finest planner; None: all.
     free: tuple[int, ...] | None
 
@@ -69,6 +68,7 @@ class Table:
     numbers: Array | np.ndarray  # (R, F), a row for each of R searches
     models: tuple[Model, ...] = struct.field(pytree_node=False)
     finest: Settings = struct.field(pytree_node=False)  # of the planner that decodes all plans
+    weights: tuple[str, ...] = struct.field(pytree_node=False)  # the planner's `weights`, sorted
     starts: int = struct.field(pytree_node=False)  # greatest number of starting points of a case
     guesses: int = struct.field(pytree_node=False)  # number of guesses among which rows start
     # Whether a GPU makes as many iterations as the model's solver states. The host then never waits
@@ -84,10 +84,9 @@ class Table:
     def rows(self) -> Row:
         """The R rows: leaves (R,)."""
         flags = {"improves", "is_first", "is_last", "starts", "ends", "writes", "frozen"}
-        names = sorted({name for model in self.models for name in model.varying})
         columns = iter(self.numbers.T)
         solver = tuple(next(columns) for _ in range(3))
-        weights = {name: next(columns) for name in names}
+        weights = {name: next(columns) for name in self.weights}
         fields: dict[str, PyTree] = {
             "solver": (solver[0].astype(np.int32), solver[1], solver[2].astype(np.int32))
         }
@@ -102,22 +101,18 @@ class Table:
 class Group(Attempt):
     """Rounds (attempts) that share a compiled program, as one attempt."""
 
+    continues: ClassVar[bool] = True  # only plans better than the best plans so far are returned
     rounds: tuple[Round, ...] = ()  # all rounds for which the program is compiled
     made: tuple[int, ...] = ()  # indices of the rounds that are made
     is_whole: bool = False  # whether the program has no other rounds
     is_first: bool = True  # whether no attempt has been made before
     place: int = 0  # index of its first round among the planner's attempts
-    # Its table in float32 and float64, after the first use.
-    tables: dict[bool, Table] = dataclasses.field(default_factory=dict, compare=False, repr=False)
+    # Arguments of programs in float32 and in float64, after the first use.
+    loaded: dict[bool, tuple] = dataclasses.field(default_factory=dict, compare=False, repr=False)
 
     def place_among(self, attempts: Sequence[Attempt]) -> int:
         """Return the index of its first round among a planner's attempts."""
         return self.place
-
-    @property
-    def continues(self) -> bool:
-        """Return true: only plans that are better than the best plans so far are returned."""
-        return True
 
     @classmethod
     def of(
@@ -187,9 +182,10 @@ def _divide(planner: "OptimisedPlanner", rounds: tuple[Round, ...], is_whole: bo
     keys: list[Hashable] = []
     leads = True
     for each in rounds:
-        shared, stages = _key_of_fields(planner, each.all_stages[-1], fixed), each.all_stages
-        models = frozenset(_key_of_model(planner, stage) for stage in stages)
-        leads = leads and _is_plain(each) and (not keys or keys[0] == (shared, models, True))
+        own, is_plain = planner.with_settings(each.settings), each.starts == 1 and not each.stages
+        shared = tuple(own.setting(name) for name in fixed)
+        models = frozenset(_key_of_model(planner, stage) for stage in each.all_stages)
+        leads = leads and is_plain and (not keys or keys[0] == (shared, models, True))
         keys.append(shared if is_whole else (shared, models, leads))
     groups: list[range] = []
     for k in range(len(rounds)):
@@ -198,15 +194,6 @@ def _divide(planner: "OptimisedPlanner", rounds: tuple[Round, ...], is_whole: bo
         else:
             groups.append(range(k, k + 1))
     return groups
-
-
-def _is_plain(each: Round) -> bool:
-    return each.starts == 1 and not each.stages
-
-
-def _key_of_fields(planner: "OptimisedPlanner", stage: Stage, names: Sequence[str]) -> tuple:
-    own = planner.with_settings(stage.settings)
-    return tuple(own.setting(name) for name in names)
 
 
 def _key_of_model(planner: "OptimisedPlanner", stage: Stage) -> tuple:
@@ -218,21 +205,30 @@ def _key_of_model(planner: "OptimisedPlanner", stage: Stage) -> tuple:
     return own.size, fixed, tuple((name, own.setting(name)) for name in sorted(names))
 
 
-def load_group(planner: "OptimisedPlanner", group: Group) -> Table:
-    """Return the table of a group of rounds (attempts) of this planner, with a jax array."""
+def load_group(planner: "OptimisedPlanner", group: Group) -> tuple[PyTree, Table]:
+    """Return a planner and a table, in a jax array, as arguments of programs for a group of rounds.
+
+    The table has the numbers of the rounds and of the planner's `weights`. The returned planner has
+    their defaults, so that planners with other numbers share programs.
+    """
     is_double = bool(jax.config.jax_enable_x64)  # type: ignore[attr-defined]
-    if is_double not in group.tables:
+    if is_double not in group.loaded:
         table = _make_table(planner, group)
         with jax.ensure_compile_time_eval():
-            numbers = jnp.asarray(table.numbers)
-            group.tables[is_double] = dataclasses.replace(table, numbers=numbers)
-    return group.tables[is_double]
+            table = dataclasses.replace(table, numbers=jnp.asarray(table.numbers))
+        own, inner = type(planner), type(planner.inner)  # classes hold the defaults of fields
+        names = *table.weights, "rounds"
+        usual = [(name, getattr(own, name, getattr(inner, name, None))) for name in names]
+        common = planner.with_settings(tuple(pair for pair in usual if pair[1] is not None))
+        group.loaded[is_double] = common, table
+    return group.loaded[is_double]
 
 
 def _make_table(planner: "OptimisedPlanner", group: Group) -> Table:
     stages = list(dict.fromkeys(s for each in group.rounds for s in each.all_stages))
     models = list_models(planner, stages, group.is_whole)
-    lists = [_rows_of(planner, each, models) for each in group.rounds]
+    weights = sorted(n for n in planner.weights if isinstance(planner.setting(n), int | float))
+    lists = [_rows_of(planner, each, models, weights) for each in group.rounds]
     rows = list(itertools.chain(*(lists[k] for k in group.made)))
     every = list(itertools.chain(*lists))
     for k in range(len(lists[group.made[0]]) if group.is_first else 0):
@@ -243,12 +239,14 @@ def _make_table(planner: "OptimisedPlanner", group: Group) -> Table:
         rows += [unmade] * (most - len(rows))
     lasts = [each.all_stages[-1] for each in group.rounds]
     finest = max(lasts, key=lambda stage: planner.with_settings(stage.settings).size).settings
+    finest = tuple(pair for pair in finest if pair[0] not in planner.weights)
     numbers = np.array([[float(x) for x in jax.tree.leaves(row)] for row in rows])
     is_gpu, turns = kernels.has_gpu(), models[lasts[0]].solver.max_steps
     return Table(
         numbers=numbers,
         models=tuple(dict.fromkeys(models.values())),
         finest=finest,
+        weights=tuple(weights),
         starts=max(int(row.width) for row in every),
         guesses=max(int(row.first) + int(row.width) for row in every if row.starts),
         is_counted=bool(is_gpu and len(rows) == 1 and rows[0].solver[0] <= turns),
@@ -278,9 +276,8 @@ def list_models(
     for group in groups.values():
         names = {name for stage in group for name, _ in stage.settings}
         values = {name: {own[stage].setting(name) for stage in group} for name in names}
-        varying = {name for name in names & {*planner.weights} if len(values[name]) > 1}
         first, free = own[group[0]], None
-        settings = {name: first.setting(name) for name in sorted(names - varying)}
+        settings = {name: first.setting(name) for name in sorted(names - {*planner.weights})}
         if "nodes" in {*settings} & {*planner.refinements}:
             settings["nodes"] = max(values["nodes"])
         if first.size < finest.size:
@@ -293,21 +290,22 @@ def list_models(
         if isinstance(solver, LbfgsConfig):  # the rows have the numbers
             most = min(_TURNS, *(stage.solver.max_steps for stage in group))
             solver = dataclasses.replace(solver, max_steps=most, tolerance=0.0, patience=0)
-        model = Model(pairs, solver, tuple(sorted(varying)), free)
+        model = Model(pairs, solver, free)
         models |= dict.fromkeys(group, model)
     return models
 
 
-def _rows_of(planner: "OptimisedPlanner", attempt: Round, models: dict[Stage, Model]) -> list[Row]:
+def _rows_of(
+    planner: "OptimisedPlanner", attempt: Round, models: dict[Stage, Model], weights: list[str]
+) -> list[Row]:
     places = {model: k for k, model in enumerate(dict.fromkeys(models.values()))}
-    varying = sorted({name for model in places for name in model.varying})
     width, last, rows = attempt.starts, len(attempt.all_stages) - 1, []
     for k, stage in enumerate(attempt.all_stages):
         fields, solver = planner.with_settings(stage.settings), stage.solver
         is_lbfgs = isinstance(solver, LbfgsConfig)
         row = Row(
             solver=tuple(jax.tree.leaves(solver)) if is_lbfgs else (1, 0.0, 0),
-            weights={name: fields.setting(name) for name in varying},
+            weights={name: fields.setting(name) for name in weights},
             model=places[models[stage]],
             width=width,
             keep=1 if k == last else min(stage.keep or width, width),

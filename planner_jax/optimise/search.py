@@ -120,8 +120,7 @@ class Search:
         index: Array,
     ) -> Optimum:
         """Minimise from points (n, lanes) of the finest model."""
-        weights = {name: row.weights[name] for name in model.varying}
-        planner = self.planner.with_settings(model.settings).with_weights(weights)
+        planner = self.planner.with_settings(model.settings).with_weights(row.weights)
         solver = model.solver
         size, free = len(starts), None if model.free is None else jnp.array(model.free)
         if free is not None:

@@ -244,7 +244,7 @@ def solve_on_devices(
     is faster and large batches take about 10 % longer.
     """
     run = _solve_quickly if compiles_quickly and QUICK_OPTIONS else _solve_fast
-    return run(mesh, None, planner, planner.load_attempt(attempt, cases), (cases, before))
+    return run(mesh, None, *planner.load(attempt, cases), (cases, before))
 
 
 def _solve_and_count(
@@ -272,8 +272,7 @@ def program_key(
     """Return the key of the program that solves `num` cases per device, for the set `compiled`."""
     own = tuple((leaf.shape, leaf.dtype) for leaf in jax.tree.leaves(planner))
     lanes = tuple((leaf.shape[1:], leaf.dtype) for leaf in jax.tree.leaves(cases))
-    loaded = planner.load_attempt(attempt, cases)
-    tree = jax.tree.structure((planner, loaded, cases))
+    tree = jax.tree.structure((*planner.load(attempt, cases), cases))
     return tree, own, lanes, num, compiles_quickly, settings()
 
 
@@ -282,7 +281,7 @@ def solve_one(planner: Planner, case: PyTree, attempt: Attempt, before: PyTree =
 
     `before` is the best plan of earlier attempts, or None.
     """
-    own = planner, planner.load_attempt(attempt, case)
+    own = planner.load(attempt, case)
     quickly = planner.compiles_quickly(attempt)
     lane = case, score_of(attempt, case, before)
     return call_packed(_solve_one, None, own, lane, compiles_quickly=quickly)

@@ -46,7 +46,7 @@ def plan_mapped(drive: Drive, planner: Planner, cases: PyTree) -> PyTree:
 def plan_purely(planner: Planner, attempts: Sequence[Attempt], cases: PyTree) -> PyTree:
     """Return plans as jax arrays; while any case is unsolved, searches are made for all cases."""
     plans: PyTree = None
-    pairs = [(attempt, planner.load_attempt(attempt, cases)) for attempt in attempts]
+    pairs = [(attempt, planner.load(attempt, cases)[1]) for attempt in attempts]
     if attempts[0].continues:
         return _plan_in_groups(planner, pairs, cases)
     # Consecutive attempts (searches) with pytrees of equal structure share one compiled loop.

@@ -76,6 +76,15 @@ class Replanner(OptimisedPlanner[Replanning, PlanT], abc.ABC):
         inner = self.planner.with_settings(tuple(each for each in settings if each[0] not in own))
         return dataclasses.replace(self, **{"planner": inner, **own})  # type: ignore[type-var]
 
+    @property
+    def weights(self) -> tuple[str, ...]:  # type: ignore[override]
+        """The inner planner's numbers of the cost that rounds may change."""
+        return self.planner.weights
+
+    def with_weights(self, weights: dict[str, PyTree]) -> Self:
+        """Return a copy whose inner planner has arrays in fields that are listed in `weights`."""
+        return dataclasses.replace(self, planner=self.planner.with_weights(weights))  # type: ignore[type-var]
+
     def setting(self, name: str) -> PyTree:
         """Return the value of a field of this planner or, if it has none, of the inner planner."""
         return vars(self)[name] if name in vars(self) else self.planner.setting(name)

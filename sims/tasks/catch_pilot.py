@@ -114,7 +114,7 @@ class CatchPilot:
         choices = find_decision(DECISIONS, self.decide, TRAINED).propose(left)
         choice = jax.tree.map(lambda leaf: leaf[0], choices)
         planner, case = self.planner.planner, left.with_choice(choice)
-        return planner.solve(case, planner.load_attempt(self.search, case))
+        return planner.solve(case, self.search)
 
 
 def is_worth_flying(fresh: CatchPlan, warm: CatchPlan) -> Array:
