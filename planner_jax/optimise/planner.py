@@ -71,8 +71,8 @@ class OptimisedPlanner(Planner[CaseT, PlanT], abc.ABC):
     """
 
     rounds: tuple[Round, ...]  # attempts, in order
-    # Fields with numbers of the cost that the `settings` of rounds may change. They do not change
-    # `prepare`, `guesses` and `decode`, and may be arrays.
+    # Fields with numbers of the cost, which compiled programs read at run time. They do not change
+    # `prepare`, `guesses` and `decode`. The `settings` of rounds may change them.
     weights: ClassVar[tuple[str, ...]] = ()
     # Fields that the `settings` of rounds may change to refine plans. A plan of a coarse planner is
     # one of a fine planner, whose additional variables, `held`, are zero.
