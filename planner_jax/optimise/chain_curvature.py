@@ -35,7 +35,7 @@ def chain_curvature(
     offsets: Array,
     scale: Array,
     parameters: PyTree,
-    energy_weight: float,
+    energy_weight: Array | float,
     active: Array,
 ) -> Curvature:
     """Return evaluation, gradient and second derivatives of a trajectory's objective at a point.
