@@ -13,7 +13,8 @@ steps:
 The table has for each way the CPU time of the first call, which compiles, and of a later call (the
 median of --turns calls, in turns). The cache on the disk is not used, but a way may use programs of
 an earlier one. Further columns count the plans of all steps that solve their case, and those that
-the referee accepts. The cost gap is the median excess of their costs over those of a longer search.
+the referee accepts. The cost gap of a plan is the relative excess of its cost over the cost that a
+longer search finds. The table has its median.
 """
 
 import functools

@@ -69,6 +69,14 @@ def test_other_numbers_of_rounds_and_of_the_cost_are_data_of_the_same_program():
     assert np.sum(np.asarray(before[1].numbers) != np.asarray(after[1].numbers)) > 4
 
 
+@pytest.mark.parametrize("kind", [float, np.float32])
+def test_weights_of_any_kind_give_way_to_those_of_a_round(kind):
+    rounds = Round(), Round(settings=(("margin", 0.004),))
+    planner = dataclasses.replace(ExactCatch(), margin=kind(0.05), rounds=rounds)
+    (table,) = tables_of(planner, pj.catch.draw(1), is_whole=True)
+    np.testing.assert_allclose(table.rows.weights["margin"], [0.05, 0.004], rtol=1e-6)
+
+
 def test_another_margin_compiles_nothing_and_is_kept():
     case, planner = pj.take(pj.catch.draw(1), 0), ExactCatch()
     usual = pj.plan(planner, case)

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jax import Array
+from jax.core import Tracer
 from jaxtyping import PyTree
 
 from planner_jax.core.errors import ArgumentError
@@ -226,8 +227,9 @@ def load_group(planner: "OptimisedPlanner", group: Group) -> tuple[PyTree, Table
 
 def _make_table(planner: "OptimisedPlanner", group: Group) -> Table:
     stages = list(dict.fromkeys(s for each in group.rounds for s in each.all_stages))
-    models = list_models(planner, stages, group.is_whole)
-    weights = sorted(n for n in planner.weights if isinstance(planner.setting(n), int | float))
+    own = {name: planner.setting(name) for name in sorted(planner.weights)}
+    weights = [n for n, x in own.items() if np.ndim(x) == 0 and not isinstance(x, Tracer)]
+    models = list_models(planner, stages, weights, group.is_whole)
     lists = [_rows_of(planner, each, models, weights) for each in group.rounds]
     rows = list(itertools.chain(*(lists[k] for k in group.made)))
     every = list(itertools.chain(*lists))
@@ -239,7 +241,7 @@ def _make_table(planner: "OptimisedPlanner", group: Group) -> Table:
         rows += [unmade] * (most - len(rows))
     lasts = [each.all_stages[-1] for each in group.rounds]
     finest = max(lasts, key=lambda stage: planner.with_settings(stage.settings).size).settings
-    finest = tuple(pair for pair in finest if pair[0] not in planner.weights)
+    finest = tuple(pair for pair in finest if pair[0] not in weights)
     numbers = np.array([[float(x) for x in jax.tree.leaves(row)] for row in rows])
     is_gpu, turns = kernels.has_gpu(), models[lasts[0]].solver.max_steps
     return Table(
@@ -254,7 +256,7 @@ def _make_table(planner: "OptimisedPlanner", group: Group) -> Table:
 
 
 def list_models(
-    planner: "OptimisedPlanner", stages: Sequence[Stage], is_whole: bool
+    planner: "OptimisedPlanner", stages: Sequence[Stage], weights: Sequence[str], is_whole: bool
 ) -> dict[Stage, Model]:
     """Return the model of each stage; stages with equal constants share a model.
 
@@ -275,11 +277,10 @@ def list_models(
     models: dict[Stage, Model] = {}
     for group in groups.values():
         names = {name for stage in group for name, _ in stage.settings}
-        values = {name: {own[stage].setting(name) for stage in group} for name in names}
         first, free = own[group[0]], None
-        settings = {name: first.setting(name) for name in sorted(names - {*planner.weights})}
+        settings = {name: first.setting(name) for name in sorted(names - {*weights})}
         if "nodes" in {*settings} & {*planner.refinements}:
-            settings["nodes"] = max(values["nodes"])
+            settings["nodes"] = max(own[stage].setting("nodes") for stage in group)
         if first.size < finest.size:
             held = finest.held
             free = () if held is None else tuple(np.flatnonzero(~held).tolist())
