@@ -9,7 +9,7 @@ import pytest
 
 import planner_jax as pj
 from planner_jax.benchmarks.learn_starts import make_untrained, to_bytes
-from planner_jax.optimise.shipped import REACH, StartNetwork, load_network, select_start
+from planner_jax.optimise.shipped import REACH, StartNetwork, load_network
 from planner_jax.planning.decided import first_choice
 
 
@@ -45,14 +45,6 @@ def test_late_hits_begin_where_a_few_iterations_find_what_all_guesses_do_not():
         return pj.are_solved(pj.plan(planner, late)).mean()
 
     assert share(True) > share(False) + 0.1
-
-
-def test_a_guess_that_costs_more_is_not_taken():
-    cost = lambda x: jnp.sum(x**2)  # noqa: E731
-    guess = jnp.array([1.0, 1.0])
-    np.testing.assert_array_equal(select_start(cost, guess, jnp.array([0.5, 1.0])), [0.5, 1.0])
-    np.testing.assert_array_equal(select_start(cost, guess, jnp.array([4.0, 1.0])), guess)
-    np.testing.assert_array_equal(select_start(cost, guess, jnp.full(2, jnp.nan)), guess)
 
 
 def test_an_untrained_network_adds_nothing_and_far_features_count_as_less_far():

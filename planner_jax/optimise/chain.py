@@ -30,7 +30,7 @@ from planner_jax.cost.quadrotor import (
 )
 from planner_jax.optimise.planner import OptimisedPlanner
 from planner_jax.optimise.settings import Curvature, Evaluation
-from planner_jax.optimise.shipped import StartNetwork, load_scale, select_start
+from planner_jax.optimise.shipped import StartNetwork, load_scale
 from planner_jax.trajectory.polynomial import PiecewisePolynomial
 from planner_jax.trajectory.proportional_minco import (
     Chain,
@@ -171,11 +171,9 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
     def first_start(
         self, guess: Float[Array, " n"], features: Float[Array, " F"], context: PyTree
     ) -> Float[Array, " n"]:
-        """Return the first `guess`, or the point predicted from it if that costs less."""
-        learned = self.predict_start(guess, features, context.case)
-        if learned is None:
-            return guess
-        return select_start(lambda point: self.objective(point, context).cost, guess, learned)
+        """Return the first `guess`, or the point that a network predicts from it."""
+        network = self.start_network(context.case)
+        return guess if network is None else self.limit_learned(guess + network(features))
 
     def guesses(self, context: PyTree, num: int) -> Float[Array, "num n"]:
         """Return starting points (num, n), whose waypoint offsets are zero."""
@@ -190,13 +188,6 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
         if self.start_network(context.case) is None:
             return jnp.zeros((0,), context.case.head_state.dtype)
         return self.start_features(context)
-
-    def predict_start(
-        self, guess: Float[Array, " n"], features: Float[Array, " F"], case: PyTree
-    ) -> Float[Array, " n"] | None:
-        """Return a point that may cost less than the first `guess`; None if there is none."""
-        network = self.start_network(case)
-        return None if network is None else self.limit_learned(guess + network(features))
 
     def split(self, point: Float[Array, " n"]) -> tuple[Array, Array]:
         """Split a point: waypoint offsets (N, M - 1, 3), end variables (N, K) of N segments."""

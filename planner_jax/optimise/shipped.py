@@ -12,9 +12,7 @@ import functools
 import importlib.resources
 import io
 import json
-from collections.abc import Callable
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
@@ -44,12 +42,6 @@ class StartNetwork:
             if k + 1 < len(self.weights):
                 values = jnp.tanh(values)
         return values
-
-
-def select_start(cost: Callable[[Array], Array], guess: Array, learned: Array) -> Array:
-    """Return the point (n,) of lower cost: `guess`, or `learned`, which a network corrected."""
-    costs = jax.vmap(cost)(jnp.stack([guess, learned]))  # evaluate both points at once
-    return jnp.where(costs[1] < costs[0], learned, guess)
 
 
 @functools.cache

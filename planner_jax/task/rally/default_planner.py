@@ -157,19 +157,17 @@ class ExactRally(ChainPlanner[RallyCase, RallyPlan]):
         return point if metric is None else _multiply(metric.inverse, point)
 
     def guesses(self, context: RallyContext, num: int) -> Array:
-        """Return starting points (num, n) of the search, whose waypoint offsets are zero."""
+        """Return starting points (num, n) of the search.
+
+        With a metric, the first one is moved by the usual displacement of the optimum. All others
+        have no waypoint offsets.
+        """
         points = super().guesses(context, num)
         metric = self._metric(points.shape[1])
         if metric is None:
             return points
+        points = points.at[0].add(jnp.asarray(metric.shift, points.dtype))
         return jax.vmap(functools.partial(_multiply, metric.inverse))(points)
-
-    def predict_start(self, guess: Array, features: Array, case: RallyCase) -> Array | None:
-        """Return the first guess (n,) moved by the metric, or None without a metric."""
-        metric = self._metric(guess.size)
-        if metric is None:
-            return None
-        return guess + jnp.asarray(metric.inverse @ metric.shift, guess.dtype)
 
     def fit_attempt(self, attempt: Round, cases: RallyCase) -> Round:
         """Return an attempt (round), with fewer iterations if there is a metric."""
