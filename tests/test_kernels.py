@@ -20,7 +20,7 @@ from planner_jax.task.hit.default_planner import ExactHit
 
 LANES = 128
 # Number of GPU kernels by name in the compiled program of one search of the planner of hits.
-ROUND = {"flight_table": 1, "integrate_along": 3, "lbfgs_turn": 1, "greatest_along": 1}
+ROUND = {"flight_table": 1, "integrate_along": 2, "lbfgs_turn": 1, "greatest_along": 1}
 # Number of GPU kernels by name in the compiled program that differentiates a plan of a hit.
 GRADIENT = {"flight_table": 2, "integrate_along": 2, "positive_inverse": 1}
 
