@@ -8,6 +8,7 @@ derivatives. On other devices JAX compiles the functions of this module.
 import dataclasses
 import functools
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -131,11 +132,9 @@ def greatest_along(
     return _greatest(along)(columns, piece_durations, parameters)
 
 
-def _with_kernel(
-    function: Callable, along: Along, mode: str, jvp: Callable | None = None
-) -> Callable:
+def _with_kernel(function: Callable, along: Along, mode: str, **options: Any) -> Callable:
     path = "planner_jax.cost.along_kernel:along_kernel"
-    return with_kernel(functools.partial(function, along), path, along, mode, jvp=jvp)
+    return with_kernel(functools.partial(function, along), path, along, mode, **options)
 
 
 @functools.cache
@@ -148,13 +147,13 @@ def _greatest(along: Along) -> Callable:
 def _integral(along: Along) -> Callable:
     values = _with_kernel(_values, along, "values")
     slopes = _with_kernel(_slopes, along, "slopes")
-    curvature = _with_kernel(_curvature, along, "curvature")
+    curvature = _with_kernel(_curvature, along, "curvature", is_in_rule=True)
 
     def slopes_jvp(primals: tuple, tangents: tuple) -> tuple:
         moved = None if _is_still(tangents[2]) else jax.tree.map(_dense, tangents[2])
         return slopes_by_all(*primals), curvature(primals, (*map(_dense, tangents[:2]), moved))
 
-    slopes_by_all = _with_kernel(_slopes_by_all, along, "slopes by all", slopes_jvp)
+    slopes_by_all = _with_kernel(_slopes_by_all, along, "slopes by all", jvp=slopes_jvp)
 
     def values_jvp(primals: tuple, tangents: tuple) -> tuple:
         is_solvers = _is_still(tangents[2])  # the solver changes only columns and durations

@@ -94,6 +94,7 @@ def with_kernel(
     path: str,
     *constants: Hashable,
     jvp: Callable[[tuple, tuple], tuple[Results, Results]] | None = None,
+    is_in_rule: bool = False,
 ) -> Callable[..., Results]:
     """Attach a kernel to a function of one problem; `over_lanes` calls it for a batch on a GPU.
 
@@ -107,6 +108,8 @@ def with_kernel(
         constants: arguments of the factory. Functions of one path with different constants must
             have a different `repr` of them, which identifies programs in the compile cache.
         jvp: derivative as for `jax.custom_jvp`, with zeros as `SymbolicZero`; by default JAX's own.
+        is_in_rule: whether the function is called in the `jvp` of another one, with the tangents
+            as arguments. It then has no rule of its own, since JAX 0.12 cannot transpose one there.
     """
 
     @functools.cache
@@ -125,13 +128,15 @@ def with_kernel(
         call.__name__ = call.__qualname__ = name
         return jax.jit(call)
 
-    # Differentiate `function`, since a derivative of the compiled function would have its name, and
-    # `over_lanes` would replace the derivative by the kernel.
-    @jax.custom_jvp
-    def call_named(*args: object) -> Results:
+    def call_compiled(*args: object) -> Results:
         leaves, treedef = jax.tree.flatten(args)
         return compile_named(treedef, tuple(map(jnp.shape, leaves)))(*leaves)
 
+    if is_in_rule:
+        return call_compiled
+    # Differentiate `function`, since a derivative of the compiled function would have its name, and
+    # `over_lanes` would replace the derivative by the kernel.
+    call_named = jax.custom_jvp(call_compiled)
     if jvp is None:
         call_named.defjvp(lambda primals, tangents: jax.jvp(function, primals, tangents))
     else:
