@@ -8,7 +8,6 @@ derivatives. On other devices JAX compiles the functions of this module.
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -132,9 +131,16 @@ def greatest_along(
     return _greatest(along)(columns, piece_durations, parameters)
 
 
-def _with_kernel(function: Callable, along: Along, mode: str, **options: Any) -> Callable:
+def _with_kernel(
+    function: Callable,
+    along: Along,
+    mode: str,
+    jvp: Callable | None = None,
+    is_in_rule: bool = False,
+) -> Callable:
     path = "planner_jax.cost.along_kernel:along_kernel"
-    return with_kernel(functools.partial(function, along), path, along, mode, **options)
+    own = functools.partial(function, along)
+    return with_kernel(own, path, along, mode, jvp=jvp, is_in_rule=is_in_rule)
 
 
 @functools.cache

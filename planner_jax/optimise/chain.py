@@ -171,7 +171,7 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
     def first_start(
         self, guess: Float[Array, " n"], features: Float[Array, " F"], context: PyTree
     ) -> Float[Array, " n"]:
-        """Return the first `guess`, or the point that a network predicts from it."""
+        """Return the point at which the search starts: the prediction of a network, or `guess`."""
         network = self.start_network(context.case)
         return guess if network is None else self.limit_learned(guess + network(features))
 

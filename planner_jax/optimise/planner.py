@@ -128,10 +128,6 @@ class OptimisedPlanner(Planner[CaseT, PlanT], abc.ABC):
         """A number that grows with the number of variables, for planners with `refinements`."""
         return 0
 
-    def start_network(self, case: PyTree) -> Callable[[Array], Array] | None:
-        """Return the network that corrects the first guess of a case; by default None."""
-        return None
-
     def network_inputs(self, context: PyTree) -> Array:
         """Return the features (F,) of a case for its network; none without a network."""
         return jnp.zeros((0,))

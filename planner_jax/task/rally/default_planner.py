@@ -159,8 +159,8 @@ class ExactRally(ChainPlanner[RallyCase, RallyPlan]):
     def guesses(self, context: RallyContext, num: int) -> Array:
         """Return starting points (num, n) of the search.
 
-        With a metric, the first one is moved by the usual displacement of the optimum. All others
-        have no waypoint offsets.
+        The waypoint offsets of a point are zero. Only with a metric, the first point is moved from
+        there by the median displacement of the optimum that was measured with the metric.
         """
         points = super().guesses(context, num)
         metric = self._metric(points.shape[1])
