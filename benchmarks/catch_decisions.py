@@ -38,12 +38,12 @@ from planner_jax.optimise.settings import LbfgsConfig, Round
 from planner_jax.planning.decided import DecidedPlanner
 from planner_jax.policies.policy import policy
 from planner_jax.task.catch.decide import Random
-from planner_jax.task.catch.default_planner import ExactCatch
+from planner_jax.task.catch.default_planner import CatchProblem
 from planner_jax.task.catch.spec import SUITES
 
 OTHERS = ("throws", "hard", "square4", "pentagon5", "heptagon7")
 TRAINED_ON = [name for name in SUITES if name not in OTHERS]
-SHORT = ExactCatch(rounds=(Round(starts=1, solver=LbfgsConfig(max_steps=25)),))
+SHORT = CatchProblem.planner(rounds=(Round(starts=1, solver=LbfgsConfig(max_steps=25)),))
 
 
 def decision_time(decision: Any, cases: Any, num: int) -> float:
@@ -74,7 +74,7 @@ def run_row(bench: Bench, suite: str, name: str, decision: Any, options: Any) ->
     the decision proposes and the optimised times. The successes are added to the run's summary.
     """
     cases: Any = jax.tree.map(np.asarray, pj.catch.draw(options.num, suite, options.seed))
-    plans = pj.plan(DecidedPlanner(ExactCatch(), decision), cases)
+    plans = pj.plan(DecidedPlanner(CatchProblem.planner(), decision), cases)
     verdict = pj.catch.judge(cases, plans)
     success = verdict.success
     short = pj.plan(DecidedPlanner(SHORT, decision), cases)

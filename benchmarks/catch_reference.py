@@ -74,13 +74,13 @@ def read_set(path: Path, dtype) -> tuple[pj.catch.CatchCase, dict[str, np.ndarra
     return cases, known
 
 
-def guess_cost(planner: PaperCatch, case: pj.catch.CatchCase) -> jax.Array:
-    """Return the cost [Yu2023catch, eqs 18-28] at the planner's initial guess for a case.
+def guess_cost(problem: PaperCatch, case: pj.catch.CatchCase) -> jax.Array:
+    """Return the cost [Yu2023catch, eqs 18-28] at the initial guess for a case.
 
-    The planner divides its cost by the constant `COST_UNIT`; the returned cost is not divided.
+    The problem divides its cost by the constant `COST_UNIT`; the returned cost is not divided.
     """
-    context = planner.prepare(case)
-    return COST_UNIT * planner.objective(planner.guesses(context, 1)[0], context).cost
+    context = problem.prepare(case)
+    return COST_UNIT * problem.objective(problem.guesses(context, 1)[0], context).cost
 
 
 def latencies(planner, cases: pj.catch.CatchCase, repeats: int) -> str:
@@ -131,7 +131,7 @@ def report_paper_planner(bench: Bench, data: Path) -> None:
                 cost = jax.jit(jax.vmap(lambda s, p=chosen: guess_cost(p, s)))(cases)
                 error = np.abs(np.asarray(cost) / known[f"J0_M{pieces}"] - 1.0).max()
                 bench.say(f"{name}: cost of the guess, M = {pieces}: largest error {error:.1e}")
-            plans = pj.plan(PaperCatch(), cases)
+            plans = pj.plan(PaperCatch.planner(), cases)
             bench.say(f"{name}: catch, float64: {_gap(plans, known)}")
 
 
@@ -143,14 +143,14 @@ def _gap(plans, known: dict[str, np.ndarray]) -> str:
     )
 
 
-def quick_paper_catch() -> PaperCatch:
+def quick_paper_catch() -> pj.SearchPlanner:
     """Return a planner that minimises the objective of [Yu2023catch] in few iterations.
 
     Its speed is measured. On most of the 240 throws its costs are within 1e-3 (relative) of the
     optimum. The first stage of the search checks limits at a quarter of the samples, the second
     stage at all samples. The weights of the penalties are as published with [Yu2023catch].
     """
-    chosen = PaperCatch()
+    chosen = PaperCatch.planner()
     (full,) = chosen.rounds
     solver = dataclasses.replace(full.solver, max_steps=_QUICK, tolerance=1e-7, patience=5)
     coarse = dataclasses.replace(solver, max_steps=_QUICK_COARSE)
@@ -165,7 +165,7 @@ def report_set(bench: Bench, data: Path, name: str, repeats: int) -> None:
     The set `name` is "paper" for easy and "hard" for hard throws, in a file of the folder `data`.
     """
     cases, known = read_set(data / f"catch_{name}.csv", jnp.float32)
-    quick, exact = quick_paper_catch(), pj.catch.ExactCatch()
+    quick, exact = quick_paper_catch(), pj.catch.CatchProblem.planner()
     bench.say(
         f"{name}: catch, float32, quick: {_gap(pj.plan(quick, cases), known)}",
         f"{name}: catch, float32, quick: {throughput(quick, cases)}",

@@ -47,7 +47,8 @@ from planner_jax.trajectory.polynomial import PiecewisePolynomial
 
 SEEN = 0.1  # [s] Observations start this long before planning starts.
 WARM_UP = 5  # Number of throws that are simulated before the measurement.
-SCRATCH, AGAIN = pj.catch.ExactCatch(), pj.catch.ReplanCatch()
+SCRATCH = pj.catch.CatchProblem.planner()
+AGAIN: Any = SCRATCH.replanner()
 
 
 class Estimator:
@@ -177,7 +178,7 @@ def fly(
     first, flown, elapsed = current, [], 0.0
     for observation in observations[before + 1 :]:
         elapsed += period
-        if current.times[0] - elapsed < AGAIN.shortest:
+        if current.times[0] - elapsed < AGAIN.problem.shortest:
             break
         began = time.perf_counter()
         ball = estimator.see(observation)

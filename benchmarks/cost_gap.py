@@ -3,6 +3,7 @@
 Benchmarks of speed use it, to report how much cheaper the plans could be.
 """
 
+import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
@@ -11,7 +12,7 @@ import numpy as np
 
 from planner_jax.core.protocol import are_solved
 from planner_jax.core.registry import Task
-from planner_jax.optimise.planner import OptimisedPlanner
+from planner_jax.optimise.planner import SearchPlanner
 from planner_jax.optimise.settings import LbfgsConfig, NewtonConfig, Round, Stage
 from planner_jax.planning.decided import DecidedPlanner
 from planner_jax.planning.plan import plan
@@ -35,7 +36,7 @@ def cost_gaps(
 ) -> np.ndarray | None:
     """Return by what fraction the costs of plans exceed the costs that a long search finds.
 
-    For an `OptimisedPlanner`, the long search is L-BFGS and then Newton's method. For any other
+    For a `SearchPlanner`, the long search is L-BFGS and then Newton's method. For any other
     planner it is the planner that the task specification names as `yardstick`, or the planner
     itself with the yardstick's effort if both have the same class.
 
@@ -64,7 +65,7 @@ def cost_gaps(
 
 
 def _reference_planner(planner: Any, cases: Any, card: Task | None) -> Any:
-    if isinstance(planner, OptimisedPlanner):
+    if isinstance(planner, SearchPlanner):
         return with_long_search(planner)
     if card is None or not card.yardstick:
         return None
@@ -74,9 +75,9 @@ def _reference_planner(planner: Any, cases: Any, card: Task | None) -> Any:
     return yardstick if isinstance(cases, yardstick.case_type) else None
 
 
-def with_long_search(planner: OptimisedPlanner) -> OptimisedPlanner:
+def with_long_search(planner: SearchPlanner) -> SearchPlanner:
     """Return a copy of the planner whose only search is long, so that it finds the optimum."""
-    return planner.with_settings((("rounds", (TO_THE_OPTIMUM,)),))
+    return dataclasses.replace(planner, rounds=(TO_THE_OPTIMUM,))
 
 
 def gap_figures(*gaps: np.ndarray | None) -> dict[str, float | None]:

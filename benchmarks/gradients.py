@@ -48,7 +48,7 @@ def _case(task: str, num: int) -> tuple[Any, Any, Any]:
         found = pj.hit.planner("exact"), pj.hit.draw(num, seed=_SEED), "stroke.time"
     else:
         throws = first_choice(pj.catch.Greedy(), pj.catch.draw(num, seed=_SEED))
-        found = pj.catch.ExactCatch(), throws, _last_catch
+        found = pj.catch.CatchProblem.planner(), throws, _last_catch
     return found[0], jax.tree.map(np.asarray, found[1]), found[2]
 
 

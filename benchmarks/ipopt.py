@@ -44,8 +44,8 @@ from planner_jax.core.errors import install_line
 from planner_jax.core.protocol import FEASIBILITY_TOLERANCE
 from planner_jax.cost.along import BETWEEN_NODES
 from planner_jax.planning.decided import DecidedPlanner
-from planner_jax.task.catch.default_planner import ExactCatch
-from planner_jax.task.hit.default_planner import ExactHit
+from planner_jax.task.catch.default_planner import CatchProblem
+from planner_jax.task.hit.default_planner import HitProblem
 from planner_jax.trajectory.polynomial import snap_energy
 
 # Task -> suite from which cases are drawn, and module of `ipopt_peer` with the problem for IPOPT.
@@ -87,8 +87,9 @@ class Setup:
         self.cases: Any = jax.tree.map(np.asarray, self.card.draw(num, suite, seed))
         made = self.card.planner("exact", **self.card.bench)
         planner = made.planner if isinstance(made, DecidedPlanner) else made
-        assert isinstance(planner, ExactHit | ExactCatch)
-        self.planner = planner
+        assert isinstance(planner, pj.SearchPlanner)
+        self.problem = planner.problem
+        assert isinstance(self.problem, HitProblem | CatchProblem)
         self.module = importlib.import_module(f"planner_jax.benchmarks.ipopt_peer.{module}")
         decided = self.cases
         if isinstance(made, DecidedPlanner):
@@ -97,16 +98,16 @@ class Setup:
         with jax.enable_x64(True):
             exact = lambda x: jnp.asarray(x, float) if x.dtype.kind == "f" else jnp.asarray(x)  # noqa: E731
             decided = jax.tree.map(lambda x: exact(np.asarray(x)), decided)
-            self.contexts = jax.jit(jax.vmap(self.planner.prepare))(decided)
+            self.contexts = jax.jit(jax.vmap(self.problem.prepare))(decided)
             self.batches = {}
-            params = peer.stack_params(self.module, self.planner, self.contexts)
+            params = peer.stack_params(self.module, self.problem, self.contexts)
             for label, learned in (("learned", True), ("smooth", False)):
-                planner = self.planner.with_settings((("learned", learned),))
-                first = lambda context, planner=planner: planner.guesses(context, 1)[0]  # noqa: E731
+                own = self.problem.with_settings((("learned", learned),))
+                first = lambda context, own=own: own.guesses(context, 1)[0]  # noqa: E731
                 starts = np.asarray(jax.jit(jax.vmap(first))(self.contexts))
                 self.batches[label] = peer.Batch(params, starts)
-            self._decode = jax.jit(jax.vmap(self.planner.decode))
-            self._objective = jax.jit(jax.vmap(self.planner.objective))
+            self._decode = jax.jit(jax.vmap(self.problem.decode))
+            self._objective = jax.jit(jax.vmap(self.problem.objective))
 
     def plans(self, points: np.ndarray) -> Any:
         """Convert n decision variables of each of B cases, (B, n), to plans in float64."""
@@ -126,9 +127,9 @@ class Setup:
         """Return the costs (B,) of the plans' snap and time, in float64 and without penalties."""
         with jax.enable_x64(True):
             path = jax.tree.map(lambda x: jnp.asarray(np.asarray(x), float), plans.trajectory)
-            cost = self.planner.energy_weight * np.asarray(jax.vmap(snap_energy)(path))
-        if isinstance(self.planner, ExactCatch):
-            cost = cost + self.planner.time_weight * np.asarray(plans.times, float)[:, -1]
+            cost = self.problem.energy_weight * np.asarray(jax.vmap(snap_energy)(path))
+        if isinstance(self.problem, CatchProblem):
+            cost = cost + self.problem.time_weight * np.asarray(plans.times, float)[:, -1]
         return cost
 
 
@@ -232,7 +233,7 @@ def measure(bench: Bench, name: str, options: Any) -> None:
     )
     runs, peers, kept = [], {}, {}
     for form in peer_module.TRIED:
-        peer = peers[form] = peer_module.Peer(setup.module, setup.planner, form, unit)
+        peer = peers[form] = peer_module.Peer(setup.module, setup.problem, form, unit)
         accepted = lambda points: tuning.judge(tuning.plans(points))  # noqa: E731
         kept[form], rows = peer_module.best_setting(peer, tuning.batches["learned"], accepted)
         for row in rows:

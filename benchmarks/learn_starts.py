@@ -199,13 +199,13 @@ TASKS = {
     "hit": _NetworkSpec(
         "hit/start_exact-12.npz",
         draw_hits,
-        pj.hit.ExactHit(learned=False),
+        pj.hit.HitProblem.planner(learned=False),
         lambda num, seed: pj.hit.draw(num, seed=seed),
     ),
     "hard-hit": _NetworkSpec(
         "hit/start_exact-12-supple.npz",
         draw_hard_hits,
-        pj.hit.ExactHit(learned=False).with_settings(WITH_VELOCITIES),
+        pj.hit.HitProblem.planner(learned=False).with_settings(WITH_VELOCITIES),
         draw_hard_hits,
         hidden=(160, 160),
         floor=3e-5,
@@ -214,7 +214,7 @@ TASKS = {
     "catch": _NetworkSpec(
         "catch/start_exact-6.npz",
         draw_catches,
-        pj.catch.ExactCatch(learned=False),
+        pj.catch.CatchProblem.planner(learned=False),
         _draw_throws,
     ),
 }
@@ -267,21 +267,21 @@ def train(
 
     The training takes `minutes`, and `say` prints its progress.
     """
-    planner = spec.planner
+    problem = spec.planner.problem
     pool = jax.device_put(jax.tree.map(jnp.asarray, spec.draw(_POOL, seed)))
-    prepare = jax.jit(jax.vmap(planner.prepare))
+    prepare = jax.jit(jax.vmap(problem.prepare))
     few = prepare(jax.tree.map(lambda leaf: leaf[:16_384], pool))
-    features = np.asarray(jax.jit(jax.vmap(planner.start_features))(few), np.float64)
-    network = make_untrained(features, len(planner.scale), spec.hidden)
+    features = np.asarray(jax.jit(jax.vmap(problem.start_features))(few), np.float64)
+    network = make_untrained(features, len(problem.scale), spec.hidden)
     params = jax.tree.map(jnp.asarray, (network.weights, network.biases))
 
     def loss(params: Any, cases: Any) -> Any:
         own = dataclasses.replace(network, weights=params[0], biases=params[1])
 
         def of_case(case: Any) -> Any:
-            context = planner.prepare(case)
-            guess = planner.guesses(context, 1)[0] + own(planner.start_features(context))
-            return jnp.log(planner.objective(guess, context).cost + spec.floor)
+            context = problem.prepare(case)
+            guess = problem.guesses(context, 1)[0] + own(problem.start_features(context))
+            return jnp.log(problem.objective(guess, context).cost + spec.floor)
 
         logs = jax.vmap(of_case)(cases)
         return jnp.mean(jnp.where(jnp.isfinite(logs), logs, 20.0))
@@ -326,7 +326,7 @@ def compare(bench: Bench, task: str, num: int) -> None:
     cases = jax.tree.map(np.asarray, spec.usual(num, _SEED_APART))
     planners = {
         "smooth": spec.planner,
-        "learned": dataclasses.replace(spec.planner, learned=True),
+        "learned": spec.planner.with_settings((("learned", True),)),
     }
     best = np.minimum(*(pj.plan(with_long_search(each), cases).cost for each in planners.values()))
     bench.say(

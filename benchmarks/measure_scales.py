@@ -1,4 +1,4 @@
-"""Measure the scales of the variables of `ExactHit` and `ExactCatch`, and the metric of rallies.
+"""Measure the scales of the variables of hits and catches, and the metric of rallies.
 
     python -m benchmarks.measure_scales [--write] [--out DIR]
 
@@ -34,7 +34,7 @@ import planner_jax.task
 from planner_jax.benchmarks.run import Bench, argument_parser, begin
 from planner_jax.core.registry import task_named
 from planner_jax.cost.quadrotor import limits_along
-from planner_jax.optimise.chain import ChainPlanner
+from planner_jax.optimise.chain import ChainProblem
 from planner_jax.optimise.multistart import minimise
 from planner_jax.optimise.settings import LbfgsConfig
 from planner_jax.planning.decided import first_choice
@@ -59,8 +59,8 @@ _FIRST_CATCH = (0.03, 0.5, 0.5, 0.6, 0.6, 0.6, 2.0, 2.0, 2.0, 40.0, 40.0, 30.0)
 _CATCH_FLOOR = 0.1
 
 
-# Type of a function that returns the residuals (R,) of a planner at n decision variables (n,). Its
-# third argument is the result of the planner's `prepare` for one case.
+# Type of a function that returns the residuals (R,) of a problem at n decision variables (n,). Its
+# third argument is the result of the problem's `prepare` for one case.
 Residuals = Callable[[Any, jax.Array, Any], jax.Array]
 _LEAST_EIGENVALUE = 3e-3  # Least eigenvalue of the Hessian for a metric, relative to the greatest.
 _ROUNDS = 3  # Number of measurements, each with the scales that the previous one measured.
@@ -73,19 +73,19 @@ def curvature_diagonal(residuals: Callable[[jax.Array], jax.Array], point: jax.A
 
 
 def measure_scale(
-    planner: Any, cases: Any, residuals: Residuals, *, floor: float = 1e-4
+    problem: Any, cases: Any, residuals: Residuals, *, floor: float = 1e-4
 ) -> np.ndarray:
-    """Measure the scale of every decision variable of a planner on a batch of cases.
+    """Measure the scale of every decision variable of a problem on a batch of cases.
 
     The solutions at which curvature is measured depend on the scales with which they are computed.
     The measurement is therefore made three times, each time with the scales measured before. It
     converges in two or three measurements.
 
     Args:
-        planner: a frozen dataclass with a `scale` field, whose initial value is only a rough guess.
+        problem: a frozen dataclass with a `scale` field, whose initial value is only a rough guess.
         cases: a batch of a few hundred cases, some of them hard, so that limits are active.
-        residuals: function of the planner, a point (n,) of the n decision variables, and the result
-            of the planner's `prepare` for a case. Returns residuals whose squares sum to about
+        residuals: function of the problem, a point (n,) of the n decision variables, and the result
+            of the problem's `prepare` for a case. Returns residuals whose squares sum to about
             twice the objective near its minimum.
         floor: added to the curvature, so that a variable with almost no effect gets a finite scale.
 
@@ -95,27 +95,27 @@ def measure_scale(
     config = LbfgsConfig(max_steps=30)
     for _ in range(_ROUNDS):
 
-        def diagonals(case: Any, planner: Any = planner) -> jax.Array:
-            context = planner.prepare(case)
-            scale = jnp.asarray(planner.scale)
-            start = planner.first_guess(context)
-            optimum = minimise(lambda x: planner.objective(x, context), start, config)
+        def diagonals(case: Any, problem: Any = problem) -> jax.Array:
+            context = problem.prepare(case)
+            scale = jnp.asarray(problem.scale)
+            start = problem.first_guess(context)
+            optimum = minimise(lambda x: problem.objective(x, context), start, config)
 
             def at(point: jax.Array) -> jax.Array:
                 return curvature_diagonal(
-                    lambda natural: residuals(planner, natural / scale, context), point * scale
+                    lambda natural: residuals(problem, natural / scale, context), point * scale
                 )
 
             return at(start) + at(optimum.point)
 
         curvature = np.asarray(jax.jit(jax.vmap(diagonals))(cases), np.float64)
         scale = 1.0 / np.sqrt(floor + np.nanmedian(curvature, axis=0))
-        planner = dataclasses.replace(planner, scale=tuple(scale.tolist()))
-    return np.asarray(planner.scale)
+        problem = dataclasses.replace(problem, scale=tuple(scale.tolist()))
+    return np.asarray(problem.scale)
 
 
-def measure_metric(planner: Any, cases: Any) -> dict[str, np.ndarray]:
-    """Measure the metric of a planner's n variables on a batch of cases.
+def measure_metric(problem: Any, cases: Any) -> dict[str, np.ndarray]:
+    """Measure the metric of a problem's n variables on a batch of cases.
 
     Returns:
         `factor` (n, n), the inverse square root of the median Hessian, whose small eigenvalues are
@@ -124,9 +124,9 @@ def measure_metric(planner: Any, cases: Any) -> dict[str, np.ndarray]:
     config = LbfgsConfig(max_steps=60, tolerance=1e-6, patience=6)
 
     def search(case: Any) -> tuple[jax.Array, jax.Array]:
-        context = planner.prepare(case)
-        cost = lambda x: planner.objective(x, context)  # noqa: E731
-        start = planner.first_guess(context)
+        context = problem.prepare(case)
+        cost = lambda x: problem.objective(x, context)  # noqa: E731
+        start = problem.first_guess(context)
         point = minimise(cost, start, config).point
         return jax.hessian(lambda x: cost(x).cost)(point), point - start
 
@@ -138,8 +138,8 @@ def measure_metric(planner: Any, cases: Any) -> dict[str, np.ndarray]:
     return {"factor": factor, "shift": np.median(shifts[sound], axis=0)}
 
 
-def chain_residuals(planner: ChainPlanner, point: jax.Array, context: Any) -> jax.Array:
-    """Return residuals whose squares sum to about twice a planner's objective near its minimum.
+def chain_residuals(problem: ChainProblem, point: jax.Array, context: Any) -> jax.Array:
+    """Return residuals whose squares sum to about twice a problem's objective near its minimum.
 
     The residuals belong to the penalties of limits, the snap energy and the durations. A penalty is
     max(excess, 0), smoothed over an interval of the excess from 0 to `hinge_width`. Its second
@@ -147,34 +147,34 @@ def chain_residuals(planner: ChainPlanner, point: jax.Array, context: Any) -> ja
     positive excess, which overestimates the curvature of clearly exceeded limits.
 
     Args:
-        planner: planner of hits or catches.
+        problem: problem of hits or catches.
         point: (n,), its decision variables.
-        context: result of the planner's `prepare` for one case.
+        context: result of the problem's `prepare` for one case.
     """
-    case, along = context.case, planner.along(planner.nodes, context.case)
-    offsets, natural = planner.split(point)
-    ends = planner.meet(natural, context)
-    durations = ends.durations / planner.num_pieces
+    case, along = context.case, problem.along(problem.nodes, context.case)
+    offsets, natural = problem.split(point)
+    ends = problem.meet(natural, context)
+    durations = ends.durations / problem.num_pieces
     rows = chain_rows(case.head_state, ends.tail_states, durations)
     chain = Chain(rows=rows, offsets=offsets, piece_durations=durations)
-    active = planner.active(context)
-    sample = functools.partial(sample_motion, planner.maps, planner.nodes, orders=along.orders)
+    active = problem.active(context)
+    sample = functools.partial(sample_motion, problem.maps, problem.nodes, orders=along.orders)
     motion = jax.vmap(sample)(chain.columns, durations)
     excess = jnp.stack(limits_along(motion, (case.gravity, case.limits, case.extras)))
     excess = jnp.where(active[:, None], excess, -1.0)
     inside = jnp.maximum(excess + jnp.asarray(along.margins, point.dtype)[:, None, None], 0.0)
     inside = inside * jnp.sqrt(durations[:, None] * jnp.asarray(along.weights(), point.dtype))
-    at_ends = jnp.sqrt(planner.end_weight) * jnp.maximum(ends.excess + planner.margin, 0.0)
-    bend = jnp.sqrt(1.5 / planner.hinge_width)
-    if planner.time_weight:
-        energy = jax.vmap(functools.partial(trajectory_energy, planner.maps))
+    at_ends = jnp.sqrt(problem.end_weight) * jnp.maximum(ends.excess + problem.margin, 0.0)
+    bend = jnp.sqrt(1.5 / problem.hinge_width)
+    if problem.time_weight:
+        energy = jax.vmap(functools.partial(trajectory_energy, problem.maps))
         energy = jnp.where(active, energy(rows, offsets, durations), 0.0)
-        smooth = jnp.sqrt(2.0 * planner.energy_weight * jnp.maximum(energy, 1e-6))
+        smooth = jnp.sqrt(2.0 * problem.energy_weight * jnp.maximum(energy, 1e-6))
     else:
-        unit = jnp.sqrt(planner.energy_weight / durations ** (2 * planner.maps.order - 1))
-        smooth = unit[:, None, None] * np.sqrt(planner.maps.offset_energy) * offsets
+        unit = jnp.sqrt(problem.energy_weight / durations ** (2 * problem.maps.order - 1))
+        smooth = unit[:, None, None] * np.sqrt(problem.maps.offset_energy) * offsets
     spent = jnp.where(active, ends.durations, 1e-6)
-    late = jnp.sqrt(2.0 * planner.time_weight * jnp.maximum(spent, 1e-6))
+    late = jnp.sqrt(2.0 * problem.time_weight * jnp.maximum(spent, 1e-6))
     parts = (bend * inside, bend * at_ends, smooth, late)
     return jnp.concatenate([part.ravel() for part in parts])
 
@@ -215,8 +215,8 @@ def draw_weak_throws(num: int, seed: int) -> pj.catch.CatchCase:
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *batches)
 
 
-def hit_planners() -> dict[str, Any]:
-    """Return planners of hits with 6 and 12 pieces, whose scales are rough initial guesses.
+def hit_problems() -> dict[str, Any]:
+    """Return problems of hits with 6 and 12 pieces, whose scales are rough initial guesses.
 
     The keys "exact-6" and "exact-12" name the measured scales in `measured_scales.json`.
     """
@@ -224,12 +224,12 @@ def hit_planners() -> dict[str, Any]:
     for pieces in HIT_PIECES:
         first = (0.2,) * (3 * (pieces - 1)) + _FIRST_HIT
         proportions = (0.2, 0.5) + (1.0,) * (pieces - 2)
-        found[f"exact-{pieces}"] = pj.hit.ExactHit(proportions=proportions, scale=first)
+        found[f"exact-{pieces}"] = pj.hit.HitProblem(proportions=proportions, scale=first)
     return found
 
 
-def catch_planners() -> dict[str, Any]:
-    """Return a planner of catches with 6 pieces, whose scales are rough initial guesses.
+def catch_problems() -> dict[str, Any]:
+    """Return a problem of catches with 6 pieces, whose scales are rough initial guesses.
 
     The key "exact-6" names the measured scales in `measured_scales.json`.
     """
@@ -237,34 +237,35 @@ def catch_planners() -> dict[str, Any]:
     for pieces in CATCH_PIECES:
         first = (0.3,) * (3 * (pieces - 1)) + _FIRST_CATCH
         proportions = (0.3,) + (1.0,) * (pieces - 1)
-        found[f"exact-{pieces}"] = pj.catch.ExactCatch(proportions=proportions, scale=first)
+        found[f"exact-{pieces}"] = pj.catch.CatchProblem(proportions=proportions, scale=first)
     return found
 
 
-# Task -> function that draws cases, function that creates planners, and options of `measure_scale`.
+# Task -> function that draws cases, function that creates problems, and options of `measure_scale`.
 TASKS = {
-    "hit": (draw_hard_serves, hit_planners, {}),
-    "catch": (draw_weak_throws, catch_planners, {"floor": _CATCH_FLOOR}),
+    "hit": (draw_hard_serves, hit_problems, {}),
+    "catch": (draw_weak_throws, catch_problems, {"floor": _CATCH_FLOOR}),
 }
 
 
 def measure(bench: Bench, task: str, num: int, seed: int) -> dict[str, np.ndarray]:
-    """Measure the scales of the variables of a task's planners, and compare with shipped scales.
+    """Measure the scales of the variables of a task's problems, and compare with shipped scales.
 
     `task` is "hit" or "catch". `num` and `seed` define the drawn cases. Returns the scales by
-    the planner's name, such as "exact-6" for a trajectory of 6 pieces.
+    the problem's name, such as "exact-6" for a trajectory of 6 pieces.
     """
-    draw, planners, options = TASKS[task]
+    draw, problems, options = TASKS[task]
     cases, found = draw(num, seed), {}
     shipped = json.loads(locate_file(task).read_text("utf-8"))
-    for name, planner in planners().items():
-        scale = found[name] = measure_scale(planner, cases, chain_residuals, **options)
+    for name, problem in problems().items():
+        scale = found[name] = measure_scale(problem, cases, chain_residuals, **options)
         bench.say(f"{task} {name} {np.array2string(scale, precision=3, max_line_width=100)}")
         ratio = None
         if name in shipped:
             ratio = np.exp(np.abs(np.log(scale / np.asarray(shipped[name]))).max())
             bench.say(f"  largest ratio to the shipped scale: {ratio:.2f}")
-        plans = pj.plan(dataclasses.replace(planner, scale=tuple(scale.tolist())), cases)
+        again = dataclasses.replace(problem, scale=tuple(scale.tolist()))
+        plans = pj.plan(pj.SearchPlanner(again), cases)
         success = task_named(task).judge(cases, plans).success
         bench.count(success)
         bench.say(f"  refereed success with the measured scale: {100 * success.mean():.2f} %")
@@ -291,7 +292,7 @@ def main() -> None:
         for task in options.tasks:
             if task == "rally":
                 cases = pj.rally.draw(options.num, seed=options.seed)
-                metric = measure_metric(pj.rally.ExactRally(metric=False), cases)
+                metric = measure_metric(pj.rally.RallyProblem(metric=False), cases)
                 path = locate_file(task).with_name("metric_exact-6.npz")
                 bench.say(f"condition of the metric: {np.linalg.cond(metric['factor']):.1f}")
                 if options.write:

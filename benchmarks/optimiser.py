@@ -25,9 +25,9 @@ from planner_jax.benchmarks.cost_gap import gap_figures
 from planner_jax.benchmarks.hit_rows import ROWS
 from planner_jax.benchmarks.run import argument_parser, begin
 from planner_jax.optimise.multistart import minimise
-from planner_jax.task.hit.default_planner import ExactHit
+from planner_jax.task.hit.default_planner import HitProblem
 
-PLANNER = ExactHit()
+PROBLEM = HitProblem()
 
 
 def make_own_solver(iterations: int) -> Callable:
@@ -37,10 +37,10 @@ def make_own_solver(iterations: int) -> Callable:
     """
 
     def solve(case):
-        context = PLANNER.prepare(case)
-        start = PLANNER.guesses(context, 1)[0]
+        context = PROBLEM.prepare(case)
+        start = PROBLEM.guesses(context, 1)[0]
         found = minimise(
-            lambda x: PLANNER.objective(x, context), start, pj.LbfgsConfig(max_steps=iterations)
+            lambda x: PROBLEM.objective(x, context), start, pj.LbfgsConfig(max_steps=iterations)
         )
         return found.point, found.iterations
 
@@ -55,11 +55,11 @@ def make_optax_solver(iterations: int) -> Callable:
     """
 
     def solve(case):
-        context = PLANNER.prepare(case)
+        context = PROBLEM.prepare(case)
         solver = optax.lbfgs(memory_size=6)
 
         def cost(x):
-            return PLANNER.objective(x, context).cost
+            return PROBLEM.objective(x, context).cost
 
         def step(_, carry):
             point, state = carry
@@ -69,7 +69,7 @@ def make_optax_solver(iterations: int) -> Callable:
             )
             return optax.apply_updates(point, updates), state
 
-        start = PLANNER.guesses(context, 1)[0]
+        start = PROBLEM.guesses(context, 1)[0]
         point, _ = jax.lax.fori_loop(0, iterations, step, (start, solver.init(start)))
         return point, jnp.asarray(iterations)
 
@@ -95,9 +95,9 @@ def run_scipy(cases, iterations: int) -> tuple[np.ndarray, float, float]:
     Returns n decision variables of each case (B, n), the mean number of iterations, and the
     duration [s].
     """
-    contexts = jax.jit(jax.vmap(PLANNER.prepare))(cases)
-    starts = np.asarray(jax.jit(jax.vmap(lambda c: PLANNER.guesses(c, 1)[0]))(contexts), float)
-    value_and_grad = jax.jit(jax.value_and_grad(lambda x, c: PLANNER.objective(x, c).cost))
+    contexts = jax.jit(jax.vmap(PROBLEM.prepare))(cases)
+    starts = np.asarray(jax.jit(jax.vmap(lambda c: PROBLEM.guesses(c, 1)[0]))(contexts), float)
+    value_and_grad = jax.jit(jax.value_and_grad(lambda x, c: PROBLEM.objective(x, c).cost))
     lanes = [jax.tree.map(lambda x, k=k: x[k], contexts) for k in range(len(starts))]
     value_and_grad(starts[0], lanes[0])
     points, counts = [], []
@@ -125,15 +125,15 @@ def main() -> None:
     parser.add_argument("--row", default="late-0.5", choices=[*ROWS][:-1], help="default: late-0.5")
     options = parser.parse_args()
     cases = pj.hit.draw(options.num, seed=2, **ROWS[options.row])
-    final = jax.jit(jax.vmap(lambda s, x: PLANNER.objective(x, PLANNER.prepare(s)).cost))
-    decode = jax.jit(jax.vmap(lambda s, x: PLANNER.decode(x, PLANNER.prepare(s))))
+    final = jax.jit(jax.vmap(lambda s, x: PROBLEM.objective(x, PROBLEM.prepare(s)).cost))
+    decode = jax.jit(jax.vmap(lambda s, x: PROBLEM.decode(x, PROBLEM.prepare(s))))
     with begin(parser, options) as bench:
         bench.say(
             f"{options.num} generated serves, row {options.row}, {jax.devices()[0].platform}",
             "| solver | iterations | ms a plan | median cost | mean cost | success |",
             "|---|---|---|---|---|---|",
         )
-        best = pj.plan(PLANNER.with_solver(), jax.tree.map(np.asarray, cases))
+        best = pj.plan(pj.SearchPlanner(PROBLEM).with_solver(), jax.tree.map(np.asarray, cases))
         runs = {
             "planner_jax": lambda n: run_batched(make_own_solver(n), cases),
             "optax.lbfgs": lambda n: run_batched(make_optax_solver(n), cases),

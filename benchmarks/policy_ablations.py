@@ -36,7 +36,7 @@ from planner_jax.planning.decided import DecidedPlanner
 from planner_jax.policies.policy import Policy
 from planner_jax.policies.settings import WEIGHTS
 from planner_jax.policies.training import Part, Training, train
-from planner_jax.task.catch.default_planner import ExactCatch
+from planner_jax.task.catch.default_planner import CatchProblem
 from planner_jax.task.catch.spec import SUITES
 
 ITERATIONS = 25  # Number of the planner's iterations for each decision in training.
@@ -88,7 +88,7 @@ def judge_decision(
     last catch [s], and the mean relative difference between decided and optimised times.
     """
     cases: Any = jax.tree.map(np.asarray, pj.catch.draw(options.num, suite, options.seed))
-    plans = pj.plan(DecidedPlanner(ExactCatch(), decision), cases)
+    plans = pj.plan(DecidedPlanner(CatchProblem.planner(), decision), cases)
     good = pj.catch.judge(cases, plans).success
     bench.count(good)
     return {

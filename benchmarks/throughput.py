@@ -35,7 +35,7 @@ from planner_jax.benchmarks.run import Bench, argument_parser, begin, parse_name
 from planner_jax.benchmarks.throughput_settings import ThroughputSettings
 from planner_jax.core.choices import require
 from planner_jax.core.registry import Task, all_tasks, task_named
-from planner_jax.optimise.planner import OptimisedPlanner
+from planner_jax.optimise.planner import SearchPlanner
 from planner_jax.planning.decided import DecidedPlanner
 from planner_jax.planning.plan import plan
 from planner_jax.runs.timing import CompileClock
@@ -75,7 +75,7 @@ def measure(bench: Bench, settings: ThroughputSettings) -> None:
     effort = {} if settings.effort is None else {"effort": settings.effort}
     made = card.planner(str(settings.planner), **card.bench, **effort)
     solver = made.planner if isinstance(made, DecidedPlanner) else made
-    has_rounds = isinstance(solver, OptimisedPlanner)
+    has_rounds = isinstance(solver, SearchPlanner)
     if iterations is not None:
         rule = "left out for a planner without rounds"
         require(has_rounds, "iterations", rule, iterations)

@@ -30,7 +30,8 @@ from .cost.extra_kinds import SpeedZone as SpeedZone
 from .export.api import export as export
 from .host.compile_cache import keep_compiled_programs as keep_compiled_programs
 from .optimise.implicit import optimal_plan as optimal_plan
-from .optimise.planner import OptimisedPlanner as OptimisedPlanner
+from .optimise.planner import Problem as Problem
+from .optimise.planner import SearchPlanner as SearchPlanner
 from .optimise.planner import pending as pending
 from .optimise.settings import Evaluation as Evaluation
 from .optimise.settings import LbfgsConfig as LbfgsConfig
@@ -46,7 +47,7 @@ from .planning.plan import plan as plan
 from .planning.plan import solve as solve
 from .planning.replan import replan as replan
 from .planning.warm_up import warm_up as warm_up
-from .recovery.planner import RecoveryPlanner as RecoveryPlanner
+from .recovery.planner import RecoveryProblem as RecoveryProblem
 from .recovery.with_recovery import RecoveringPlanner as RecoveringPlanner
 from .referee.judging import Verdict as Verdict
 from .robot.drag_fit import fit_drag as fit_drag

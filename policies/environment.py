@@ -30,7 +30,7 @@ from planner_jax.policies.observation import FEATURES, PER_TARGET, choice_of, ob
 from planner_jax.policies.settings import WEIGHTS
 from planner_jax.task.catch.case import CatchCase, CatchChoice
 from planner_jax.task.catch.decide import in_several_lengths
-from planner_jax.task.catch.default_planner import ExactCatch
+from planner_jax.task.catch.default_planner import CatchProblem
 from planner_jax.task.catch.estimate import earliest_next, shortfall, timetable
 from planner_jax.task.catch.spec import SUITES
 from planner_jax.task.catch.suites import draw_by_key
@@ -43,7 +43,7 @@ _GATED = ("solved", "last", "ratio", "caught")
 class CatchEnv(Env):
     """An environment that rewards decisions by the planner's results, or by a cheap estimate.
 
-    The planner `ExactCatch` optimises a trajectory for each case from one initial guess, the
+    The planner `CatchProblem` optimises a trajectory for each case from one initial guess, the
     decision. Suites whose cases have equal shapes and equal iterations are planned in one call.
 
     Args:
@@ -220,12 +220,13 @@ def evaluate_actions(cases: CatchCase, actions: Array, iterations: int) -> dict[
 
 def _plan(cases: CatchCase, choices: CatchChoice, iterations: int) -> tuple[CatchChoice, Any]:
     if not cases.optional:
-        return choices, ExactCatch().solve_lanes(cases.with_choice(choices), _search(iterations))
+        decided = cases.with_choice(choices)
+        return choices, CatchProblem.planner().solve_lanes(decided, _search(iterations))
     several = jax.vmap(in_several_lengths)(cases, jax.tree.map(lambda x: x[:, None], choices))
     num = several.times.shape[1]
     flat = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), several)
     tried = jax.tree.map(lambda leaf: jnp.repeat(leaf, num, axis=0), cases).with_choice(flat)
-    found = ExactCatch().solve_lanes(tried, _search(iterations))
+    found = CatchProblem.planner().solve_lanes(tried, _search(iterations))
     each = jax.tree.map(lambda leaf: leaf.reshape(-1, num, *leaf.shape[1:]), (flat, found))
     # Each decision was also planned without its last catches. These variants are sorted by falling
     # number of catches, so that the first solved variant has the most catches.
@@ -235,7 +236,7 @@ def _plan(cases: CatchCase, choices: CatchChoice, iterations: int) -> tuple[Catc
 
 def _search(iterations: int) -> Table:
     attempt = Round(starts=1, solver=LbfgsConfig(max_steps=iterations))
-    return load_group(ExactCatch(), Group.of((attempt,), (0,)))[1]
+    return load_group(CatchProblem(), Group.of((attempt,), (0,)))[1]
 
 
 def weight_terms(terms: Mapping[str, Array], weights: Mapping[str, Any]) -> Array:

@@ -58,7 +58,7 @@ from planner_jax.runs.environment import code_digest, find_version
 from planner_jax.runs.manifest import to_write
 from planner_jax.runs.run_folder import RunFolder
 from planner_jax.task.catch.decide import optimal_time_ratio
-from planner_jax.task.catch.default_planner import ExactCatch
+from planner_jax.task.catch.default_planner import CatchProblem
 from planner_jax.task.catch.suites import draw
 
 _ROWS = 50  # greatest number of rows in the learning curve of one part (call of PPO)
@@ -180,7 +180,7 @@ def evaluate_policy(training: Training, network: Any, params: Any) -> dict[str, 
     The results are the success rate, and means over solved cases: the time [s] of the last catch,
     the optimal time ratio (relative difference of decided and planned catch times), iterations.
     """
-    decided = DecidedPlanner(ExactCatch(), Policy(params=params, network=network))
+    decided = DecidedPlanner(CatchProblem.planner(), Policy(params=params, network=network))
     figures = {}
     for suite in training.suites:
         cases: Any = jax.tree.map(np.asarray, draw(training.eval_cases, suite, _EVAL_SEED))

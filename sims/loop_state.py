@@ -11,7 +11,7 @@ from flax import struct
 from jax import Array
 
 from planner_jax.ball.flight import BallState
-from planner_jax.optimise.planner import OptimisedPlanner
+from planner_jax.optimise.planner import Problem
 from planner_jax.sims.model import World
 from planner_jax.sims.noise import Sensing, require_whole
 from planner_jax.sims.robot import Physics
@@ -69,15 +69,15 @@ class Pilot(Protocol):
         ...
 
 
-def shapes_of_plans(planner: OptimisedPlanner, cases: Any) -> Any:
-    """Return the shapes of a planner's plans of a batch of cases, as `jax.ShapeDtypeStruct`.
+def shapes_of_plans(problem: Problem, cases: Any) -> Any:
+    """Return the shapes of the plans of a batch of cases, as `jax.ShapeDtypeStruct`.
 
     Leaves of the cases may be arrays or `jax.ShapeDtypeStruct`.
     """
 
     def plan(case: Any) -> Any:
-        context = planner.prepare(case)
-        return planner.decode(planner.guesses(context, 1)[0], context)
+        context = problem.prepare(case)
+        return problem.decode(problem.guesses(context, 1)[0], context)
 
     return jax.eval_shape(jax.vmap(plan), cases)
 

@@ -29,6 +29,7 @@ from planner_jax.ball.estimation import EkfState, congruence
 from planner_jax.ball.flight import BallState, fly
 from planner_jax.core.compiled import QUICK_OPTIONS
 from planner_jax.planning.replan import Replanning
+from planner_jax.planning.replanner import Replanner
 from planner_jax.robot.attitude import tilt_quaternion
 from planner_jax.sims import sensing as sight
 from planner_jax.sims.launch import watch_ball
@@ -39,8 +40,9 @@ from planner_jax.sims.robot import Physics
 from planner_jax.sims.scoring import Contact, Moment, moment, passage, racket_impact
 from planner_jax.sims.sensing import Estimate, RlsState, rls_update
 from planner_jax.task.rally.case import RallyCase
+from planner_jax.task.rally.default_planner import RallyProblem
 from planner_jax.task.rally.plan import RallyPlan
-from planner_jax.task.rally.replan import ReplanRally, count_done
+from planner_jax.task.rally.replan import REMAINDER, count_done
 from planner_jax.task.rally.suites import Course
 
 LOWEST = 0.3  # [m], height below which a ball is lost
@@ -115,7 +117,7 @@ class Frames:
 class RallyPilot:
     """The part of the loop that plans the next hits in every planning period."""
 
-    planner: ReplanRally = ReplanRally()
+    planner: Replanner = REMAINDER.planner_of(RallyProblem())
     course: Course = Course()
     # A plan does not change in the last `shortest` [s] before a planned impact, as the tracking
     # error that a change causes would not decay before it, and not until `settled` [s] after it.

@@ -15,11 +15,11 @@ from planner_jax.runs.run_folder import LOCK, RunFolder
 from planner_jax.sweep.report import write_report
 from planner_jax.sweep.run import SweepInterrupted, resume_sweep, start_sweep
 from planner_jax.sweep.sweep import Sweep
-from planner_jax.task.hit.default_planner import ExactHit
+from planner_jax.task.hit.default_planner import HitProblem
 
 
 def quick_hit(**options):
-    return ExactHit(rounds=ExactHit().rounds[:1], **options)
+    return HitProblem.planner(rounds=HitProblem.planner().rounds[:1], **options)
 
 
 def quick_catch(**options):

@@ -11,8 +11,8 @@ from planner_jax.cost.along_curvature import block_and_diagonal, columns_columns
 from planner_jax.cost.quadrotor import flight_along
 from planner_jax.planning.decided import first_choice
 from planner_jax.task.catch.decide import Greedy
-from planner_jax.task.catch.default_planner import ExactCatch
-from planner_jax.task.hit.default_planner import ExactHit
+from planner_jax.task.catch.default_planner import CatchProblem
+from planner_jax.task.hit.default_planner import HitProblem
 from planner_jax.trajectory.proportional_minco import proportional_minco
 from tests.derivatives import double
 
@@ -75,36 +75,36 @@ def greedy_catch(suite, num_targets):
     return pj.take(first_choice(Greedy(), cases), 0)
 
 
-PLANS = {  # planner, cases that share one program, end variables of a segment
+PLANS = {  # problem, cases that share one program, end variables of a segment
     "hit": lambda: (
-        ExactHit(proportions=(0.2, 0.5, 1.0, 1.0, 1.0, 1.0)),
+        HitProblem(proportions=(0.2, 0.5, 1.0, 1.0, 1.0, 1.0)),
         [pj.take(pj.hit.draw(1, seed=1), 0)],
         8,
     ),
     "pairs": lambda: (
-        ExactCatch(),
+        CatchProblem(),
         [greedy_catch("parabola2", 2), greedy_catch("throws", 2)],  # one target is absent
         12,
     ),
-    "throw": lambda: (ExactCatch(), [greedy_catch("throws", 1)], 12),
+    "throw": lambda: (CatchProblem(), [greedy_catch("throws", 1)], 12),
 }
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["hit", "pairs", "throw"])
 def test_second_derivatives_of_a_plan_are_those_of_its_objective(name):
-    planner, cases, num_own = PLANS[name]()
+    problem, cases, num_own = PLANS[name]()
     segments = cases[0].num_targets if num_own == 12 else 1
-    size = segments * len(planner.scale)
+    size = segments * len(problem.scale)
     random = np.random.default_rng(2)
     noise, direction = 0.1 * random.normal(size=size), random.normal(size=size)
 
     @jax.jit
     def compare(case):
-        context = planner.prepare(case)
-        point = planner.guesses(context, 1)[0] + noise
-        evaluation, gradient, products, preconditioner = planner.curvature_at(point, context)
-        objective = lambda x: planner.objective(x, context)  # noqa: E731
+        context = problem.prepare(case)
+        point = problem.guesses(context, 1)[0] + noise
+        evaluation, gradient, products, preconditioner = problem.curvature_at(point, context)
+        objective = lambda x: problem.objective(x, context)  # noqa: E731
         cost_and_slopes = jax.value_and_grad(lambda x: objective(x).cost)
         (cost, slopes), change = jax.linearize(cost_and_slopes, point)
         hessian = jax.vmap(lambda unit: change(unit)[1])(jnp.eye(size))

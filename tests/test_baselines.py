@@ -27,7 +27,7 @@ from planner_jax.trajectory.polynomial import evaluate
 NUM = 16
 GRAVITY = 9.8
 RESTITUTION = 0.7
-BAT = BatHit()
+BAT = BatHit.planner()
 JUGGLE = JuggleHit()
 position = jax.jit(lambda head, tail, end, t: evaluate(minimum_jerk(head, tail, end), t))
 float64 = pytest.mark.usefixtures("float64")
@@ -260,7 +260,7 @@ def test_a_plan_that_breaks_a_limit_has_a_failure_status(planner):
     assert (plans.violation[refused] > 0.0).all()
 
 
-@pytest.mark.parametrize("make", [BatHit, JuggleHit])
+@pytest.mark.parametrize("make", [BatHit.planner, JuggleHit])
 def test_degenerate_cases_stay_finite_and_leave_other_lanes_unchanged(make, cases):
     broken = jax.tree.map(lambda a, b: np.concatenate([b[:9], a]), serves_gone_wrong(), cases)
     found = plan(make(), broken)
@@ -278,12 +278,12 @@ def test_every_published_planner_has_its_name():
     assert {"exact", *court.PLANNERS} == set(TASK.planners)
     assert pj.hit.planner("juggle") == JUGGLE
     assert pj.hit.planner("bat") == BAT
-    assert pj.hit.planner("bat-lite", nodes=8) == BatHit(transition=False, nodes=8)
+    assert pj.hit.planner("bat-lite", nodes=8) == BatHit.planner(transition=False, nodes=8)
 
 
 def test_planners_with_one_piece_or_two_starts_are_rejected():
     with pytest.raises(ValueError, match="starts must be 1, got 2"):
-        BAT.guesses(None, 2)
+        BAT.problem.guesses(None, 2)
     assert {attempt.starts for each in (BAT, JUGGLE) for attempt in each.attempts} == {1}
     with pytest.raises(ValueError, match="num_pieces must be >= 2, got 1"):
         BatHit(num_pieces=1)

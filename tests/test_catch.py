@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_solve import Well, WellPlanner
+from test_solve import Well, WellProblem
 
 import planner_jax as pj
 from planner_jax.core.protocol import Status, is_solved
@@ -14,13 +14,14 @@ from planner_jax.planning.plan import plan
 from planner_jax.referee.catch import referee_catches
 from planner_jax.task.catch.context import nearest_upright
 from planner_jax.task.catch.decide import Greedy
-from planner_jax.task.catch.default_planner import ExactCatch
+from planner_jax.task.catch.default_planner import CatchProblem
 from planner_jax.task.catch.suites import draw
 from planner_jax.trajectory.polynomial import evaluate
 from tests.jaxpr import assert_full_precision
 from tests.trees import assert_same
 
-PLANNER = ExactCatch(rounds=(Round(1, LbfgsConfig(max_steps=20)),))
+PROBLEM = CatchProblem()
+PLANNER = pj.SearchPlanner(PROBLEM, (Round(1, LbfgsConfig(max_steps=20)),))
 NUM = 8
 THROWS = NUM // 2  # Number of cases with one ball, which come first. The others have two balls.
 
@@ -51,10 +52,10 @@ def test_any_decision_vector_has_every_ball_in_the_net(cases):
     @jax.jit
     @jax.vmap
     def decode_beside(case, noise):
-        context = PLANNER.prepare(case)
-        return PLANNER.decode(PLANNER.guesses(context, 1)[0] + noise, context)
+        context = PROBLEM.prepare(case)
+        return PROBLEM.decode(PROBLEM.guesses(context, 1)[0] + noise, context)
 
-    size = 2 * len(PLANNER.scale)
+    size = 2 * len(PROBLEM.scale)
     found = decode_beside(pairs, random.normal(size=(len(pairs.gravity), size)).astype(np.float32))
     verdict = referee_catches(pairs, found)
     assert verdict.net_distance.max() < 0.125
@@ -64,7 +65,7 @@ def test_any_decision_vector_has_every_ball_in_the_net(cases):
 
 
 def test_absent_targets_have_no_flight_and_the_plan_stays_at_the_last_catch(plans):
-    pieces = PLANNER.num_pieces
+    pieces = PROBLEM.num_pieces
     assert (plans.trajectory.durations[:THROWS, pieces:] == 0.0).all()
     assert (plans.trajectory.durations[THROWS:] > 0.0).all()
     np.testing.assert_array_equal(plans.times[:THROWS, 1], plans.times[:THROWS, 0])
@@ -78,24 +79,24 @@ def test_one_throw_planned_alone_equals_its_lane_in_a_batch_for_more_targets(cas
     wide = pj.take(cases, 0)
     each_target = ("targets", "present", "horizon", "order", "times")
     fields = {name: pj.take(vars(wide)[name], slice(1)) for name in each_target}
-    planner = dataclasses.replace(PLANNER, learned=False)  # Networks guess for one target only.
+    planner = PLANNER.with_settings((("learned", False),))  # Networks guess for one target only.
     alone = plan(planner, wide.replace(**fields))
     assert alone.status == plans.status[0]
     np.testing.assert_allclose(alone.times, plans.times[0, :1], rtol=1e-3)
     np.testing.assert_allclose(alone.cost, plans.cost[0], rtol=1e-3)
-    durations = plans.trajectory.durations[0, : PLANNER.num_pieces]
+    durations = plans.trajectory.durations[0, : PROBLEM.num_pieces]
     np.testing.assert_allclose(alone.trajectory.durations, durations, rtol=1e-3)
 
 
 @jax.jit
 @jax.value_and_grad
 def cost_and_slopes(shift, case):
-    context = PLANNER.prepare(case)
-    return PLANNER.objective(PLANNER.guesses(context, 1)[0] + shift, context).cost
+    context = PROBLEM.prepare(case)
+    return PROBLEM.objective(PROBLEM.guesses(context, 1)[0] + shift, context).cost
 
 
 def test_absent_targets_cost_nothing_and_have_no_slope(float64):
-    size = len(PLANNER.scale)
+    size = len(PROBLEM.scale)
     shifts = 0.5 * np.random.default_rng(2).normal(size=(2, 2 * size))
     shifts[1, :size] = shifts[0, :size]
     wide = pj.take(draw(1, "throws", 4, num_targets=2, dtype=jnp.float64), 0)
@@ -109,7 +110,7 @@ def test_absent_targets_cost_nothing_and_have_no_slope(float64):
 def test_objective_gradient_agrees_with_finite_differences(float64):
     pair = pj.take(draw(1, "parabola2", 4, dtype=jnp.float64), 0)
     random = np.random.default_rng(3)
-    shift = 0.3 * random.normal(size=2 * len(PLANNER.scale))
+    shift = 0.3 * random.normal(size=2 * len(PROBLEM.scale))
     _, slopes = cost_and_slopes(shift, pair)
     assert np.count_nonzero(slopes) == slopes.size
     for direction in random.normal(size=(4, shift.size)):
@@ -145,11 +146,11 @@ def test_a_ball_that_is_due_too_early_is_reported_and_not_caught_late(cases):
 
 
 def test_all_products_of_the_objective_are_in_full_precision(cases):
-    context = PLANNER.prepare(pj.take(cases, 0))
-    start = jnp.zeros(2 * len(PLANNER.scale))
-    slopes = jax.grad(lambda x: PLANNER.objective(x, context).cost)
+    context = PROBLEM.prepare(pj.take(cases, 0))
+    start = jnp.zeros(2 * len(PROBLEM.scale))
+    slopes = jax.grad(lambda x: PROBLEM.objective(x, context).cost)
     assert assert_full_precision(slopes, start) > 0
-    assert assert_full_precision(lambda x: PLANNER.decode(x, context), start) > 0
+    assert assert_full_precision(lambda x: PROBLEM.decode(x, context), start) > 0
 
 
 SEARCH, STAND = LbfgsConfig(max_steps=30, memory=2), LbfgsConfig(max_steps=0)
@@ -157,8 +158,8 @@ SEARCH, STAND = LbfgsConfig(max_steps=30, memory=2), LbfgsConfig(max_steps=0)
 
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
-class Bowl(WellPlanner):
-    """A planner that minimises the squared distance of a number from `goal`, without limits."""
+class Bowl(WellProblem):
+    """The squared distance of a number from `goal`, without limits."""
 
     goal: float = 0.0
 
@@ -173,7 +174,7 @@ class Bowl(WellPlanner):
 def solve(starts, solver, *, settings=(), goals=()):
     stages = tuple(Stage(SEARCH, (("goal", goal),)) for goal in goals)
     attempt = Round(starts, solver, settings, stages)
-    return jax.jit(lambda case: Bowl().solve(case, attempt))(Well(np.zeros((), np.float32)))
+    return jax.jit(lambda case: Bowl.planner().solve(case, attempt))(Well(np.zeros((), np.float32)))
 
 
 def test_a_round_starts_where_its_last_stage_ended():

@@ -9,16 +9,16 @@ from planner_jax.core.protocol import Status, is_solved, take
 from planner_jax.optimise.settings import LbfgsConfig, Round
 from planner_jax.planning.plan import plan
 from planner_jax.referee.catch import referee_catches
-from planner_jax.task.catch.default_planner import ExactCatch
-from planner_jax.task.catch.replan import ReplanCatch
+from planner_jax.task.catch.default_planner import CatchProblem
+from planner_jax.task.catch.replan import REMAINDER
 from planner_jax.task.catch.suites import draw
 from planner_jax.trajectory.polynomial import states_at
 
-SCRATCH = ExactCatch(rounds=(Round(starts=1, solver=LbfgsConfig(max_steps=20)),))
-AGAIN = ReplanCatch(
-    rounds=(Round(starts=1, solver=LbfgsConfig(max_steps=12, trial_steps=(1.0, 0.2, 0.04))),)
-)
-UNCHANGED = ReplanCatch(rounds=(Round(starts=1, solver=LbfgsConfig(max_steps=0)),))
+SCRATCH = CatchProblem.planner(rounds=(Round(starts=1, solver=LbfgsConfig(max_steps=20)),))
+USUAL = REMAINDER.planner_of(CatchProblem())
+_SHORT = LbfgsConfig(max_steps=12, trial_steps=(1.0, 0.2, 0.04))
+AGAIN = dataclasses.replace(USUAL, rounds=(Round(starts=1, solver=_SHORT),))
+UNCHANGED = dataclasses.replace(USUAL, rounds=(Round(solver=LbfgsConfig(max_steps=0)),))
 
 
 def plan_first(name, num):
@@ -89,7 +89,7 @@ def test_with_too_little_time_left_the_previous_plan_is_kept(throws):
     elapsed = plans.times[:, 0] - left
     task = AGAIN.begin(cases, plans, elapsed, targets=ahead(cases, elapsed, 0.05))
     again = plan(AGAIN, task)
-    kept = left < AGAIN.shortest
+    kept = left < AGAIN.problem.shortest
     np.testing.assert_allclose(again.times[kept, 0], left[kept], atol=1e-6)
     np.testing.assert_array_equal(again.violation[kept], plans.violation[kept])
     assert is_solved(again.status[kept]).all()
@@ -100,7 +100,7 @@ def test_with_too_little_time_left_the_previous_plan_is_kept(throws):
 @pytest.mark.slow
 def test_what_is_left_of_a_plan_can_be_cut_anywhere(throws):
     cases, plans = throws
-    keeping = dataclasses.replace(UNCHANGED, shortest=10.0)
+    keeping = UNCHANGED.with_settings((("shortest", 10.0),))
     elapsed = np.array([0.0, 0.02, 0.21, 0.43, 0.6, 0.7], np.float32)
     rest = plan(keeping, keeping.begin(cases, plans, elapsed, targets=ahead(cases, elapsed)))
     assert (rest.trajectory.durations > 0.0).all()
@@ -124,7 +124,7 @@ def test_of_several_targets_those_not_caught_yet_are_planned_on():
     cases, _ = plan_first("triangle3", 4)
     order = np.array([2, 0, 1], np.int32)
     cases = dataclasses.replace(cases, order=np.tile(order, (4, 1)))
-    longer = ExactCatch(rounds=(Round(starts=1, solver=LbfgsConfig(max_steps=40)),))
+    longer = CatchProblem.planner(rounds=(Round(starts=1, solver=LbfgsConfig(max_steps=40)),))
     plans = plan(longer, cases)
     solved = is_solved(plans.status)
     assert solved.any()

@@ -15,7 +15,7 @@ import planner_jax as pj
 from planner_jax.core import planner as planner_module
 from planner_jax.core.protocol import Attempt, Plan, is_solved, outcome
 from planner_jax.core.rules import has_rules
-from planner_jax.optimise.planner import OptimisedPlanner
+from planner_jax.optimise.planner import SearchPlanner
 from planner_jax.task.intercept.default_planner import SpacetimeIntercept
 from tests.planners import ENTRIES, NUM, LibraryPlanner, Place, Stand, library, places
 from tests.trees import assert_same
@@ -107,7 +107,7 @@ def test_every_matrix_product_asks_for_full_precision(entry, monkeypatch):
         assert_full_precision(lambda p, case, a=attempt: p.solve(case, a), planner, case)
         solve = lambda p, cases, a=attempt: p.solve_lanes(cases, a)  # noqa: E731
         assert_full_precision(solve, planner, entry.batch)
-    if isinstance(planner, OptimisedPlanner):
+    if isinstance(planner, SearchPlanner):
         further = planner.with_polish().attempts[0]
         assert_full_precision(lambda p, case: p.solve(case, further), planner, case)
     if planner is not entry.planner:
@@ -226,7 +226,7 @@ def test_a_derivative_is_refused_with_the_names_of_what_has_one(entry, call):
 def test_a_gradient_is_there_where_it_is_promised_and_refused_elsewhere(entry):
     planner = entry.planner.inner
     searches_first = isinstance(planner, SpacetimeIntercept)  # plans are then settled anew
-    if not (isinstance(planner, OptimisedPlanner) or searches_first):
+    if not (isinstance(planner, SearchPlanner) or searches_first):
         with pytest.raises(TypeError, match=rf"\A{type(planner).__name__} minimises nothing.*\Z"):
             pj.gradient(entry.planner, entry.batch, of="cost", by=entry.broken)
         return

@@ -16,12 +16,12 @@ from planner_jax.planning.plan import plan
 from planner_jax.referee.catch import referee_catches
 from planner_jax.task.catch import decide as decisions
 from planner_jax.task.catch.decide import LENGTHS, Best, Given, Greedy, Random, beam
-from planner_jax.task.catch.default_planner import ExactCatch
+from planner_jax.task.catch.default_planner import CatchProblem
 from planner_jax.task.catch.estimate import follow, timetable
 from planner_jax.task.catch.suites import draw
 from tests.trees import assert_same
 
-PLANNER = ExactCatch(rounds=(Round(1, LbfgsConfig(max_steps=20)),))
+PLANNER = CatchProblem.planner(rounds=(Round(1, LbfgsConfig(max_steps=20)),))
 NUM = 8
 NEAR, FAR = (-1.0, 0.0, 1.2), (2.0, 0.0, 1.2)  # [m] Targets; the quadrotor starts at (0, 0, 1).
 
@@ -177,17 +177,17 @@ def test_one_case_alone_is_decided_on_and_planned_as_in_its_batch(decide, pairs)
 
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
-class LongFirst(ExactCatch):
-    """A planner whose first search tries every order of catches, and later searches only few."""
+class LongFirst(CatchProblem):
+    """A problem whose first search tries every order of catches, and later searches only few."""
 
-    def starts_long(self, case):
+    def starts_long(self, cases, rounds):
         return True
 
 
 @pytest.mark.parametrize(
     "kind, num, calls",
     [
-        (ExactCatch, 2, [(1, 10), (1, 2)]),
+        (CatchProblem, 2, [(1, 10), (1, 2)]),
         pytest.param(LongFirst, 3, [(1, 10), (1, 2), (1, 2)], marks=pytest.mark.slow),
     ],
 )
@@ -202,7 +202,7 @@ def test_later_rounds_are_for_cases_without_any_solved_order(kind, num, calls, p
         return plan_batch(planner, attempts, cases, *where)
 
     monkeypatch.setattr(batch, "plan_batch", note_call)
-    plans = plan(by(Best(), kind(rounds=num * PLANNER.rounds[:1])), pairs)
+    plans = plan(by(Best(), kind.planner(num * PLANNER.rounds[:1])), pairs)
     assert is_solved(np.delete(plans.status, [1, 2])).all()
     assert is_unsolved(plans.status[1]) and plans.status[2] == Status.TOO_FAR
     assert planned == calls

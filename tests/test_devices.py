@@ -8,7 +8,7 @@ import chex
 import jax
 import numpy as np
 import pytest
-from test_solve import Well, WellPlanner
+from test_solve import Well, WellProblem
 
 from planner_jax.planning.plan import plan
 
@@ -33,22 +33,23 @@ def compare_devices():
     """Check that plans on four, on three, and on the third device equal plans on the first."""
     devices = jax.local_devices()
     assert len(devices) == 4
-    alone = plan(WellPlanner(), Well(GOALS), devices=devices[:1])
+    planner = WellProblem.planner()
+    alone = plan(planner, Well(GOALS), devices=devices[:1])
     for some in (None, devices[:3], devices[2:3]):
         for chunk in (None, 16):
-            require_equal(plan(WellPlanner(), Well(GOALS), devices=some, chunk=chunk), alone)
+            require_equal(plan(planner, Well(GOALS), devices=some, chunk=chunk), alone)
             resident = Well(jax.numpy.asarray(GOALS))
-            resident = plan(WellPlanner(), resident, devices=some, chunk=chunk)
+            resident = plan(WellProblem.planner(), resident, devices=some, chunk=chunk)
             require_equal(resident, alone)
             assert isinstance(resident.point, jax.Array)
             assert resident.point.sharding.device_set == {(some or devices)[0]}
-    even = plan(WellPlanner(), Well(jax.numpy.asarray(GOALS[:200])))
+    even = plan(WellProblem.planner(), Well(jax.numpy.asarray(GOALS[:200])))
     assert len(even.point.sharding.device_set) == 4
     broken = GOALS.copy()
     broken[::100] = np.nan
-    spoiled = plan(WellPlanner(), Well(broken))
+    spoiled = plan(WellProblem.planner(), Well(broken))
     others = np.isfinite(broken)
-    clean = plan(WellPlanner(), Well(GOALS))
+    clean = plan(WellProblem.planner(), Well(GOALS))
     np.testing.assert_array_equal(spoiled.point[others], clean.point[others])
 
 

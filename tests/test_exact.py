@@ -14,22 +14,22 @@ from planner_jax.optimise.shipped import load_scale
 from planner_jax.planning.plan import plan
 from planner_jax.referee.hit import referee_hits
 from planner_jax.sims.scoring import racket_impact
-from planner_jax.task.hit.default_planner import ExactHit
+from planner_jax.task.hit.default_planner import HitProblem
 from planner_jax.task.hit.suites import generate_serves, to_cases
 from planner_jax.trajectory.polynomial import evaluate, total_duration
 from tests.trees import assert_same
 
-PLANNER = ExactHit()
-FIRST_ROUND = ExactHit(rounds=PLANNER.rounds[:1])
-SUPPLE = dataclasses.replace(PLANNER, velocities=True)
+PROBLEM, SUPPLE = HitProblem(), HitProblem(velocities=True)
+PLANNER = pj.SearchPlanner(PROBLEM)
+FIRST_ROUND = pj.SearchPlanner(PROBLEM, PLANNER.rounds[:1])
 NUM = 16
 apex_of = jax.jit(apex_with_drag)
 
 
 @jax.jit
 def first_guess(case):
-    context = PLANNER.prepare(case)
-    return context, PLANNER.guesses(context, 1)[0]
+    context = PROBLEM.prepare(case)
+    return context, PROBLEM.guesses(context, 1)[0]
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +68,7 @@ def test_any_decision_vector_meets_the_ball_and_reaches_the_target(cases):
     lane = pj.take(cases, 3)
     context, guess = first_guess(lane)
     points = guess[None] + 0.3 * np.random.default_rng(0).normal(size=(8, guess.size))
-    found = jax.jit(jax.vmap(lambda x: PLANNER.decode(x, context)))(points.astype(np.float32))
+    found = jax.jit(jax.vmap(lambda x: PROBLEM.decode(x, context)))(points.astype(np.float32))
     many = jax.tree.map(lambda leaf: np.repeat(leaf[None], 8, axis=0), lane)
     verdict = referee_hits(many, found)
     assert verdict.contact_error.max() < 1e-3
@@ -154,7 +154,7 @@ def test_a_falling_ball_is_highest_at_once():
 def test_objective_gradient_agrees_with_finite_differences(float64):
     case = pj.take(to_cases(generate_serves(1, 4), delay=0.5, dtype=jnp.float64), 0)
     context, guess = first_guess(case)
-    cost = jax.jit(jax.value_and_grad(lambda x: PLANNER.objective(x, context).cost))
+    cost = jax.jit(jax.value_and_grad(lambda x: PROBLEM.objective(x, context).cost))
     point = np.asarray(guess) + 0.1
     _, slopes = cost(point)
     for slope, step in zip(slopes, 1e-6 * np.eye(point.size), strict=True):
@@ -170,9 +170,9 @@ def test_with_zero_offsets_of_velocities_a_point_is_the_same_plan(cases):
     @jax.jit
     def both(point):
         converted = jnp.zeros(SUPPLE.held.shape).at[~SUPPLE.held].set(point)
-        points = (PLANNER, point), (SUPPLE, converted)
-        plans = [planner.decode(x, context).trajectory.coeffs[:, :4] for planner, x in points]
-        return converted, plans, [planner.objective(x, context).cost for planner, x in points]
+        points = (PROBLEM, point), (SUPPLE, converted)
+        plans = [problem.decode(x, context).trajectory.coeffs[:, :4] for problem, x in points]
+        return converted, plans, [problem.objective(x, context).cost for problem, x in points]
 
     converted, (usual, supple), costs = both(point)
     assert converted.size == point.size + 33 == len(SUPPLE.scale)
@@ -203,9 +203,9 @@ def test_all_guesses_but_the_first_have_the_tangential_velocity_of_an_even_motio
 
     @jax.jit
     def impacts(case):
-        context = PLANNER.prepare(case)
-        natural = PLANNER.guesses(context, 13)[1:, -8:] * jnp.asarray(PLANNER.scale[-8:])[None]
-        return jax.vmap(lambda own: PLANNER.impact(own, context))(natural)
+        context = PROBLEM.prepare(case)
+        natural = PROBLEM.guesses(context, 13)[1:, -8:] * jnp.asarray(PROBLEM.scale[-8:])[None]
+        return jax.vmap(lambda own: PROBLEM.impact(own, context))(natural)
 
     found = impacts(lane)
     places, vels = found.tail_state[:, 0], found.tail_state[:, 1]
@@ -230,23 +230,23 @@ def test_late_hits_that_no_short_search_finds_are_found_by_the_rounds_after_it()
     assert shares[2] > 0.965
 
 
-@pytest.mark.parametrize(("planner", "starts"), [(PLANNER, 13), (pj.catch.ExactCatch(), 6)])
-def test_sizes_that_make_no_sense_are_refused(planner, starts):
+@pytest.mark.parametrize(("problem", "starts"), [(PROBLEM, 13), (pj.catch.CatchProblem(), 6)])
+def test_sizes_that_make_no_sense_are_refused(problem, starts):
     rule = r"proportions must be of >= 2 pieces, finite and > 0, got \(1.0,\)"
     with pytest.raises(ValueError, match=rule):
-        dataclasses.replace(planner, proportions=(1.0,), scale=())
+        dataclasses.replace(problem, proportions=(1.0,), scale=())
     with pytest.raises(pj.ArgumentError, match="scale must be passed, except for .*, got exact-5"):
-        dataclasses.replace(planner, proportions=(1.0,) * 5, scale=())
+        dataclasses.replace(problem, proportions=(1.0,) * 5, scale=())
     with pytest.raises(ValueError, match=f"starts must be <= {starts}, got {starts + 1}"):
-        planner.guesses(None, starts + 1)
+        problem.guesses(None, starts + 1)
 
 
 @pytest.mark.parametrize(("task", "pieces"), [(pj.hit, 6), (pj.hit, 12), (pj.catch, 6)])
 def test_a_load_scale_is_a_positive_number_for_every_decision_variable(task, pieces):
-    planner = task.planner().inner.replanner().inner
-    planner = dataclasses.replace(planner, proportions=(1.0,) * pieces, scale=())
+    problem = task.planner().inner.replanner().inner.problem
+    problem = dataclasses.replace(problem, proportions=(1.0,) * pieces, scale=())
     case = pj.take(task.draw(1), 0)
-    points = jax.eval_shape(lambda one: planner.guesses(planner.prepare(one), 1), case)
-    scale = load_scale(planner.package, f"exact-{pieces}")
+    points = jax.eval_shape(lambda one: problem.guesses(problem.prepare(one), 1), case)
+    scale = load_scale(problem.package, f"exact-{pieces}")
     assert points.shape == (1, len(scale))
     assert np.isfinite(scale).all() and min(scale) > 0.0

@@ -17,9 +17,9 @@ from planner_jax.trajectory.polynomial import PiecewisePolynomial, states_at
 from planner_jax.trajectory.proportional_minco import boundary_rows
 from tests.derivatives import assert_gradient_matches_differences
 
-FREE = pj.hit.ExactHit(learned=False)
+FREE = pj.hit.HitProblem(learned=False)
 CATCH = pj.catch.planner("exact", decide="given")
-HIT = FREE.with_settings((("rounds", FREE.rounds[1:2]),))  # One attempt needs one program.
+HIT = pj.SearchPlanner(FREE, FREE.rounds[1:2])  # One attempt needs one program.
 NUM, AT, FAR = 4, np.zeros(3), np.full((4, 3), 50.0)
 TRACES = []
 # Values with which the five limits and costs that `having` adds to cases have no effect.
@@ -239,7 +239,10 @@ def test_another_value_compiles_nothing_anew(hits, around):
 # `HIT` makes one attempt, which need not find a path around the boxes.
 @pytest.mark.parametrize(
     ("planner", "lanes"),
-    [(HIT, slice(2, None)), pytest.param(FREE, slice(None), marks=pytest.mark.slow)],
+    [
+        (HIT, slice(2, None)),
+        pytest.param(pj.SearchPlanner(FREE), slice(None), marks=pytest.mark.slow),
+    ],
     ids=["planes", "boxes and planes"],
 )
 def test_boxes_and_planes_are_planned_around_and_judged(hits, free, middle, planner, lanes):

@@ -18,7 +18,7 @@ from planner_jax.optimise.sensitivity import gradient_at
 from planner_jax.optimise.settings import LbfgsConfig, Round
 from planner_jax.planning.plan import plan
 from planner_jax.task.catch.suites import draw
-from planner_jax.task.hit.default_planner import ExactHit
+from planner_jax.task.hit.default_planner import HitProblem
 from planner_jax.task.hit.suites import generate_serves, to_cases
 
 pytestmark = pytest.mark.gpu
@@ -44,7 +44,7 @@ def run(device, function, *args):
 
 def test_hits_are_those_of_a_cpu(devices, serves):
     ours, theirs = (
-        run(device, lambda s, d=device: plan(ExactHit(), s, devices=[d]), serves)
+        run(device, lambda s, d=device: plan(HitProblem.planner(), s, devices=[d]), serves)
         for device in devices
     )
     np.testing.assert_array_equal(ours.status, theirs.status)
@@ -54,7 +54,7 @@ def test_hits_are_those_of_a_cpu(devices, serves):
 
 def test_compiled_programs_hold_their_kernels(devices, serves):
     attempt = Round(1, LbfgsConfig(max_steps=2))
-    hits = jax.jit(lambda cases: ExactHit().solve_lanes(cases, attempt))
+    hits = jax.jit(lambda cases: HitProblem.planner().solve_lanes(cases, attempt))
     program = hits.lower(jax.device_put(serves, devices[0])).compile().as_text()
     assert program.count('custom_call_target="__gpu$xla.gpu.triton"') >= 5
 
@@ -63,13 +63,13 @@ WITHOUT_KERNELS = """
 import sys
 import jax, numpy as np
 from planner_jax.lanes import kernels
-from planner_jax.task.hit.default_planner import ExactHit
+from planner_jax.task.hit.default_planner import HitProblem
 from planner_jax.task.hit.suites import generate_serves, to_cases
 from planner_jax.planning.plan import plan
 
 assert jax.default_backend() == "gpu" and kernels.kernels() is kernels.Kernels.OFF
 cases = jax.tree.map(np.asarray, to_cases(generate_serves(int(sys.argv[1]), 0)))
-plans = plan(ExactHit(), cases, devices=jax.devices()[:1])
+plans = plan(HitProblem.planner(), cases, devices=jax.devices()[:1])
 np.savez(sys.argv[2], status=plans.status, time=plans.stroke.time)
 """
 
@@ -79,7 +79,7 @@ def test_hits_are_those_of_a_process_without_kernels(devices, serves, tmp_path):
     off = {kernels.SWITCH: "off", "XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
     command = [sys.executable, "-c", WITHOUT_KERNELS, str(LANES), str(without)]
     subprocess.run(command, env={**os.environ, **off}, check=True)
-    ours = plan(ExactHit(), serves, devices=devices[:1])
+    ours = plan(HitProblem.planner(), serves, devices=devices[:1])
     with np.load(without) as theirs:
         np.testing.assert_array_equal(ours.status, theirs["status"])
         np.testing.assert_allclose(ours.stroke.time, theirs["time"], atol=1e-3)
@@ -97,22 +97,22 @@ def test_catches_are_those_of_a_cpu(devices):
 
 
 def test_gradients_at_the_same_points_are_those_of_a_cpu(devices, serves):
-    planner = ExactHit()
+    problem = HitProblem()
     lanes = jax.tree.map(lambda leaf: np.moveaxis(leaf, 0, -1), serves)
 
     @jax.jit
     def optima(cases):
-        contexts = over_lanes(planner.prepare)(cases)
-        starts = over_lanes(lambda context: planner.guesses(context, 1)[0])(contexts)
+        contexts = over_lanes(problem.prepare)(cases)
+        starts = over_lanes(lambda context: problem.guesses(context, 1)[0])(contexts)
         config = LbfgsConfig(max_steps=60)
-        search = lambda start, c: minimise(lambda x: planner.objective(x, c), start, config)  # noqa: E731
+        search = lambda start, c: minimise(lambda x: problem.objective(x, c), start, config)  # noqa: E731
         return jax.vmap(search, in_axes=-1, out_axes=-1)(starts, contexts).point
 
     @jax.jit
     @over_lanes
     def gradients(case, point):
         by = ("drag", "ball", "limits", "target")
-        return gradient_at(planner, case, point, "stroke.time", by, steps=2).by
+        return gradient_at(problem, case, point, "stroke.time", by, steps=2).by
 
     points = run(devices[1], optima, lanes)
     ours, theirs = (run(device, gradients, lanes, points) for device in devices)
@@ -136,7 +136,7 @@ def test_several_gpus_give_the_plans_of_one(devices, serves):
     gpus = jax.devices("gpu")
     if len(gpus) == 1:
         pytest.skip("there is one GPU")
-    planner = ExactHit()
+    planner = HitProblem.planner()
     first = Round(1, LbfgsConfig(max_steps=0))  # the guess itself
     planner = dataclasses.replace(planner, rounds=(first, *planner.rounds))
     some = jax.tree.map(lambda leaf: jax.device_put(leaf[:-3], gpus[0]), serves)
@@ -152,7 +152,7 @@ def test_lanes_that_are_not_finite_change_no_bit_of_the_others(devices):
     serves = to_cases(generate_serves(8192, 1))
     broken = np.arange(8192) % 100 == 7
     spoiled = serves.replace(drag=jnp.where(broken, jnp.nan, serves.drag))
-    hits = functools.partial(plan, ExactHit(), devices=[devices[0]])
+    hits = functools.partial(plan, HitProblem.planner(), devices=[devices[0]])
     clean, others = (run(devices[0], hits, each) for each in (serves, spoiled))
     for ours, theirs in zip(jax.tree.leaves(clean), jax.tree.leaves(others), strict=True):
         np.testing.assert_array_equal(ours[~broken], theirs[~broken])

@@ -6,10 +6,10 @@ import pytest
 from planner_jax.core.protocol import Status
 from planner_jax.optimise.implicit import newton_refine, optimal_plan
 from planner_jax.optimise.settings import Evaluation
-from planner_jax.task.hit.default_planner import ExactHit
+from planner_jax.task.hit.default_planner import HitProblem
 from planner_jax.task.hit.suites import generate_serves, to_cases
 
-PLANNER = ExactHit()
+PLANNER = HitProblem.planner()
 
 MOVES = {
     "drag": lambda s, d: s.replace(drag=s.drag + d),

@@ -27,8 +27,8 @@ def crossing(dtype, wall=0.0):
 
 
 @functools.cache
-def settle(planner):
-    return jax.jit(lambda case: planner.guesses(planner.prepare(case), 1)[0])
+def settle(problem):
+    return jax.jit(lambda case: problem.guesses(problem.prepare(case), 1)[0])
 
 
 def move_to_optimum(smooth, case):
@@ -37,14 +37,15 @@ def move_to_optimum(smooth, case):
 
 def optimum_near_straight(planner, case):
     smooth, case = planner.smooth_near(case, make_straight_plan(case, planner.pieces))
+    smooth = smooth.problem
     return smooth, move_to_optimum(smooth, case)
 
 
 @functools.cache
-def differentiate(planner, quantity, by, steps):
+def differentiate(problem, quantity, by, steps):
     options = {"steps": steps, "curvature": "whole"}
     return jax.jit(
-        lambda case: gradient_at(planner, case, case.start_point, quantity, by, **options)
+        lambda case: gradient_at(problem, case, case.start_point, quantity, by, **options)
     )
 
 
@@ -115,5 +116,6 @@ def test_an_optimal_plan_has_the_same_gradient(float64):
     slope, plan = jax.jit(jax.grad(time, has_aux=True))(case.limits.acceleration)
     assert pj.are_solved(plan)
     smooth, case = planner.settle(case)
+    smooth = smooth.problem
     found = differentiate(smooth, "time", BY, 1)(move_to_optimum(smooth, case))
     assert slope == pytest.approx(float(found.by["limits.acceleration"]), rel=1e-3)

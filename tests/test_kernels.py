@@ -15,8 +15,8 @@ from planner_jax.optimise.preconditioner import positive_inverse
 from planner_jax.optimise.sensitivity import gradient_at
 from planner_jax.optimise.settings import LbfgsConfig, Round
 from planner_jax.runs.environment import require_backend
-from planner_jax.task.catch.default_planner import ExactCatch
-from planner_jax.task.hit.default_planner import ExactHit
+from planner_jax.task.catch.default_planner import CatchProblem
+from planner_jax.task.hit.default_planner import HitProblem
 
 LANES = 128
 # Number of GPU kernels by name in the compiled program of one search of the planner of hits.
@@ -58,23 +58,23 @@ X = np.broadcast_to(np.eye(3, dtype=np.float32)[..., None], (3, 3, LANES))
 
 
 def test_a_round_of_hits_contains_its_kernels(gpu):
-    assert kernels_in(round_of(ExactHit()), serves()) == ROUND
+    assert kernels_in(round_of(HitProblem.planner()), serves()) == ROUND
 
 
 @pytest.mark.slow
 def test_a_round_of_catches_contains_its_kernels(gpu):
-    held = kernels_in(round_of(ExactCatch()), pj.catch.draw(LANES, "throws"))
+    held = kernels_in(round_of(CatchProblem.planner()), pj.catch.draw(LANES, "throws"))
     assert held | {"flight_table": 1} == ROUND and "flight_table" not in held
 
 
 @pytest.mark.slow
 def test_gradients_contain_their_kernels(gpu):
-    planner, lanes = ExactHit(), jax.tree.map(lambda leaf: np.moveaxis(leaf, 0, -1), serves())
-    starts = jax.vmap(lambda case: planner.guesses(planner.prepare(case), 1)[0], out_axes=-1)
+    problem, lanes = HitProblem(), jax.tree.map(lambda leaf: np.moveaxis(leaf, 0, -1), serves())
+    starts = jax.vmap(lambda case: problem.guesses(problem.prepare(case), 1)[0], out_axes=-1)
 
     def gradients(case, point):
         wrt = ("drag", "ball", "limits", "target")
-        return gradient_at(planner, case, point, "stroke.time", wrt, steps=2).by
+        return gradient_at(problem, case, point, "stroke.time", wrt, steps=2).by
 
     points = np.asarray(starts(serves()))
     held = kernels_in(over_lanes(gradients), lanes, points)

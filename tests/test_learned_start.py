@@ -16,20 +16,20 @@ from planner_jax.planning.decided import first_choice
 @pytest.mark.parametrize("task", ["hit", "catch"])
 def test_the_learnt_guess_costs_a_hundredth_and_little_more_than_the_optimum(task):
     if task == "hit":
-        planner, cases = pj.hit.ExactHit(), pj.hit.draw(64, seed=3)
+        problem, cases = pj.hit.HitProblem(), pj.hit.draw(64, seed=3)
     else:
-        planner = pj.catch.ExactCatch()
+        problem = pj.catch.CatchProblem()
         cases = first_choice(pj.catch.Greedy(), pj.catch.draw(64, "throws", 3))
 
-    def costs(case, planner):
-        context = planner.prepare(case)
-        return planner.objective(planner.first_guess(context), context).cost
+    def costs(case, problem):
+        context = problem.prepare(case)
+        return problem.objective(problem.first_guess(context), context).cost
 
     learnt, smooth = (
         np.asarray(jax.jit(jax.vmap(lambda case, own=own: costs(case, own)))(cases))
-        for own in (planner, dataclasses.replace(planner, learned=False))
+        for own in (problem, dataclasses.replace(problem, learned=False))
     )
-    ended = pj.plan(planner, cases)
+    ended = pj.plan(pj.SearchPlanner(problem), cases)
     assert pj.are_solved(ended).all()
     assert np.median(smooth / ended.cost) > 1.5
     assert np.median(learnt / ended.cost) < 1.1
@@ -38,10 +38,10 @@ def test_the_learnt_guess_costs_a_hundredth_and_little_more_than_the_optimum(tas
 
 def test_late_hits_begin_where_a_few_iterations_find_what_all_guesses_do_not():
     late = pj.hit.to_cases(pj.hit.generate_serves(64, 3), delay=0.7)
-    (search,) = [each for each in pj.hit.ExactHit().rounds if each.solver.max_steps == 150]
+    (search,) = [each for each in pj.hit.HitProblem.rounds if each.solver.max_steps == 150]
 
     def share(learned):
-        planner = pj.hit.ExactHit(learned=learned, rounds=(search,))
+        planner = pj.hit.HitProblem.planner(learned=learned, rounds=(search,))
         return pj.are_solved(pj.plan(planner, late)).mean()
 
     assert share(True) > share(False) + 0.1

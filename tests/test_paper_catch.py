@@ -19,7 +19,8 @@ from planner_jax.baselines.catch.paper import PaperCatch
 from planner_jax.referee.catch import referee_catches
 from tests.derivatives import assert_gradient_matches_differences, value_and_gradient
 
-PLANNER = PaperCatch()
+PROBLEM = PaperCatch()
+PLANNER = pj.SearchPlanner(PROBLEM)
 UNIT = 1e3  # the planner's cost is the paper's over 1000
 NAMES = ("paper", "hard")
 
@@ -58,13 +59,13 @@ def excess(planner):
 
 @pytest.mark.parametrize("pieces", [4, 8])
 def test_the_guess_has_the_published_cost(pieces):
-    planner = PaperCatch(num_pieces=pieces)
+    problem = PaperCatch(num_pieces=pieces)
 
     @jax.jit
     @jax.vmap
     def guess_cost(case):
-        context = planner.prepare(case)
-        return planner.objective(planner.guesses(context, 1)[0], context).cost
+        context = problem.prepare(case)
+        return problem.objective(problem.guesses(context, 1)[0], context).cost
 
     for name in NAMES:
         cases, published = rows(name)
@@ -92,10 +93,10 @@ def test_objective_gradient_agrees_with_finite_differences():
     case = jax.tree.map(lambda leaf: leaf[0], rows("hard", 1)[0])
 
     def cost(shift):
-        context = PLANNER.prepare(case)
-        return PLANNER.objective(PLANNER.guesses(context, 1)[0] + shift, context).cost
+        context = PROBLEM.prepare(case)
+        return PROBLEM.objective(PROBLEM.guesses(context, 1)[0] + shift, context).cost
 
-    shift = 0.3 * np.random.default_rng(0).normal(size=len(PLANNER.scale))
+    shift = 0.3 * np.random.default_rng(0).normal(size=len(PROBLEM.scale))
     assert_gradient_matches_differences(cost, shift, step=1e-6, rtol=1e-6)
     # The first guess meets the ball exactly, where the distance from the net has no derivative.
     assert np.isfinite(value_and_gradient(cost)(np.zeros_like(shift))[1]).all()
@@ -106,4 +107,4 @@ def test_invalid_sizes_are_rejected():
         PaperCatch(num_pieces=1)
     case = jax.tree.map(lambda leaf: leaf[0], rows("paper", 1)[0])
     with pytest.raises(ValueError, match="starts must be 1, got 2"):
-        PLANNER.guesses(PLANNER.prepare(case), 2)
+        PROBLEM.guesses(PROBLEM.prepare(case), 2)

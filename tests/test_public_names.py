@@ -29,7 +29,7 @@ def test_a_planner_by_name_says_which_names_there_are(task):
         made = make(name)
         made = made.inner  # behind a decision
         assert f"`{name}`" in make.__doc__
-        assert type(made).__name__ in make.__doc__
+        assert made.title in make.__doc__
     default = next(iter(all_tasks()[task].planners))
     with pytest.raises(ValueError, match=f"planner must be one of {default}"):
         make("nobody")

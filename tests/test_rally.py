@@ -23,13 +23,13 @@ PLACES = np.tile([0.0, 0.0, 1.5], (2, 1))
 
 def test_a_hovering_racket_is_a_rally_of_the_equations():
     case, plan = bounces(hits=3)
-    planner = pj.rally.planner()
+    problem = pj.rally.RallyProblem()
     one, strokes = pj.take(case, 0), pj.take(plan, 0).strokes
     natural = np.zeros((3, 11))
     natural[:, 0] = np.log(np.diff(strokes.time, prepend=0.0))
     natural[-1, 1] = np.log(strokes.flight_time[-1])
     natural[:, 2] = np.log(9.8)
-    ends = planner.meet(jnp.asarray(natural, jnp.float32), planner.prepare(one))
+    ends = problem.meet(jnp.asarray(natural, jnp.float32), problem.prepare(one))
     hover = np.zeros((3, 4, 3))
     hover[:, 0] = one.head_state[0]
     np.testing.assert_allclose(ends.tail_states, hover, atol=2e-3)
@@ -86,8 +86,8 @@ def test_a_ball_that_is_struck_later_is_met_later():
     later = case.replace(ball_time=np.full(1, 0.7))
     natural = np.zeros((1, 11))
     natural[0, :3] = np.log([0.6, 1.0, 9.8])
-    planner = pj.rally.planner()
-    meet = jax.jit(lambda case, natural: planner.meet(natural, planner.prepare(case)))
+    problem = pj.rally.RallyProblem()
+    meet = jax.jit(lambda case, natural: problem.meet(natural, problem.prepare(case)))
     first = meet(pj.take(case, 0), natural)
     natural[0, 0] = np.log(1.3)
     second = meet(pj.take(later, 0), natural)
@@ -96,7 +96,7 @@ def test_a_ball_that_is_struck_later_is_met_later():
 
 
 def test_a_plan_with_a_home_ends_where_the_way_home_is_short():
-    case, plan = pj.take(bounces(hits=1), 0), pj.rally.planner()
+    case, problem = pj.take(bounces(hits=1), 0), pj.rally.RallyProblem()
     tail = np.zeros((4, 3))
     tail[0] = case[0].head_state[0]
     costs = []
@@ -104,7 +104,7 @@ def test_a_plan_with_a_home_ends_where_the_way_home_is_short():
         home = np.array([away, 0.0, 1.5], np.float32)
         at_home = case[0].replace(home=home)
         place, time = at_home.places[0], jnp.asarray(1.0)
-        costs.append(float(plan._cost_to_go(jnp.asarray(tail), place, time, at_home)))
+        costs.append(float(problem._cost_to_go(jnp.asarray(tail), place, time, at_home)))
     assert costs[0] < 1e-6 * costs[2]
     np.testing.assert_allclose(costs[2], 4.0 * costs[1], rtol=1e-3)  # energy is quadratic
 
@@ -187,7 +187,7 @@ def test_a_ball_is_kept_up_for_thirty_hits_by_looking_one_hit_ahead():
 def test_the_start_of_a_replan_is_the_plan_itself_and_the_ball_may_change():
     case, planner = pj.take(pj.rally.draw(1, seed=2), 0), pj.rally.planner()
     plan = pj.plan(planner, case)
-    again = planner.replanner()
+    again = planner.replanner().problem
     zero = jnp.zeros((), jnp.float32)
     context = again.prepare(Replanning(case=case, previous=plan, elapsed=zero))
     start = again.decode(context.start, context)
@@ -204,19 +204,19 @@ def test_the_start_of_a_replan_is_the_plan_itself_and_the_ball_may_change():
 
 @pytest.mark.slow
 def test_the_metric_of_two_hits_changes_variables_only(float64):
-    case, planner = pj.rally.draw(1, seed=3, dtype=jnp.float64), pj.rally.planner()
-    plain = pj.rally.planner(metric=False)
-    context = planner.prepare(pj.take(case, 0))
-    point = planner.guesses(context, 2)[1]
-    again = plain.join(*planner.split(point))
+    case, problem = pj.rally.draw(1, seed=3, dtype=jnp.float64), pj.rally.RallyProblem()
+    plain = pj.rally.RallyProblem(metric=False)
+    context = problem.prepare(pj.take(case, 0))
+    point = problem.guesses(context, 2)[1]
+    again = plain.join(*problem.split(point))
     np.testing.assert_allclose(again, plain.guesses(context, 2)[1], atol=1e-9)
-    np.testing.assert_allclose(planner.join(*planner.split(point)), point, atol=1e-9)
+    np.testing.assert_allclose(problem.join(*problem.split(point)), point, atol=1e-9)
     direction = jnp.cos(jnp.arange(point.size))
 
     @jax.jit
     def derive(point):
-        found = planner.curvature_at(point, context)
-        slope = jax.grad(lambda x: planner.objective(x, context).cost)
+        found = problem.curvature_at(point, context)
+        slope = jax.grad(lambda x: problem.objective(x, context).cost)
         own = found.gradient, found.products()(direction)
         return own, jax.jvp(slope, (point,), (direction,))
 

@@ -14,7 +14,6 @@ import planner_jax as pj
 from planner_jax.cli.main import main
 from planner_jax.cli.plan.answer import sample_plan
 from planner_jax.core.errors import ArgumentError, NoRecovery
-from planner_jax.recovery import after_plan
 from planner_jax.recovery.after_plan import append_recovery, is_rested
 from planner_jax.recovery.case import RecoveryCase, end_state
 from planner_jax.referee import recovery
@@ -132,7 +131,7 @@ def test_a_fast_flight_ends_at_the_requested_position(to):
     limits = jax.tree.map(np.asarray, pj.catch.draw(NUM).limits)
     home = np.tile(np.float32([1.0, 0.0, 1.0]), (NUM, 1))
     case = RecoveryCase(head_state=head, home=home, gravity=9.81 * ones, limits=limits)
-    plans = pj.plan(pj.RecoveryPlanner(to=to), case)
+    plans = pj.plan(pj.RecoveryProblem.planner(to=to), case)
     assert pj.are_solved(plans).all()
     ends = np.stack([states(pj.take(plans.trajectory, k))[0] for k in range(NUM)])
     if to == "home":
@@ -180,7 +179,7 @@ def test_rows_of_a_sweep_have_the_judged_recovery(swept, braked):
 def test_another_recovery_is_refused_in_one_line_and_settings_leave_none_to_the_planner():
     rule = "must be one of brake, home, got 'land'$"
     assert_refused(f"^recovery {rule}", pj.hit.planner, "exact", recovery="land")
-    assert_refused(f"^to {rule}", pj.RecoveryPlanner, to="land")
+    assert_refused(f"^to {rule}", pj.RecoveryProblem, to="land")
     for settings in (HitSettings, CatchSettings):
         assert "recovery" not in settings().planner_options()
         assert settings(recovery="home").planner_options()["recovery"] == "home"
@@ -227,8 +226,7 @@ def test_an_export_without_a_fitting_case_or_recovery_is_refused_and_writes_noth
 
 def test_nothing_is_written_if_no_recovery_keeps_the_limits(hit, here, monkeypatch):
     case, plan = hit
-    one_round = functools.partial(pj.RecoveryPlanner, rounds=pj.RecoveryPlanner().rounds[:1])
-    monkeypatch.setattr(after_plan, "RecoveryPlanner", one_round)
+    monkeypatch.setattr(pj.RecoveryProblem, "rounds", pj.RecoveryProblem.rounds[:1])
     slow = dataclasses.replace(case.limits, speed=np.float32(0.1))
     says = "^recovery must be none .* keeps every limit, got 'brake' .speed: .* above its limit"
     assert_refused(says, export, plan, case=dataclasses.replace(case, limits=slow))

@@ -119,7 +119,7 @@ def test_a_task_and_a_planner_with_a_used_name_are_left_out(others):
     with pytest.warns(UserWarning, match=problem):
         assert all_tasks()["hit"].home == "planner_jax.task.hit"
     with pytest.warns(UserWarning, match="planners 'hit.exact' .* left out, as the name is taken"):
-        assert type(pj.hit.planner("exact")).__name__ == "ExactHit"
+        assert pj.hit.planner("exact").title == "HitProblem"
 
 
 def test_a_planner_of_another_package_is_made_by_its_name(others):
@@ -137,7 +137,7 @@ def test_a_planner_that_cannot_be_loaded_raises_only_when_it_is_requested(others
     others(planners={"hit.mine": "planner_jax_nowhere:low"})
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert type(pj.hit.planner("exact")).__name__ == "ExactHit"
+        assert pj.hit.planner("exact").title == "HitProblem"
     rule = "^hit.mine of planner_jax_nowhere:low must be one that can be loaded, got Module"
     assert_one_line(lambda: pj.hit.planner("mine"), rule)
 

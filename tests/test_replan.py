@@ -9,13 +9,17 @@ import pytest
 import planner_jax as pj
 from planner_jax.optimise.settings import LbfgsConfig, Round
 from planner_jax.planning.replan import Replanning
-from planner_jax.task.hit.replan import ReplanHit
 from planner_jax.trajectory.polynomial import states_at
 
 NUM = 4
 NONE = (Round(solver=LbfgsConfig(max_steps=0)),)
-HIT = pj.hit.ExactHit(rounds=pj.hit.ExactHit().rounds[:1])  # a program of test_exact
+HIT = pj.hit.HitProblem.planner(pj.hit.HitProblem.rounds[:1])  # a program of test_exact
 CATCH = pj.catch.planner("exact", decide="greedy", rounds=(Round(1, LbfgsConfig(max_steps=20)),))
+
+
+def unchanged(planner):
+    """Return the planner's re-planner that makes no iterations."""
+    return dataclasses.replace(planner.replanner(), rounds=NONE)
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +36,7 @@ def catches():
 
 def test_no_time_and_a_target_as_before_give_back_the_motion_of_a_catch(catches):
     cases, plans, news = catches
-    again = pj.replan(pj.catch.ReplanCatch(CATCH.planner, rounds=NONE), cases, plans, 0.0, **news)
+    again = pj.replan(unchanged(CATCH), cases, plans, 0.0, **news)
     assert again.status.shape == (NUM,)
     np.testing.assert_allclose(again.times, plans.times, atol=2e-6)
     np.testing.assert_allclose(again.cost, plans.cost, rtol=2e-3)
@@ -47,7 +51,7 @@ def test_no_time_and_a_ball_as_before_give_back_the_motion_of_a_hit(hits):
     cases, plans, news = hits
     solved = pj.are_solved(plans)
     assert solved.any()
-    start = pj.replan(ReplanHit(HIT, rounds=NONE), cases, plans, 0.0, **news)
+    start = pj.replan(unchanged(HIT), cases, plans, 0.0, **news)
     for name in ("time", "flight_time", "ball_pos", "normal", "ball_vel_after"):
         found, expected = (getattr(each.stroke, name) for each in (start, plans))
         np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-4)
@@ -79,7 +83,7 @@ def test_plans_again_at_utm_coordinates_are_the_same(catches):
     moved = news["targets"].replace(ball=ball.replace(pos=ball.pos.astype(float) + away))
     origin = np.tile(np.float32(away[:2]), (NUM, 1))
     far = [each.replace(origin=origin) for each in (cases, plans)]
-    planner = pj.catch.ReplanCatch(CATCH.planner, rounds=NONE)
+    planner = unchanged(CATCH)
     found = pj.replan(planner, *far, 0.0, targets=moved)
     near = pj.replan(planner, cases, plans, 0.0, **news)
     np.testing.assert_array_equal(found.origin, origin)
@@ -90,8 +94,7 @@ def test_plans_again_at_utm_coordinates_are_the_same(catches):
 @pytest.mark.parametrize("task", ["hits", "catches"])
 def test_one_case_is_its_lane(task, request):
     cases, plans, news = request.getfixturevalue(task)
-    planner = (HIT if task == "hits" else CATCH).replanner()
-    planner = dataclasses.replace(planner, rounds=NONE)
+    planner = unchanged(HIT if task == "hits" else CATCH)
     elapsed = np.float32(0.1)
     together = pj.replan(planner, cases, plans, np.full(NUM, elapsed), **news)
     alone = pj.replan(planner, *pj.take((cases, plans), 1), elapsed, **pj.take(news, 1))
@@ -110,6 +113,6 @@ def test_a_new_drag_is_believed(hits):
 def test_a_planner_that_cannot_plan_again_names_one_that_can(hits, catches, task, name):
     cases, plans, news = hits if task == "hit" else catches
     planner = pj.task_named(task).planner(name)
-    says = f"^{type(planner.inner).__name__} cannot plan again: use hits' and catches' exact, "
+    says = f"^{planner.inner.title} cannot plan again: use hits' and catches' exact, "
     with pytest.raises(TypeError, match=says):
         pj.replan(planner, cases, plans, 0.0, **news)

@@ -17,8 +17,8 @@ class Bowl:
 
 
 @dataclasses.dataclass(frozen=True)
-class BowlPlanner:
-    """A planner with a quadratic cost whose second derivatives are 4 and 10^4."""
+class BowlProblem:
+    """A problem with a quadratic cost whose second derivatives are 4 and 10^4."""
 
     scale: tuple[float, ...] = (1.0, 1.0)
 
@@ -36,8 +36,8 @@ class BowlPlanner:
         return Evaluation(cost=cost, violation=-jnp.ones(()))
 
 
-def residuals(planner, point, context):
-    return jnp.array([2.0, 100.0]) * (point * jnp.asarray(planner.scale) - context.centre)
+def residuals(problem, point, context):
+    return jnp.array([2.0, 100.0]) * (point * jnp.asarray(problem.scale) - context.centre)
 
 
 def test_curvature_is_the_diagonal_of_the_gauss_newton_matrix():
@@ -49,14 +49,14 @@ def test_curvature_is_the_diagonal_of_the_gauss_newton_matrix():
 def test_scale_is_one_over_the_root_of_twice_the_curvature_in_any_unit():
     """`measure_scale` adds the curvatures H at first guess and solution, hence 1 / sqrt(2 H)."""
     cases = Bowl(centre=jnp.array([[1.0, 0.5], [-2.0, 0.1], [0.3, 0.0]]))
-    scale = measure_scale(BowlPlanner(), cases, residuals, floor=0.0)
+    scale = measure_scale(BowlProblem(), cases, residuals, floor=0.0)
     np.testing.assert_allclose(scale, 1.0 / np.sqrt([8.0, 2e4]), rtol=1e-5)
-    other = measure_scale(BowlPlanner(scale=(30.0, 0.02)), cases, residuals, floor=0.0)
+    other = measure_scale(BowlProblem(scale=(30.0, 0.02)), cases, residuals, floor=0.0)
     np.testing.assert_allclose(other, scale, rtol=1e-4)
 
 
 def test_a_variable_without_curvature_keeps_a_finite_scale():
     flat = lambda *args: residuals(*args) * jnp.array([1.0, 0.0])  # noqa: E731
     cases = Bowl(centre=jnp.ones((2, 2)))
-    scale = measure_scale(BowlPlanner(), cases, flat, floor=1e-4)
+    scale = measure_scale(BowlProblem(), cases, flat, floor=1e-4)
     assert scale[1] == 100.0

@@ -14,10 +14,10 @@ from planner_jax.lanes.packing import Packing
 from planner_jax.optimise import lbfgs
 from planner_jax.optimise.settings import LbfgsConfig, NewtonConfig, Round
 from planner_jax.recovery.case import RecoveryCase
-from planner_jax.recovery.planner import RecoveryPlanner
+from planner_jax.recovery.planner import RecoveryProblem
 from planner_jax.runs.timing import CompileClock
-from planner_jax.task.catch.default_planner import ExactCatch
-from planner_jax.task.hit.default_planner import ExactHit
+from planner_jax.task.catch.default_planner import CatchProblem
+from planner_jax.task.hit.default_planner import HitProblem
 from tests.jaxpr import equations
 
 MOST = {"hit": 9000, "catch": 6500}  # equations of jit(pj.solve) of one case
@@ -31,7 +31,7 @@ def test_solve_of_one_case_has_few_equations(task):
     assert sum(1 for _ in equations(jaxpr.jaxpr)) <= MOST[task]
 
 
-PLANNERS = {"hit": ExactHit(), "catch": ExactCatch()}
+PLANNERS = {"hit": HitProblem.planner(), "catch": CatchProblem.planner()}
 
 
 def tables_of(planner, cases, *, is_whole):
@@ -55,12 +55,12 @@ def test_rows_list_the_stages_of_all_rounds(task, programs, models):
 
 
 def test_other_numbers_of_rounds_and_of_the_cost_are_data_of_the_same_program():
-    cases, planner = pj.catch.draw(1), ExactCatch()
+    cases, planner = pj.catch.draw(1), CatchProblem.planner()
     first, second, *others = planner.rounds
     solver = dataclasses.replace(second.solver, max_steps=31, tolerance=1e-5)
     longer = dataclasses.replace(second, solver=solver, within=0.1)
     rounds = (first, longer, *others)
-    changed = dataclasses.replace(planner, rounds=rounds, margin=0.1, energy_weight=1e-7)
+    changed = CatchProblem.planner(rounds, margin=0.1, energy_weight=1e-7)
     before, after = (
         each.load(each.group_attempts(each.attempts, cases, is_whole=True)[0], cases)
         for each in (planner, changed)
@@ -72,16 +72,16 @@ def test_other_numbers_of_rounds_and_of_the_cost_are_data_of_the_same_program():
 @pytest.mark.parametrize("kind", [float, np.float32])
 def test_weights_of_any_kind_give_way_to_those_of_a_round(kind):
     rounds = Round(), Round(settings=(("margin", 0.004),))
-    planner = dataclasses.replace(ExactCatch(), margin=kind(0.05), rounds=rounds)
+    planner = CatchProblem.planner(rounds, margin=kind(0.05))
     (table,) = tables_of(planner, pj.catch.draw(1), is_whole=True)
     np.testing.assert_allclose(table.rows.weights["margin"], [0.05, 0.004], rtol=1e-6)
 
 
 def test_another_margin_compiles_nothing_and_is_kept():
-    case, planner = pj.take(pj.catch.draw(1), 0), ExactCatch()
+    case, planner = pj.take(pj.catch.draw(1), 0), CatchProblem.planner()
     usual = pj.plan(planner, case)
     with CompileClock() as clock:
-        wide = pj.plan(dataclasses.replace(planner, margin=0.3), case)
+        wide = pj.plan(CatchProblem.planner(margin=0.3), case)
     assert not clock.compiled
     assert pj.are_solved(wide) and wide.violation < usual.violation - 0.05
 
@@ -97,7 +97,7 @@ def test_another_margin_compiles_nothing_and_is_kept():
     ids=["improves", "Newton", "another field", "no iterations"],
 )
 def test_rounds_that_prepare_cases_differently_have_their_own_programs(rounds, programs):
-    planner = dataclasses.replace(ExactCatch(), rounds=rounds)
+    planner = CatchProblem.planner(rounds)
     assert len(tables_of(planner, pj.catch.draw(1), is_whole=True)) == programs
 
 
@@ -125,14 +125,14 @@ def test_the_loop_over_pairs_computes_the_direction_of_the_unrolled_recursion():
 
 
 def test_weights_in_arrays_give_the_objective_of_constant_weights():
-    planner = RecoveryPlanner()
+    problem = RecoveryProblem()
     hit = pj.take(pj.hit.draw(1), 0)
     case = RecoveryCase(hit.head_state, np.zeros(3, np.float32), hit.gravity, hit.limits)
-    weights = {name: jnp.float32(getattr(planner, name)) for name in planner.weights}
-    context = planner.prepare(case)
-    point = planner.guesses(context, 1)[0]
+    weights = {name: jnp.float32(getattr(problem, name)) for name in problem.weights}
+    context = problem.prepare(case)
+    point = problem.guesses(context, 1)[0]
     own, other = (
-        each.objective(point, context) for each in (planner, planner.with_weights(weights))
+        each.objective(point, context) for each in (problem, problem.with_weights(weights))
     )
     np.testing.assert_allclose(own.cost, other.cost, rtol=1e-5)
     np.testing.assert_allclose(own.violation, other.violation, rtol=1e-5)

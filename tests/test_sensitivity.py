@@ -42,9 +42,9 @@ class BowlPlan(pj.Plan):
 
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
-class BowlPlanner(pj.OptimisedPlanner):
+class BowlProblem(pj.Problem):
     weight: float = 1.0
-    rounds: tuple = (
+    rounds = (
         pj.Round(starts=2, solver=pj.LbfgsConfig(max_steps=40, tolerance=1e-14), settings=()),
         pj.Round(starts=1, solver=pj.LbfgsConfig(max_steps=5), settings=(("weight", 2.0),)),
     )
@@ -78,7 +78,7 @@ def bowls(float64):
     [{"steps": 3}, pytest.param({"steps": 1, "curvature": "whole"}, marks=pytest.mark.slow)],
 )
 def test_gradient_of_a_quadratic_is_the_closed_form(bowls, options):
-    found = pj.gradient(BowlPlanner(), bowls, of=square, by=("b", "k"), **options)
+    found = pj.gradient(BowlProblem.planner(), bowls, of=square, by=("b", "k"), **options)
     inverse = np.linalg.inv(CURVED)
     best = (bowls.b + bowls.k[:, None] * np.eye(3)[0]) @ inverse
     np.testing.assert_allclose(found.plans.point, best, atol=1e-6)
@@ -89,26 +89,26 @@ def test_gradient_of_a_quadratic_is_the_closed_form(bowls, options):
 
 
 def test_the_gradient_is_nan_where_the_hessian_is_not_positive(bowls):
-    planner = BowlPlanner(weight=-1.0, rounds=(pj.Round(1, pj.LbfgsConfig(max_steps=0)),))
+    planner = BowlProblem.planner(weight=-1.0, rounds=(pj.Round(1, pj.LbfgsConfig(max_steps=0)),))
     found = pj.gradient(planner, bowls, of=lambda plan: plan.point[0], by="b")
     assert np.isnan(found.by["b"]).all() and np.isnan(found.residual).all()
 
 
 def test_gradient_of_the_cost_needs_no_adjoint(bowls):
-    found = pj.gradient(BowlPlanner(), bowls, of="cost", by=("b",), steps=0)
+    found = pj.gradient(BowlProblem.planner(), bowls, of="cost", by=("b",), steps=0)
     np.testing.assert_allclose(found.by["b"], -found.plans.point, atol=1e-12)
     np.testing.assert_allclose(found.value, found.plans.cost, atol=1e-12)
     for by in ("b", ["b"]):  # one name, or a list
-        again = pj.gradient(BowlPlanner(), bowls, of="cost", by=by, steps=0)
+        again = pj.gradient(BowlProblem.planner(), bowls, of="cost", by=by, steps=0)
         np.testing.assert_array_equal(again.by["b"], found.by["b"])
 
 
 def test_an_optimal_plan_has_the_same_gradient_forward_and_backward(bowls):
     with pytest.raises(ValueError, match=r"must be one case, got batch shape \(5,\)"):
-        optimal_plan(BowlPlanner(), bowls)
+        optimal_plan(BowlProblem.planner(), bowls)
     bowl = jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), bowls)
     inverse = np.linalg.inv(CURVED)
-    point_of = lambda bowl: optimal_plan(BowlPlanner(), bowl).point  # noqa: E731
+    point_of = lambda bowl: optimal_plan(BowlProblem.planner(), bowl).point  # noqa: E731
     for jacobian in (jax.jacfwd, jax.jacrev):
         slopes = jax.jit(jacobian(lambda b, k: point_of(bowl.replace(b=b, k=k)), argnums=(0, 1)))
         by_b, by_k = slopes(bowl.b, bowl.k)
@@ -120,11 +120,11 @@ def test_a_batch_equals_its_lanes_and_a_broken_lane_affects_no_other(bowls):
     b = bowls.b.copy()
     b[2] = np.nan
     how = {"of": square, "by": ("b", "k"), "steps": 3}
-    found = pj.gradient(BowlPlanner(), bowls.replace(b=b), **how)
+    found = pj.gradient(BowlProblem.planner(), bowls.replace(b=b), **how)
     assert np.isnan(found.by["b"][2]).all() and found.plans.point.shape == (5, 3)
     for lane in (0, 1, 3, 4):
         one = jax.tree.map(lambda leaf, k=lane: leaf[k], bowls)
-        alone = pj.gradient(BowlPlanner(), one, **how)
+        alone = pj.gradient(BowlProblem.planner(), one, **how)
         np.testing.assert_allclose(found.by["b"][lane], alone.by["b"], rtol=1e-9)
 
 
@@ -158,7 +158,7 @@ def test_the_kernel_gives_the_same_inverses():
 )
 def test_invalid_arguments_are_named(bowls, options, line):
     with pytest.raises(ValueError, match=line):
-        pj.gradient(BowlPlanner(), bowls, **{"of": "cost", "by": ("b",), **options})
+        pj.gradient(BowlProblem.planner(), bowls, **{"of": "cost", "by": ("b",), **options})
 
 
 def late_serve():
@@ -173,42 +173,45 @@ def throw():
     return first_choice(pj.catch.Greedy(), pj.catch.draw(1, "throws", 3))
 
 
-HIT = pj.hit.ExactHit(proportions=(0.2, 0.5, 1.0, 1.0, 1.0, 1.0))
-TIMES = {HIT: lambda plan: plan.stroke.time, pj.catch.ExactCatch(): lambda plan: plan.times[-1]}
+HIT = pj.hit.HitProblem(proportions=(0.2, 0.5, 1.0, 1.0, 1.0, 1.0))
+TIMES = {
+    HIT: lambda plan: plan.stroke.time,
+    pj.catch.CatchProblem(): lambda plan: plan.times[-1],
+}
 HEIGHT, RATE, DRAG = {"racket_height": 1e-3}, {"limits.body_rate": 1e-3}, {"drag": 1e-4}
 THROW = {"net.height": 1e-3, "gravity": 1e-3, "limits.speed": 1e-3}
-CASES = {  # planner, case, steps of the differences by places in the case, options
+CASES = {  # problem, case, steps of the differences by places in the case, options
     "hit": (HIT, late_serve, HEIGHT | DRAG | RATE, {"curvature": "whole"}),
     "hit by products": (HIT, late_serve, HEIGHT | RATE, {}),
     "hit without active limits": (HIT, easy_serve, HEIGHT | DRAG, {}),
-    "catch": (pj.catch.ExactCatch(), throw, THROW, {"curvature": "whole"}),
+    "catch": (pj.catch.CatchProblem(), throw, THROW, {"curvature": "whole"}),
 }
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 def test_the_gradient_at_an_optimum_matches_differences_of_optima(name, float64):
-    planner, make, steps, options = CASES[name]
-    case, quantity = double(pj.take(make(), 0)), TIMES[planner]
+    problem, make, steps, options = CASES[name]
+    case, quantity = double(pj.take(make(), 0)), TIMES[problem]
     config = pj.LbfgsConfig(max_steps=200, tolerance=1e-7, patience=6)
 
     def objective_of(case):
-        context = planner.prepare(case)
-        return context, lambda x: planner.objective(x, context)
+        context = problem.prepare(case)
+        return context, lambda x: problem.objective(x, context)
 
     @jax.jit
     def refine(case, point):
         context, objective = objective_of(case)
         point, _ = newton_refine(objective, point, max_steps=60, stationarity=1e-15)
-        return point, quantity(planner.decode(point, context))
+        return point, quantity(problem.decode(point, context))
 
     @jax.jit
     def search(case):
         context, objective = objective_of(case)
-        return minimise(objective, planner.guesses(context, 1)[0], config).point
+        return minimise(objective, problem.guesses(context, 1)[0], config).point
 
     point, value = refine(case, search(case))
-    take = functools.partial(gradient_at, planner, quantity=quantity, by=tuple(steps), **options)
+    take = functools.partial(gradient_at, problem, quantity=quantity, by=tuple(steps), **options)
     found = jax.jit(take)(case, point)
     np.testing.assert_allclose(found.value, value, rtol=1e-12)
     for place, step in steps.items():

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 import pytest
 from flax import struct
-from test_solve import GOALS, Well, WellPlanner
+from test_solve import GOALS, Well, WellProblem
 
 import planner_jax as pj
 from planner_jax.core.protocol import Status, is_solved, is_unsolved
@@ -242,16 +242,16 @@ def test_a_heavy_robot_with_a_large_net_catches():
 
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
-class TracedPlanner(WellPlanner):
+class TracedProblem(WellProblem):
     def prepare(self, case):
         TRACES.append(case)
         return case
 
 
 def test_attempts_compiled_ahead_are_not_traced_again():
-    first, second = WellPlanner().rounds
+    first, second = WellProblem.rounds
     own = dataclasses.replace(first, solver=pj.LbfgsConfig(max_steps=41, step_cap=0.2))
-    planner, easy = TracedPlanner(rounds=(own, second, own)), Well(GOALS[:1].repeat(3))
+    planner, easy = TracedProblem.planner(rounds=(own, second, own)), Well(GOALS[:1].repeat(3))
     compile_attempts(planner, easy)
     before = len(TRACES)
     assert before > 0
@@ -264,14 +264,14 @@ def test_compiling_ahead_also_accepts_a_planner_on_the_host():
     tried = []
 
     class OnHost(pj.Planner):
-        attempts = WellPlanner().rounds
+        attempts = WellProblem.rounds
 
         def solve_on_host(self, cases, attempt):
             tried.append(attempt)
-            return jax.device_get(plan(WellPlanner(rounds=(attempt,)), cases))
+            return jax.device_get(plan(WellProblem.planner(rounds=(attempt,)), cases))
 
     compile_attempts(OnHost(), Well(GOALS))
-    assert tried == [WellPlanner().rounds[0]]
+    assert tried == [WellProblem.rounds[0]]
 
 
 @pytest.mark.slow

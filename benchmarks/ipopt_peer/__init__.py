@@ -1,4 +1,4 @@
-"""The problems of the planners `ExactHit` and `ExactCatch`, written with CasADi for IPOPT.
+"""The problems `HitProblem` and `CatchProblem`, written with CasADi for IPOPT.
 
 `benchmarks.ipopt` uses them to compare the planners with IPOPT.
 """

@@ -30,19 +30,19 @@ class Basis:
     outer coefficients; the boundary conditions and h, which are functions of variables, inner ones.
 
     Args:
-        planner: the `ExactHit` or `ExactCatch` whose settings and constant matrices are used.
+        ours: the `HitProblem` or `CatchProblem` whose settings and constant matrices are used.
     """
 
-    def __init__(self, planner: Any):
-        rows, inside = 2 * ORDERS, planner.num_pieces - 1
-        matrices = [planner.maps.sample_matrix(planner.nodes, d) for d in range(ORDERS)]
+    def __init__(self, ours: Any):
+        rows, inside = 2 * ORDERS, ours.num_pieces - 1
+        matrices = [ours.maps.sample_matrix(ours.nodes, d) for d in range(ORDERS)]
         self._matrices, self._num_samples = [ca.DM(m) for m in matrices], len(matrices[0])
         self.num = rows + inside
         self.outer = [a * self.num + rows + i for a in range(3) for i in range(inside)]
         self.inner = [a * self.num + i for a in range(3) for i in range(rows)]
         order = [3 * i + axis for axis in range(3) for i in range(inside)]
         self.place = np.argsort(order).tolist()
-        self.scale = ca.DM(planner.scale).T
+        self.scale = ca.DM(ours.scale).T
 
     def join(self, outward: Any, offsets: Any) -> tuple[Any, Any]:
         """Return the C coefficients per axis (C, 3), and the mean duration h of a piece [s].

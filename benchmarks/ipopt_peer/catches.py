@@ -1,4 +1,4 @@
-"""The problem of `ExactCatch` with one ball, written with CasADi for IPOPT [Yu2023catch].
+"""The problem of `CatchProblem` with one ball, written with CasADi for IPOPT [Yu2023catch].
 
 `benchmarks.ipopt` loads this module by its name.
 """
@@ -46,16 +46,16 @@ def read_params(context: Any) -> dict[str, Any]:
     return found
 
 
-def make_problem(planner: Any) -> Problem:
-    """Define for IPOPT the problem that the planner `ExactCatch` solves for one ball."""
+def make_problem(ours: Any) -> Problem:
+    """Define for IPOPT the problem that `CatchProblem` states for one ball."""
     return Problem(
-        planner=planner,
+        ours=ours,
         sizes=SIZES,
         num_natural=12,
-        ends=lambda natural, params: ends(natural, params, planner.time_weight),
+        ends=lambda natural, params: ends(natural, params, ours.time_weight),
         limits=limits,
         factors=(2.0, 2.0, 2.0, 2.0, 1.0),
-        impact_weight=planner.catch_weight,
+        impact_weight=ours.catch_weight,
     )
 
 

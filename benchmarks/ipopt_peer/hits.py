@@ -1,4 +1,4 @@
-"""The problem of `ExactHit`, written with CasADi for IPOPT [Yu2023bat].
+"""The problem of `HitProblem`, written with CasADi for IPOPT [Yu2023bat].
 
 `benchmarks.ipopt` loads this module by its name.
 """
@@ -46,16 +46,16 @@ def read_params(context: Any) -> dict[str, Any]:
     return found
 
 
-def make_problem(planner: Any) -> Problem:
-    """Define for IPOPT the problem that the planner `ExactHit` solves, with the same settings."""
+def make_problem(ours: Any) -> Problem:
+    """Define for IPOPT the problem that `HitProblem` states, with the same settings."""
     return Problem(
-        planner=planner,
+        ours=ours,
         sizes=SIZES | {"path_pos": 3 * NODES, "path_vel": 3 * NODES},
         num_natural=8,
         ends=lambda natural, params: ends(natural, params, NODES),
         limits=limits,
         factors=(2.0, 2.0, 2.0, 1.0),
-        impact_weight=planner.impact_weight,
+        impact_weight=ours.impact_weight,
     )
 
 

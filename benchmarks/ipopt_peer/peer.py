@@ -75,34 +75,34 @@ class Solutions:
     converged: np.ndarray  # (B,) bool, as reported by IPOPT
 
 
-def stack_params(module: ModuleType, planner: Any, contexts: Any) -> np.ndarray:
+def stack_params(module: ModuleType, ours: Any, contexts: Any) -> np.ndarray:
     """Return the numbers of B cases on which IPOPT's problem depends, such as limits, (B, P).
 
     `contexts` are the results of the planner's `prepare` for the cases: each has a case and
     precomputed data, such as a table of a ball's path. `module` is `hits` or `catches`.
     """
     contexts = jax.tree.map(np.asarray, contexts)
-    sizes = module.make_problem(planner).sizes
+    sizes = module.make_problem(ours).sizes
     num = jax.tree.leaves(contexts)[0].shape[0]
     each = (module.read_params(take(contexts, k)) for k in range(num))
     return np.stack([np.concatenate([np.ravel(one[name]) for name in sizes]) for one in each])
 
 
 class Peer:
-    """IPOPT on the problem of a planner, with limits as constraints or as penalties.
+    """IPOPT on the problem of a ours, with limits as constraints or as penalties.
 
     Args:
         module: defines the task's problem, `hits` or `catches`.
-        planner: an `ExactHit` or `ExactCatch`.
+        ours: a `HitProblem` or `CatchProblem`.
         form: "limits" has limits as constraints, "penalties" minimises the planner's own objective.
         unit: a typical cost; IPOPT's tolerances are relative to it.
         compiled: whether to compile the functions as C code too, if there is a compiler.
     """
 
     def __init__(
-        self, module: ModuleType, planner: Any, form: str, unit: float, compiled: bool = True
+        self, module: ModuleType, ours: Any, form: str, unit: float, compiled: bool = True
     ):
-        problem, penalised = module.make_problem(planner), form == "penalties"
+        problem, penalised = module.make_problem(ours), form == "penalties"
         self.form, self._scale, began = form, 1.0 / unit, time.perf_counter()
         self.programs = {False: Program(problem, penalised, BETWEEN_NODES)}
         self.build_seconds, began = time.perf_counter() - began, time.perf_counter()

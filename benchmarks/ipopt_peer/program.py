@@ -1,8 +1,8 @@
 """The nonlinear program of one minimum-snap trajectory with exact derivatives, for IPOPT.
 
 `benchmarks.ipopt` compares the planners with IPOPT on this program. It has the decision variables x
-of `ExactHit` and `ExactCatch`: offsets of the waypoints from the smoothest trajectory, in scaled
-("whitened") coordinates, and a few variables that describe the state at the end of the trajectory.
+of `HitProblem` and `CatchProblem`: offsets of the waypoints from the smoothest trajectory, in
+scaled ("whitened") coordinates, and a few variables that describe the state at its end.
 The program shares only the trajectory's constant matrices and the settings with the planners.
 
 The program is computed in three steps:
@@ -41,7 +41,7 @@ class Problem:
     exceeded.
     """
 
-    planner: Any  # the `ExactHit` or `ExactCatch` whose settings are used
+    ours: Any  # the `HitProblem` or `CatchProblem` whose settings are used
     sizes: dict[str, int]  # names of the parameters of a case, with their numbers of values
     num_natural: int  # number of variables that describe the end of the trajectory
     # Function of the end's variables and `params`. Returns position to jerk at the end (4, 3), the
@@ -51,7 +51,7 @@ class Problem:
     # of excesses over limits.
     limits: Callable[[Any, Any, Any, Any, dict], list]
     # Factor for each limit. The limit's penalty starts at the excess -margin * factor, where
-    # `margin` is a setting of the planner.
+    # `margin` is a setting of the ours.
     factors: tuple[float, ...]
     impact_weight: float  # [s], weight of the penalties at the end
 
@@ -105,7 +105,7 @@ class Program:
 
     Args:
         problem: definition of the task's problem.
-        penalised: whether limits are penalties in the objective, as in the planner, or constraints.
+        penalised: whether limits are penalties in the objective, as in the ours, or constraints.
         backoff: margin of the constraints: every excess must be at most -backoff.
         compiled: whether functions are compiled C code, or run by CasADi's virtual machine.
     """
@@ -113,15 +113,15 @@ class Program:
     def __init__(
         self, problem: Problem, penalised: bool, backoff: float = 0.0, *, compiled: bool = False
     ):
-        planner = problem.planner
+        ours = problem.ours
         self.problem, self.penalised, self.backoff = problem, penalised, backoff
-        self._maps = planner.maps
-        self._basis = Basis(planner)
-        weights = join_trapezoid_weights(planner.nodes, self._maps.proportions)
+        self._maps = ours.maps
+        self._basis = Basis(ours)
+        weights = join_trapezoid_weights(ours.nodes, self._maps.proportions)
         self._weights, self.num_samples = ca.DM(weights).T, len(weights)
         self.num_params = sum(problem.sizes.values())
         self._power = 2 * self._maps.order - 1
-        self._own = planner.energy_weight * self._maps.offset_energy
+        self._own = ours.energy_weight * self._maps.offset_energy
         self._build_ends()
         self._build_limits()
         self.worst = self._worst()
@@ -165,22 +165,22 @@ class Program:
         the excesses over limits at the end. Also build its Jacobian, and the Hessian of a weighted
         sum of its outputs.
         """
-        problem, planner = self.problem, self.problem.planner
+        problem, ours = self.problem, self.problem.ours
         natural = ca.SX.sym("natural", problem.num_natural)
         params = ca.SX.sym("params", self.num_params)
         named = self._split(params)
         tail, time, excess, cost = problem.ends(natural, named)
-        duration, excess = time / planner.num_pieces, ca.vertcat(*excess)
+        duration, excess = time / ours.num_pieces, ca.vertcat(*excess)
         head = ca.reshape(named["head_state"], 3, ORDERS).T
         scale = ca.repmat(ca.vertcat(*[duration**k for k in range(ORDERS)]), 1, 3)
         rows = ca.vertcat(head * scale, tail * scale)
         gram = ca.DM(self._maps.boundary_energy)
         energy = ca.sum1(ca.sum2(rows * (gram @ rows))) / duration**self._power
-        core = cost + planner.energy_weight * energy
+        core = cost + ours.energy_weight * energy
         self._num_at_ends = excess.numel()
         if self.penalised:
-            inside = ca.vertsplit(excess + planner.margin)
-            hinges = sum(hinge(each, planner.hinge_width) for each in inside)
+            inside = ca.vertsplit(excess + ours.margin)
+            hinges = sum(hinge(each, ours.hinge_width) for each in inside)
             core = core + problem.impact_weight * hinges
         outward = ca.vertcat(ca.vec(rows), duration)
         together = ca.vertcat(outward, core, excess)
@@ -199,7 +199,7 @@ class Program:
         parameters. If limits are penalties, the functions return one value: the sum of the sample's
         penalties times h.
         """
-        planner, factors = self.problem.planner, self.problem.factors
+        ours, factors = self.problem.ours, self.problem.factors
         unit, h = ca.SX.sym("unit", len(PLACES)), ca.SX.sym("h")
         params = ca.SX.sym("params", self.num_params)
         at = [unit[i] / h**order for i, (order, _) in enumerate(PLACES)]
@@ -207,8 +207,8 @@ class Program:
         limits = ca.vertcat(*self.problem.limits(at[0], vel, acc, jerk, self._split(params)))
         values = limits
         if self.penalised:
-            inside = limits + planner.margin * ca.DM(factors)
-            values = h * sum(hinge(each, planner.hinge_width) for each in ca.vertsplit(inside))
+            inside = limits + ours.margin * ca.DM(factors)
+            values = h * sum(hinge(each, ours.hinge_width) for each in ca.vertsplit(inside))
         self._num_values = values.numel()
         num_limits = self._num_values * self.num_samples + self._num_at_ends
         self.num_constraints = 0 if self.penalised else num_limits
@@ -236,7 +236,7 @@ class Program:
         The parts are the unscaled variables of the trajectory's end, and the offsets (M - 1, 3) of
         the waypoints from the smoothest trajectory, for M pieces.
         """
-        num = self.problem.planner.num_offsets
+        num = self.problem.ours.num_offsets
         scale = self._basis.scale
         x, params = ca.MX.sym("x", scale.numel()), ca.MX.sym("params", self.num_params)
         natural = x * scale.T

@@ -11,9 +11,8 @@ from collections.abc import Callable, Sequence
 from typing import ClassVar, Generic, Protocol, Self, TypeVar
 
 import jax
-import jax.numpy as jnp
 from flax import struct
-from jax import Array, lax
+from jax import lax
 from jaxtyping import PyTree
 
 from planner_jax.core.choices import EFFORTS, require_one_of
@@ -136,6 +135,11 @@ class Planner(Generic[CaseT, PlanT]):
         return not self.is_sequential
 
     @property
+    def title(self) -> str:
+        """Name of the planner in messages."""
+        return type(self).__name__
+
+    @property
     def inner(self) -> "Planner":
         """The planner inside a planner that wraps another one; otherwise the planner itself."""
         return self
@@ -148,6 +152,8 @@ class Planner(Generic[CaseT, PlanT]):
         """Return a batch's plans by one attempt (search), one by one on CPUs if `is_sequential`."""
         if not self.is_sequential:
             return self.solve_at_once(cases, attempt)
+        from planner_jax.core.in_turn import solve_in_turn  # few planners need it
+
         in_turn = functools.partial(solve_in_turn, lambda case: self.solve(case, attempt))
         at_once = lambda cases: self.solve_at_once(cases, attempt)  # noqa: E731
         platform = "cpu" if has_only_cpu() else traced_platform()
@@ -191,7 +197,7 @@ class Planner(Generic[CaseT, PlanT]):
             TypeError: the planner cannot continue from existing plans.
         """
         raise NotOffered(
-            f"{type(self).__name__} cannot plan again: use hits' and catches' exact, intercepts' "
+            f"{self.title} cannot plan again: use hits' and catches' exact, intercepts' "
             "spacetime, or blocks' online"
         )
 
@@ -265,30 +271,9 @@ def require_fit(planner: Planner, cases: object) -> None:
         rule += "a flax.struct.dataclass if it holds arrays"
         raise ArgumentTypeError(type(planner).__name__, rule, shown="")
     if not isinstance(cases, planner.case_type):
-        rule = f"of the class {planner.case_type.__name__}, which {type(planner).__name__} plans"
+        rule = f"of the class {planner.case_type.__name__}, which {planner.title} plans"
         raise ArgumentTypeError("cases", rule, shown=f"a {type(cases).__name__}")
     if not planner.attempts:
         raise ArgumentError(
             type(planner).__name__, "at least one attempt", verb="have", shown="none"
         )
-
-
-def solve_in_turn(solve: Callable[[PyTree], PyTree], cases: PyTree) -> PyTree:
-    """Return the results of a function for every case of a batch, one after another; pure.
-
-    A case equal to the one before it, such as the padding of a batch, is not solved again.
-    """
-    first = jax.tree.map(lambda leaf: leaf[0], cases)
-    nothing = jax.tree.map(
-        lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(solve, first)
-    )
-
-    def next_one(state: tuple[Array, PyTree, PyTree], case: PyTree) -> tuple[tuple, PyTree]:
-        is_first, before, plan = state
-        same = jax.tree.map(lambda a, b: jnp.array_equal(a, b), before, case)
-        is_again = jnp.all(jnp.stack(jax.tree.leaves(same))) & ~is_first
-        plan = lax.cond(is_again, lambda case: plan, solve, case)
-        return (jnp.zeros_like(is_first), case, plan), plan
-
-    _, plans = lax.scan(next_one, (jnp.ones((), bool), first, nothing), cases)
-    return plans

@@ -128,8 +128,10 @@ def require_name(known: Collection[str], kind: str, name: object) -> str:
 
 
 def _require_options(planner: str, maker: object, options: Collection[str]) -> None:
-    if isinstance(maker, type) and dataclasses.is_dataclass(maker):
-        known = [field.name for field in dataclasses.fields(maker) if field.init]
+    owner = getattr(maker, "__self__", maker)  # of `Problem.planner`
+    if isinstance(owner, type) and dataclasses.is_dataclass(owner):
+        known = [field.name for field in dataclasses.fields(owner) if field.init]
+        known += ["rounds"] if owner is not maker else []
         for option in options:
             if option not in known:
                 rule = f"one of {', '.join(known)}" if known else "left out"

@@ -11,9 +11,10 @@ from jaxtyping import Float
 
 from planner_jax.core.protocol import is_solved
 from planner_jax.live.packets import FIELDS
+from planner_jax.optimise.planner import SearchPlanner
 from planner_jax.planning.programs import solve_one
 from planner_jax.recovery.case import RecoveryCase
-from planner_jax.recovery.planner import RecoveryPlanner
+from planner_jax.recovery.planner import RecoveryProblem
 from planner_jax.robot.attitude import setpoint_at, tilt_quaternion, turn_quaternion, yaw_at
 from planner_jax.robot.heading import KNOTS
 from planner_jax.robot.quadrotor import (
@@ -25,7 +26,8 @@ from planner_jax.robot.quadrotor import (
 )
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, states_at, total_duration
 
-_REST = RecoveryPlanner()
+_REST = RecoveryProblem()
+_REST_PLANNER = SearchPlanner(_REST)
 
 
 @struct.dataclass
@@ -50,7 +52,7 @@ def with_recovery(
     """Append a trajectory to standstill to a plan's path; return both, and if the limits hold."""
     state: Any = state_on(path, np.sum(path.durations))
     case = RecoveryCase(state, state[0], gravity, limits.of_recovery(state, gravity))
-    rest: QuadrotorPlan = solve_one(_REST, case, _REST.rounds[0])
+    rest: QuadrotorPlan = solve_one(_REST_PLANNER, case, _REST.rounds[0])
     return Course(_join(path, rest.trajectory), gravity, limits.air), bool(is_solved(rest.status))
 
 

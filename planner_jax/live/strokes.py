@@ -22,7 +22,7 @@ from planner_jax.ball.flight import BallState, rk4_step
 from planner_jax.ball.linear_drag import linear_drag_flight
 from planner_jax.ball.target import BallPath
 from planner_jax.core import GRAVITY
-from planner_jax.optimise.planner import OptimisedPlanner
+from planner_jax.optimise.planner import SearchPlanner
 from planner_jax.optimise.settings import LbfgsConfig, Round
 from planner_jax.planning.programs import call_packed, solve_cases
 from planner_jax.planning.replan import Replanning
@@ -31,14 +31,12 @@ from planner_jax.robot.quadrotor_model import PAPER_CATCHER, PAPER_HITTER, Quadr
 from planner_jax.task.catch.case import CatchCase
 from planner_jax.task.catch.case import case as catch_case
 from planner_jax.task.catch.decide import Greedy
-from planner_jax.task.catch.default_planner import ExactCatch
+from planner_jax.task.catch.default_planner import CatchProblem
 from planner_jax.task.catch.plan import CatchPlan
-from planner_jax.task.catch.replan import ReplanCatch
 from planner_jax.task.hit.case import HitCase
 from planner_jax.task.hit.case import case as hit_case
-from planner_jax.task.hit.default_planner import ExactHit
+from planner_jax.task.hit.default_planner import HitProblem
 from planner_jax.task.hit.plan import HitPlan
-from planner_jax.task.hit.replan import ReplanHit
 from planner_jax.task.hit.spec import DRAG as HIT_DRAG
 from planner_jax.trajectory.polynomial import evaluate
 
@@ -66,17 +64,18 @@ class Stroke(abc.ABC, Generic[CaseT, PlanT]):
         case: CaseT,
         flight: Flight,
         drag: ArrayLike,
-        planners: tuple[ExactHit | ExactCatch, OptimisedPlanner],
+        problem: HitProblem | CatchProblem,
         solvers: tuple[Callable[..., PlanT], Callable[..., PlanT]],
     ) -> None:
         self.case: CaseT = jax.tree.map(np.asarray, case)
         limits = self.case.limits.scale(_SHARE, self.case.gravity)
         self._case = dataclasses.replace(self.case, limits=jax.tree.map(np.asarray, limits))
         self.flight, self.drag = flight, drag
-        self._planner, self._replanner = planners
+        self._planner = SearchPlanner(problem)
+        self._replanner = dataclasses.replace(self._planner.replanner(), rounds=(_AGAIN,))
         # Functions (optimiser's settings, planner, case) -> plan, called by `first` and `again`.
         self._solve_first, self._solve_again = solvers
-        self.pieces = self._planner.num_pieces  # number of polynomial pieces of a plan
+        self.pieces = problem.num_pieces  # number of polynomial pieces of a plan
 
     def first(
         self,
@@ -113,11 +112,11 @@ def _state_in(task: Replanning) -> Array:
     return jnp.stack([evaluate(path, elapsed, order) for order in range(4)])
 
 
-def _solve(attempt: Round, planner: OptimisedPlanner, case: PyTree) -> PyTree:
+def _solve(attempt: Round, planner: SearchPlanner, case: PyTree) -> PyTree:
     return solve_cases(planner, case, attempt)
 
 
-def _hit_again(attempt: Round, planner: ReplanHit, task: Replanning) -> HitPlan:
+def _hit_again(attempt: Round, planner: SearchPlanner, task: Replanning) -> HitPlan:
     case = dataclasses.replace(task.case, head_state=_state_in(task))
     return _solve(attempt, planner, dataclasses.replace(task, case=case))
 
@@ -144,9 +143,8 @@ class HitStroke(Stroke[HitCase, HitPlan]):
     ) -> None:
         ball = (6.0, 0.0, 2.0), (-1.0, 0.0, 0.0)
         case = hit_case(*ball, target, robot=robot, drag=drag, **turn)
-        planner = ExactHit(drag_after_impact=True)
-        planners = planner, ReplanHit(planner, rounds=(_AGAIN,))
-        super().__init__(case, rk4_step, drag, planners, (_solve, _hit_again))
+        problem = HitProblem(drag_after_impact=True)
+        super().__init__(case, rk4_step, drag, problem, (_solve, _hit_again))
 
     def contact(self, plan: HitPlan) -> float:
         """Return the time [s] at which a plan hits the ball."""
@@ -170,14 +168,14 @@ def _time_left(case: CatchCase) -> Array:
     return jnp.where(path.at(start).pos[2] > height, low, 0.0)[None]
 
 
-def _catch_first(attempt: Round, planner: ExactCatch, case: CatchCase) -> CatchPlan:
+def _catch_first(attempt: Round, planner: SearchPlanner, case: CatchCase) -> CatchPlan:
     """Plan a catch from scratch; the first guess is the earliest catch within the robot's reach."""
     case = dataclasses.replace(case, horizon=_time_left(case))
     case = case.with_choice(jax.tree.map(lambda leaf: leaf[0], Greedy().propose(case)))
     return _solve(attempt, planner, case)
 
 
-def _catch_again(attempt: Round, planner: ReplanCatch, task: Replanning) -> CatchPlan:
+def _catch_again(attempt: Round, planner: SearchPlanner, task: Replanning) -> CatchPlan:
     previous = task.previous
     case = dataclasses.replace(
         task.case,
@@ -206,10 +204,8 @@ class CatchStroke(Stroke[CatchCase, CatchPlan]):
         zero, gravity = jnp.zeros((1, 3)), jnp.full(1, GRAVITY, jnp.float32)
         path = BallPath(BallState(zero, zero), jnp.full((1, 3), drag, jnp.float32), gravity)
         case = catch_case(path, np.ones(1, np.float32), robot=robot, **turn)
-        planner = ExactCatch()
-        planners = planner, ReplanCatch(planner, rounds=(_AGAIN,))
         solvers = _catch_first, _catch_again
-        super().__init__(case, linear_drag_flight, np.full(3, drag), planners, solvers)
+        super().__init__(case, linear_drag_flight, np.full(3, drag), CatchProblem(), solvers)
 
     def contact(self, plan: CatchPlan) -> float:
         """Return the time [s] at which a plan catches the ball."""

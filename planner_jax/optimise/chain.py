@@ -28,7 +28,7 @@ from planner_jax.cost.quadrotor import (
     greatest_excess,
     overturn_excess,
 )
-from planner_jax.optimise.planner import OptimisedPlanner
+from planner_jax.optimise.planner import Problem
 from planner_jax.optimise.settings import Curvature, Evaluation
 from planner_jax.optimise.shipped import StartNetwork, load_scale
 from planner_jax.trajectory.polynomial import PiecewisePolynomial
@@ -58,8 +58,8 @@ class ChainEnds:
 
 
 @dataclasses.dataclass(frozen=True)
-class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
-    """A planner of N minimum-snap segments of M polynomial pieces each.
+class ChainProblem(Problem[CaseT, PlanT]):
+    """A problem of N minimum-snap segments of M polynomial pieces each.
 
     The decision variables of a segment are whitened waypoint offsets (scaled deviations from the
     smoothest trajectory) and K end variables. Each is divided by its unit in `scale`. The first end

@@ -10,7 +10,7 @@ import numpy as np
 from jax import Array
 
 from planner_jax.core.arithmetic import Numbers
-from planner_jax.optimise.chain import ChainPlanner
+from planner_jax.optimise.chain import ChainProblem
 from planner_jax.trajectory import polynomial
 from planner_jax.trajectory.proportional_minco import boundary_rows
 
@@ -33,7 +33,7 @@ def sample_states(trajectory: polynomial.PiecewisePolynomial, times: Numbers) ->
 
 
 def fit_offsets(
-    planner: ChainPlanner,
+    problem: ChainProblem,
     trajectory: polynomial.PiecewisePolynomial,
     begins: Array,
     durations: Array,
@@ -42,18 +42,18 @@ def fit_offsets(
     """Return the waypoint offsets (N, M - 1, 3) with which N segments follow a trajectory.
 
     Args:
-        planner: the planner of segments with M pieces.
+        problem: the problem, whose segments have M pieces.
         trajectory: the trajectory to follow.
         begins: (N,) [s], times in `trajectory` at which the segments start.
         durations: (N,) [s], durations of the segments.
         tails: (N, 4, 3), position to jerk at the ends of the segments.
     """
-    proportions = planner.maps.proportions
+    proportions = problem.maps.proportions
     shares = np.cumsum(proportions) / np.sum(proportions) - proportions / np.sum(proportions)
     knots = begins[:, None] + durations[:, None] * jnp.asarray(shares, begins.dtype)[None]
     states = sample_states(trajectory, knots.ravel()).reshape(*knots.shape, _ORDERS, 3)
     heads = jnp.concatenate([states[:1, 0], tails[:-1]])
-    rows = jax.vmap(boundary_rows)(heads, tails, durations / planner.num_pieces)
+    rows = jax.vmap(boundary_rows)(heads, tails, durations / problem.num_pieces)
     along = jnp.concatenate([rows, states[:, 1:, 0]], axis=1)
-    matrix = jnp.asarray(planner.maps.offsets, begins.dtype)
+    matrix = jnp.asarray(problem.maps.offsets, begins.dtype)
     return jnp.sum(matrix[None, :, :, None] * along[:, None], axis=2)

@@ -119,18 +119,19 @@ def optimal_plan(planner: Planner, case: PyTree, *, solver: LbfgsConfig | None =
         shown = f"batch shape {case.batch_shape}; for batches use pj.gradient or jax.vmap"
         raise ArgumentError("case", "one case", shown=shown)
     minimiser, case = planner.settle(case)
+    problem = minimiser.problem
     solver = solver or LbfgsConfig(max_steps=200, tolerance=1e-7, patience=6)
-    context = minimiser.prepare(case)
-    start = lax.stop_gradient(minimiser.first_guess(context))
+    context = problem.prepare(case)
+    start = lax.stop_gradient(problem.first_guess(context))
     # A gradient with a norm below this multiple of the cost can be due to rounding errors alone.
     stationarity = 1e2 * float(jnp.finfo(start.dtype).eps)
 
     def cost(point: Array) -> Array:
-        return minimiser.objective(point, context).cost
+        return problem.objective(point, context).cost
 
     def solve(_: Callable, start: Array) -> tuple[Array, Array]:
         def objective(point: Array):
-            return minimiser.objective(point, context)
+            return problem.objective(point, context)
 
         found = minimise(objective, start, solver)
         tolerance = stationarity * jnp.abs(found.evaluation.cost)
@@ -141,6 +142,6 @@ def optimal_plan(planner: Planner, case: PyTree, *, solver: LbfgsConfig | None =
         return jnp.linalg.solve(jax.jacobian(hessian_product)(rhs), rhs)
 
     point, excess = lax.custom_root(jax.grad(cost), start, solve, tangent_solve, has_aux=True)
-    plan = minimiser.decode(point, context).replace(cost=cost(point))
+    plan = problem.decode(point, context).replace(cost=cost(point))
     plan = plan.replace(status=status_of(plan.cost, plan.violation, excess <= 1e3))
     return with_origin(mark_bad_input(plan, case), case)

@@ -22,7 +22,7 @@ from planner_jax.optimise.settings import (
 )
 
 if TYPE_CHECKING:
-    from planner_jax.optimise.planner import OptimisedPlanner
+    from planner_jax.optimise.planner import Problem
 
 
 @struct.dataclass
@@ -113,11 +113,11 @@ def put_lanes_first(plans: PyTree) -> PyTree:
     return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, -1, 0), plans)
 
 
-def plan_at(planner: "OptimisedPlanner", optimum: Optimum, context: PyTree) -> PyTree:
+def plan_at(problem: "Problem", optimum: Optimum, context: PyTree) -> PyTree:
     """Return the plan at the point where a search has ended, with its status."""
-    plan = planner.decode(optimum.point, context)
+    plan = problem.decode(optimum.point, context)
     cost = optimum.evaluation.cost
     status = status_of(cost, plan.violation, optimum.stationary)
-    hopeless = is_unsolved(status) & planner.rules_out(context)
+    hopeless = is_unsolved(status) & problem.rules_out(context)
     status = jnp.where(hopeless, jnp.int32(Status.TOO_FAR), status)
     return plan.replace(cost=cost, iterations=optimum.iterations, status=status)

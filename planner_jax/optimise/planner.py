@@ -1,10 +1,10 @@
-"""The base class of planners that minimise a cost, with the methods that subclasses define."""
+"""Planners that minimise a cost: a problem, stated by pure functions, and attempts to solve it."""
 
 import abc
 import copy
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import ClassVar, Self
+from typing import ClassVar, Generic, Self
 
 import jax
 import jax.numpy as jnp
@@ -16,38 +16,17 @@ from planner_jax.core.arithmetic import float_type
 from planner_jax.core.checks import require_numeric
 from planner_jax.core.choices import EFFORTS, require_one_of
 from planner_jax.core.planner import CaseT, Planner, PlanT
-from planner_jax.core.protocol import Score
+from planner_jax.core.protocol import Score, require_attempts
+from planner_jax.core.rules import Case
 from planner_jax.optimise.rows import Group, Table, group_rounds, load_group
 from planner_jax.optimise.settings import (
     Curvature,
     Evaluation,
-    LbfgsConfig,
     NewtonConfig,
     Round,
     Settings,
     Solver,
-    Stage,
 )
-
-# Settings with which Newton's method continues the first round (attempt) to the optimum.
-_POLISH = NewtonConfig(
-    max_steps=8,
-    damping=1e-6,
-    tighten=30.0,
-    tolerance=1e-7,
-    trusted=1e-6,
-    patience=8,
-    slack=256.0,
-    stragglers=(0.125, 10, 10),
-)
-_LONG = LbfgsConfig(max_steps=300, tolerance=1e-7, patience=6)
-# Value of `effort` -> settings of Newton's method, which continues the first round (attempt).
-_EFFORTS = {
-    "good": NewtonConfig(max_steps=1, damping=1e-6, tolerance=2e-2, stragglers=(0.125, 2, 60)),
-    "best": NewtonConfig(
-        max_steps=8, damping=1e-6, tolerance=1e-7, patience=8, stragglers=(0.125, 8, 32)
-    ),
-}
 
 
 def pending(violation: Array) -> dict[str, PyTree]:
@@ -61,16 +40,16 @@ def pending(violation: Array) -> dict[str, PyTree]:
     }
 
 
-class OptimisedPlanner(Planner[CaseT, PlanT], abc.ABC):
-    """Base class of planners that minimise by L-BFGS or Newton's method, in rounds.
+class Problem(Generic[CaseT, PlanT], abc.ABC):
+    """Base class of what a `SearchPlanner` minimises for one case.
 
-    A round is one attempt at the cases that earlier rounds left unsolved. A subclass is a frozen
-    dataclass and a pytree (`jax.tree_util.register_static` if it holds no arrays) with a field
-    `rounds`. Its functions `prepare`, `guesses`, `objective` and `decode` are pure and take one
+    A subclass is a frozen dataclass and a pytree (`jax.tree_util.register_static` if it holds no
+    arrays). Its functions `prepare`, `guesses`, `objective` and `decode` are pure and take one
     case. Their decision variables are scaled, so that second derivatives are of order one.
     """
 
-    rounds: tuple[Round, ...]  # attempts, in order
+    case_type: ClassVar[type] = Case  # cases of other classes are rejected
+    rounds: ClassVar[tuple[Round, ...]] = (Round(),)  # usual attempts of planners, in order
     # Fields with numbers of the cost, which compiled programs read at run time. They do not change
     # `prepare`, `guesses` and `decode`. The `settings` of rounds may change them.
     weights: ClassVar[tuple[str, ...]] = ()
@@ -79,6 +58,8 @@ class OptimisedPlanner(Planner[CaseT, PlanT], abc.ABC):
     refinements: ClassVar[tuple[str, ...]] = ()
     # Number of Newton's subspace vectors. With 0 the preconditioner counts as inverse Hessian.
     subspace: ClassVar[int] = 4
+    # Whether the guesses are minima, so that Newton's method need not continue from a search.
+    guesses_minima: ClassVar[bool] = False
     # Default of `curvature` in `pj.gradient`: "products" with the Hessian, or the "whole" Hessian.
     adjoint: ClassVar[str] = "products"
 
@@ -141,17 +122,80 @@ class OptimisedPlanner(Planner[CaseT, PlanT], abc.ABC):
         guess = self.guesses(context, 1)[0]
         return self.first_start(guess, self.network_inputs(context), context)
 
+    def fit_attempt(self, attempt: Round, cases: PyTree, rounds: tuple[Round, ...]) -> Round:
+        """Return one of a planner's `rounds` with settings for the shapes of these cases."""
+        return attempt
+
+    def starts_long(self, cases: PyTree, rounds: tuple[Round, ...]) -> bool:
+        """Return whether the first of a planner's `rounds` (attempts) takes long."""
+        return False
+
+    def replanner(self) -> "SearchPlanner | None":
+        """Return the planner by which `pj.replan` updates plans, if it is another one."""
+        return None
+
+    def with_settings(self, settings: Settings) -> Self:
+        """Return a copy with the field values in `settings`, pairs (name, value)."""
+        return dataclasses.replace(self, **dict(settings))  # type: ignore[type-var]
+
+    def setting(self, name: str) -> PyTree:
+        """Return the value of a field that `with_settings` changes."""
+        return getattr(self, name)
+
+    def with_weights(self, weights: dict[str, PyTree]) -> Self:
+        """Return a copy with arrays in fields that are listed in `weights`."""
+        problem = copy.copy(self)  # `dataclasses.replace` would check the arrays' values
+        for name, value in weights.items():
+            object.__setattr__(problem, name, value)
+        return problem
+
+    def with_usual(self, names: Sequence[str]) -> Self:
+        """Return a copy with the default values of these fields of its class."""
+        usual = [(name, getattr(type(self), name, None)) for name in names]
+        return self.with_settings(tuple(pair for pair in usual if pair[1] is not None))
+
+    @classmethod
+    def planner(cls, rounds: tuple[Round, ...] = (), **numbers: object) -> "SearchPlanner":
+        """Make a planner of the problem with these attempts (`rounds`) and values of its fields."""
+        return SearchPlanner(cls(**numbers), rounds)
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class SearchPlanner(Planner[CaseT, PlanT]):
+    """A planner that minimises in rounds: attempts at the cases that are still unsolved."""
+
+    problem: PyTree  # a `Problem`, whose class the type checker does not know
+    # Attempts, in order; if empty, the usual ones of the problem.
+    rounds: tuple[Round, ...] = dataclasses.field(default=(), metadata={"static": True})
+
+    def __post_init__(self) -> None:
+        if not self.rounds:
+            object.__setattr__(self, "rounds", self.problem.rounds)
+        require_attempts("rounds", self.rounds, Round)
+
+    @property
+    def title(self) -> str:
+        """Name of the problem, for messages."""
+        return type(self.problem).__name__
+
+    @property
+    def case_type(self) -> type:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """The class of the planner's cases."""
+        return self.problem.case_type
+
+    def replanner(self) -> "SearchPlanner":
+        """Return the planner by which `pj.replan` updates plans in flight."""
+        return self.problem.replanner() or self
+
+    def starts_long(self, cases: CaseT) -> bool:
+        """Return whether the first attempt (search) for these cases takes long."""
+        return self.problem.starts_long(cases, self.rounds)
+
     @property
     def attempts(self) -> tuple[Round, ...]:
         """The planner's rounds: attempts at a case, in order, until one attempt solves it."""
         return self.rounds
-
-    def fit_attempt(self, attempt: Round, cases: PyTree) -> Round:
-        """Return a round (attempt) with settings for these cases, by default unchanged.
-
-        The method may use only the class and the shapes of the cases.
-        """
-        return attempt
 
     def group_attempts(
         self, attempts: Sequence[Round], cases: PyTree, *, is_whole: bool
@@ -162,14 +206,14 @@ class OptimisedPlanner(Planner[CaseT, PlanT], abc.ABC):
             places = tuple(known.index(each) if each in known else -1 for each in attempts)
             if -1 in places:  # rounds that the planner does not have
                 known, places = tuple(attempts), tuple(range(len(attempts)))
-        fitted = tuple([self.fit_attempt(each, cases) for each in known])
-        return group_rounds(self, fitted, places, is_whole)
+        fitted = tuple([self.problem.fit_attempt(each, cases, self.rounds) for each in known])
+        return group_rounds(self.problem, fitted, places, is_whole)
 
     def load(self, attempt: Round | Group, cases: PyTree) -> tuple[PyTree, Table]:
         """Return arguments of compiled programs for a round, or a group of rounds (attempts)."""
         if isinstance(attempt, Round):
-            attempt = Group.of((self.fit_attempt(attempt, cases),), (0,))
-        return load_group(self, attempt)
+            attempt = Group.of((self.problem.fit_attempt(attempt, cases, self.rounds),), (0,))
+        return load_group(self.problem, attempt)
 
     def solve(self, case: PyTree, attempt: Round | Table, before: Score | None = None) -> PyTree:
         """Return the plan that rounds (attempts) find for one case; see `solve_lanes`."""
@@ -184,58 +228,46 @@ class OptimisedPlanner(Planner[CaseT, PlanT], abc.ABC):
         `before` are the numbers of earlier plans; only better plans are returned, see
         `search.solve_table`. None: there are no earlier plans.
         """
-        from planner_jax.optimise.search import solve_table  # reads this class
+        from planner_jax.optimise.search import solve_table  # reads the class of problems
 
         cases = jax.tree.map(jnp.asarray, cases)
         table = self.load(attempt, cases)[1] if isinstance(attempt, Round) else attempt
-        if before is None:
-            before = Score.none(cases.batch_shape, float_type(cases))
-        return solve_table(self, table, cases, jax.tree.map(jnp.asarray, before))
+        before = Score.none(cases.batch_shape, float_type(cases)) if before is None else before
+        return solve_table(self.problem, table, cases, jax.tree.map(jnp.asarray, before))
 
     def settle(
         self, cases: PyTree, plan_of: Callable[[Planner, PyTree], PyTree] | None = None
     ) -> tuple[Self, PyTree]:
-        """Return the planner and the cases unchanged: there is no choice, such as an order, to fix.
-
-        `plan_of(planner, cases)`, which would make plans to choose from, is not called.
-        """
+        """Return the planner and the cases unchanged, as there is no choice to fix."""
         return self, cases
 
     def with_settings(self, settings: Settings) -> Self:
-        """Return a copy of the planner with the field values in `settings`, pairs (name, value)."""
-        return dataclasses.replace(self, **dict(settings))  # type: ignore[type-var]
+        """Return a copy with the values in `settings`, pairs (name, value).
 
-    def setting(self, name: str) -> PyTree:
-        """Return the value of a field that `with_settings` changes."""
-        return getattr(self, name)
+        The names are `rounds` and fields of the problem.
+        """
+        values = dict(settings)
+        rounds: PyTree = values.pop("rounds", self.rounds)
+        problem = self.problem.with_settings(tuple(values.items())) if values else self.problem
+        return dataclasses.replace(self, problem=problem, rounds=rounds)
 
-    def with_weights(self, weights: dict[str, PyTree]) -> Self:
-        """Return a copy of the planner with arrays in fields that are listed in `weights`."""
-        planner = copy.copy(self)  # `dataclasses.replace` would check the arrays' values
-        for name, value in weights.items():
-            object.__setattr__(planner, name, value)
-        return planner
+    def with_solver(self, solver: Solver | None = None) -> Self:
+        """Return a copy that makes one search from its best first guess, by default a long one."""
+        from planner_jax.optimise.efforts import LONG  # usual searches are shorter
 
-    def with_solver(self, solver: Solver = _LONG) -> Self:
-        """Return a copy of the planner that makes one long search from its best first guess."""
-        return self.with_settings((("rounds", (Round(solver=solver),)),))
+        return dataclasses.replace(self, rounds=(Round(solver=solver or LONG),))
 
     def with_polish(self, solver: NewtonConfig | None = None) -> Self:
         """Return a copy of the planner whose first round (attempt) continues by Newton's method.
 
         `solver` has the settings of the method; None: settings that continue to a local optimum.
         """
-        first, *others = self.rounds
-        stages = (*first.stages, Stage(first.solver, first.settings))
-        first = dataclasses.replace(
-            first, solver=solver or self._fit_subspace(_POLISH), stages=stages
-        )
-        return self.with_settings((("rounds", (first, *others)),))
+        from planner_jax.optimise.efforts import polish_rounds
+
+        return dataclasses.replace(self, rounds=polish_rounds(self.problem, self.rounds, solver))
 
     def with_effort(self, effort: str) -> Self:
-        """Return a copy of the planner that lowers the cost further after every limit holds.
-
-        Only the first round (attempt) is longer. The later rounds are unchanged.
+        """Return a copy whose first round (attempt) lowers the cost further when limits hold.
 
         Args:
             effort: "good" adds one iteration of Newton's method for each case, "best" adds up to 8.
@@ -243,9 +275,8 @@ class OptimisedPlanner(Planner[CaseT, PlanT], abc.ABC):
                 exceeds 2e-2 ("good") or 1e-7 ("best"). "feasible" returns the planner itself.
         """
         require_one_of(EFFORTS, "effort", effort)
-        return (
-            self.with_polish(self._fit_subspace(_EFFORTS[effort])) if effort in _EFFORTS else self
-        )
+        if effort == EFFORTS[0]:
+            return self
+        from planner_jax.optimise.efforts import polish_rounds
 
-    def _fit_subspace(self, solver: NewtonConfig) -> NewtonConfig:
-        return dataclasses.replace(solver, subspace=self.subspace)
+        return dataclasses.replace(self, rounds=polish_rounds(self.problem, self.rounds, effort))

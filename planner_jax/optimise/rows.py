@@ -26,7 +26,7 @@ from planner_jax.lanes import kernels
 from planner_jax.optimise.settings import LbfgsConfig, Round, Settings, Solver, Stage
 
 if TYPE_CHECKING:
-    from planner_jax.optimise.planner import OptimisedPlanner
+    from planner_jax.optimise.planner import Problem
 
 Number = Array | float | int | bool
 _TURNS = 8  # greatest number of iterations on a GPU after which the host asks for unfinished lanes
@@ -37,7 +37,7 @@ class Row:
     """The settings of one search, as Python numbers, or as arrays in a compiled program."""
 
     solver: tuple[Number, ...]  # the numbers of an `LbfgsConfig`: iterations, tolerance, patience
-    weights: dict[str, Number]  # values of the planner's fields `weights`
+    weights: dict[str, Number]  # values of the problem's fields `weights`
     model: Number  # () int32, index of the model
     width: Number  # () int32, number of starting points of a case
     keep: Number  # () int32, number of starting points that the next row continues
@@ -49,16 +49,16 @@ class Row:
     starts: Number  # () bool, whether the row is the first one of a round
     ends: Number  # () bool, whether `keep` selects by the status of the plans, not only by cost
     writes: Number  # () bool, whether the plans compete with the best plans of earlier rounds
-    frozen: Number  # () bool, whether the variables `OptimisedPlanner.held` are constant
+    frozen: Number  # () bool, whether the variables `Problem.held` are constant
 
 
 @dataclasses.dataclass(frozen=True)
 class Model:
     """The constants of a loop that is compiled once for several rows."""
 
-    settings: Settings  # fields of the planner
+    settings: Settings  # fields of the problem
     solver: Solver  # for L-BFGS, `max_steps` are the turns of `tiles.minimise_tile`
-    # Indices of the searched variables among the variables of the finest planner; None: all.
+    # Indices of the searched variables among the variables of the finest problem; None: all.
     free: tuple[int, ...] | None
 
 
@@ -68,8 +68,8 @@ class Table:
 
     numbers: Array | np.ndarray  # (R, F), a row for each of R searches
     models: tuple[Model, ...] = struct.field(pytree_node=False)
-    finest: Settings = struct.field(pytree_node=False)  # of the planner that decodes all plans
-    weights: tuple[str, ...] = struct.field(pytree_node=False)  # the planner's `weights`, sorted
+    finest: Settings = struct.field(pytree_node=False)  # of the problem that decodes all plans
+    weights: tuple[str, ...] = struct.field(pytree_node=False)  # the problem's `weights`, sorted
     starts: int = struct.field(pytree_node=False)  # greatest number of starting points of a case
     guesses: int = struct.field(pytree_node=False)  # number of guesses among which rows start
     # Whether a GPU makes as many iterations as the model's solver states. The host then never waits
@@ -139,13 +139,13 @@ class Group(Attempt):
         )
 
 
-# Groups by the identity of their planner, since it takes long to hash a planner.
+# Groups by the identity of their problem, since it takes long to hash a problem.
 _RECENT: dict[int, tuple] = {}
 _MOST_RECENT = 256
 
 
 def group_rounds(
-    planner: "OptimisedPlanner",
+    problem: "Problem",
     rounds: tuple[Round, ...],
     places: tuple[int, ...],
     is_whole: bool,
@@ -153,13 +153,13 @@ def group_rounds(
     """Return groups of those rounds (attempts) whose indices are `places`, in order.
 
     Unless `is_whole`, each group makes one round, though other rounds can share its program. The
-    last groups of each planner are stored.
+    last groups of each problem are stored.
     """
-    key, known = (rounds, places, is_whole), _RECENT.get(id(planner))
-    if known is not None and known[0] is planner and known[1] == key:
+    key, known = (rounds, places, is_whole), _RECENT.get(id(problem))
+    if known is not None and known[0] is problem and known[1] == key:
         return known[2]
     groups: list[Group] = []
-    for part in _divide(planner, rounds, is_whole):
+    for part in _divide(problem, rounds, is_whole):
         own, made = rounds[part.start : part.stop], [k for k in places if k in part]
         together = [made] if is_whole and made else [[k] for k in made]
         for some in together:
@@ -167,25 +167,25 @@ def group_rounds(
             groups.append(Group.of(own, indices, is_whole, not groups, some[0]))
     if len(_RECENT) >= _MOST_RECENT:
         _RECENT.clear()
-    _RECENT[id(planner)] = planner, key, groups
+    _RECENT[id(problem)] = problem, key, groups
     return groups
 
 
-def _divide(planner: "OptimisedPlanner", rounds: tuple[Round, ...], is_whole: bool) -> list[range]:
+def _divide(problem: "Problem", rounds: tuple[Round, ...], is_whole: bool) -> list[range]:
     """Return the indices of consecutive rounds (attempts) that one compiled program can make.
 
-    These rounds have equal values of all fields of the planner that `weights` and `refinements` do
+    These rounds have equal values of all fields of the problem that `weights` and `refinements` do
     not list. Unless `is_whole`, they also have the same models. The first rounds of one stage and
     one starting point are then apart, because their program is compiled fast.
     """
     names = {name for each in rounds for stage in each.all_stages for name, _ in stage.settings}
-    fixed = sorted(names - {*planner.weights, *planner.refinements})
+    fixed = sorted(names - {*problem.weights, *problem.refinements})
     keys: list[Hashable] = []
     leads = True
     for each in rounds:
-        own, is_plain = planner.with_settings(each.settings), each.starts == 1 and not each.stages
+        own, is_plain = problem.with_settings(each.settings), each.starts == 1 and not each.stages
         shared = tuple(own.setting(name) for name in fixed)
-        models = frozenset(_key_of_model(planner, stage) for stage in each.all_stages)
+        models = frozenset(_key_of_model(problem, stage) for stage in each.all_stages)
         leads = leads and is_plain and (not keys or keys[0] == (shared, models, True))
         keys.append(shared if is_whole else (shared, models, leads))
     groups: list[range] = []
@@ -197,40 +197,38 @@ def _divide(planner: "OptimisedPlanner", rounds: tuple[Round, ...], is_whole: bo
     return groups
 
 
-def _key_of_model(planner: "OptimisedPlanner", stage: Stage) -> tuple:
-    ignored = {*planner.weights} | {*planner.refinements} & {"nodes"}
+def _key_of_model(problem: "Problem", stage: Stage) -> tuple:
+    ignored = {*problem.weights} | {*problem.refinements} & {"nodes"}
     names = {name for name, _ in stage.settings} - ignored
-    own, solver = planner.with_settings(stage.settings), stage.solver
+    own, solver = problem.with_settings(stage.settings), stage.solver
     is_counted = isinstance(solver, LbfgsConfig) and solver.max_steps > 0
     fixed = jax.tree.structure(solver) if is_counted else solver
     return own.size, fixed, tuple((name, own.setting(name)) for name in sorted(names))
 
 
-def load_group(planner: "OptimisedPlanner", group: Group) -> tuple[PyTree, Table]:
+def load_group(problem: "Problem", group: Group) -> tuple[PyTree, Table]:
     """Return a planner and a table, in a jax array, as arguments of programs for a group of rounds.
 
-    The table has the numbers of the rounds and of the planner's `weights`. The returned planner has
-    their defaults, so that planners with other numbers share programs.
+    The table has the numbers of the rounds and of the problem's `weights`. The returned planner has
+    their defaults, so that problems with other numbers share programs.
     """
     is_double = bool(jax.config.jax_enable_x64)  # type: ignore[attr-defined]
     if is_double not in group.loaded:
-        table = _make_table(planner, group)
+        table = _make_table(problem, group)
         with jax.ensure_compile_time_eval():
             table = dataclasses.replace(table, numbers=jnp.asarray(table.numbers))
-        own, inner = type(planner), type(planner.inner)  # classes hold the defaults of fields
-        names = *table.weights, "rounds"
-        usual = [(name, getattr(own, name, getattr(inner, name, None))) for name in names]
-        common = planner.with_settings(tuple(pair for pair in usual if pair[1] is not None))
-        group.loaded[is_double] = common, table
+        from planner_jax.optimise.planner import SearchPlanner  # imports this module
+
+        group.loaded[is_double] = SearchPlanner(problem.with_usual(table.weights)), table
     return group.loaded[is_double]
 
 
-def _make_table(planner: "OptimisedPlanner", group: Group) -> Table:
+def _make_table(problem: "Problem", group: Group) -> Table:
     stages = list(dict.fromkeys(s for each in group.rounds for s in each.all_stages))
-    own = {name: planner.setting(name) for name in sorted(planner.weights)}
+    own = {name: problem.setting(name) for name in sorted(problem.weights)}
     weights = [n for n, x in own.items() if np.ndim(x) == 0 and not isinstance(x, Tracer)]
-    models = list_models(planner, stages, weights, group.is_whole)
-    lists = [_rows_of(planner, each, models, weights) for each in group.rounds]
+    models = list_models(problem, stages, weights, group.is_whole)
+    lists = [_rows_of(problem, each, models, weights) for each in group.rounds]
     rows = list(itertools.chain(*(lists[k] for k in group.made)))
     every = list(itertools.chain(*lists))
     for k in range(len(lists[group.made[0]]) if group.is_first else 0):
@@ -240,7 +238,7 @@ def _make_table(planner: "OptimisedPlanner", group: Group) -> Table:
         unmade = dataclasses.replace(lists[0][0], within=-np.inf, improves=False)
         rows += [unmade] * (most - len(rows))
     lasts = [each.all_stages[-1] for each in group.rounds]
-    finest = max(lasts, key=lambda stage: planner.with_settings(stage.settings).size).settings
+    finest = max(lasts, key=lambda stage: problem.with_settings(stage.settings).size).settings
     finest = tuple(pair for pair in finest if pair[0] not in weights)
     numbers = np.array([[float(x) for x in jax.tree.leaves(row)] for row in rows])
     is_gpu, turns = kernels.has_gpu(), models[lasts[0]].solver.max_steps
@@ -256,7 +254,7 @@ def _make_table(planner: "OptimisedPlanner", group: Group) -> Table:
 
 
 def list_models(
-    planner: "OptimisedPlanner", stages: Sequence[Stage], weights: Sequence[str], is_whole: bool
+    problem: "Problem", stages: Sequence[Stage], weights: Sequence[str], is_whole: bool
 ) -> dict[Stage, Model]:
     """Return the model of each stage; stages with equal constants share a model.
 
@@ -264,14 +262,14 @@ def list_models(
     compiles faster, and searches more slowly.
 
     Raises:
-        ArgumentError: a stage has fewer variables than the finest planner, and they are not the
-            variables that remain when this planner's `held` variables are constant.
+        ArgumentError: a stage has fewer variables than the finest problem, and they are not the
+            variables that remain when this problem's `held` variables are constant.
     """
-    own = {stage: planner.with_settings(stage.settings) for stage in stages}
-    apart = not is_whole and "nodes" in planner.refinements
+    own = {stage: problem.with_settings(stage.settings) for stage in stages}
+    apart = not is_whole and "nodes" in problem.refinements
     groups: dict[tuple, list[Stage]] = {}
     for stage in stages:
-        key = _key_of_model(planner, stage), apart and own[stage].setting("nodes")
+        key = _key_of_model(problem, stage), apart and own[stage].setting("nodes")
         groups.setdefault(key, []).append(stage)
     finest = max(own.values(), key=lambda each: each.size)
     models: dict[Stage, Model] = {}
@@ -279,7 +277,7 @@ def list_models(
         names = {name for stage in group for name, _ in stage.settings}
         first, free = own[group[0]], None
         settings = {name: first.setting(name) for name in sorted(names - {*weights})}
-        if "nodes" in {*settings} & {*planner.refinements}:
+        if "nodes" in {*settings} & {*problem.refinements}:
             settings["nodes"] = max(own[stage].setting("nodes") for stage in group)
         if first.size < finest.size:
             held = finest.held
@@ -297,12 +295,12 @@ def list_models(
 
 
 def _rows_of(
-    planner: "OptimisedPlanner", attempt: Round, models: dict[Stage, Model], weights: list[str]
+    problem: "Problem", attempt: Round, models: dict[Stage, Model], weights: list[str]
 ) -> list[Row]:
     places = {model: k for k, model in enumerate(dict.fromkeys(models.values()))}
     width, last, rows = attempt.starts, len(attempt.all_stages) - 1, []
     for k, stage in enumerate(attempt.all_stages):
-        fields, solver = planner.with_settings(stage.settings), stage.solver
+        fields, solver = problem.with_settings(stage.settings), stage.solver
         is_lbfgs = isinstance(solver, LbfgsConfig)
         row = Row(
             solver=tuple(jax.tree.leaves(solver)) if is_lbfgs else (1, 0.0, 0),

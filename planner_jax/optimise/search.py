@@ -26,7 +26,7 @@ from planner_jax.optimise.multistart import (
     put_lanes_first,
     put_lanes_last,
 )
-from planner_jax.optimise.planner import OptimisedPlanner
+from planner_jax.optimise.planner import Problem
 from planner_jax.optimise.rows import Model, Row, Table
 from planner_jax.optimise.settings import Evaluation, LbfgsConfig
 
@@ -39,13 +39,13 @@ class Item:
     status: Array  # () int32
 
 
-def solve_table(planner: OptimisedPlanner, table: Table, cases: PyTree, before: Score) -> PyTree:
+def solve_table(problem: Problem, table: Table, cases: PyTree, before: Score) -> PyTree:
     """Return the best plans of B cases over the rows of a table; pure.
 
     `before` has the numbers (B,) of the plans that earlier attempts found. Where no new plan is
     better, the result has these numbers, and its other arrays are not meaningful.
     """
-    search = Search(planner, planner.with_settings(table.finest), table)
+    search = Search(problem, problem.with_settings(table.finest), table)
     if table.is_plain:
         return search.once(cases, before)
     from planner_jax.optimise.tiles import solve_in_tiles  # first attempts do not need it
@@ -57,8 +57,8 @@ def solve_table(planner: OptimisedPlanner, table: Table, cases: PyTree, before: 
 class Search:
     """The searches of a table's rows, each from one starting point of each lane."""
 
-    planner: OptimisedPlanner
-    finest: OptimisedPlanner  # prepares cases, guesses and decodes for all models
+    problem: Problem
+    finest: Problem  # prepares cases, guesses and decodes for all models
     table: Table
 
     def once(self, cases: PyTree, before: Score) -> PyTree:
@@ -120,23 +120,23 @@ class Search:
         index: Array,
     ) -> Optimum:
         """Minimise from points (n, lanes) of the finest model."""
-        planner = self.planner.with_settings(model.settings).with_weights(row.weights)
+        problem = self.problem.with_settings(model.settings).with_weights(row.weights)
         solver = model.solver
         size, free = len(starts), None if model.free is None else jnp.array(model.free)
         if free is not None:
             starts = starts[free]
 
         def select(start: Array, inputs: Array, context: PyTree, index: Array) -> Array:
-            return jnp.where(index == 0, planner.first_start(start, inputs, context), start)
+            return jnp.where(index == 0, problem.first_start(start, inputs, context), start)
 
         starts = self._if_starts(row, over(select), starts, starts, inputs, contexts, index)
-        held = None if planner.held is None else row.frozen & planner.held
+        held = None if problem.held is None else row.frozen & problem.held
 
         def objective(point: Array, given: tuple[Array, PyTree]) -> Evaluation:
             start, context = given
             if held is not None:
                 point = jnp.where(held, start, point)
-            return planner.objective(point, context)
+            return problem.objective(point, context)
 
         given = starts, contexts
         if isinstance(solver, LbfgsConfig) and solver.max_steps > 0:
@@ -156,7 +156,7 @@ class Search:
         else:
             from planner_jax.optimise.newton_lanes import minimise_lanes  # few searches need it
 
-            curved = lambda x, given: planner.curvature_at(x, given[1])  # noqa: E731
+            curved = lambda x, given: problem.curvature_at(x, given[1])  # noqa: E731
             found = minimise_lanes(objective, starts, given, solver, curved)
         if free is None:
             return found

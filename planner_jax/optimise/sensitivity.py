@@ -6,13 +6,13 @@ For a number q(u, theta) of a plan, where u minimises cost(u, theta) and theta i
 
 where indices denote derivatives. This is the adjoint form of the implicit function theorem, and
 lambda is the adjoint vector. Conjugate gradients [Hestenes1952] solve for lambda in a few steps.
-They use the planner's products with the Hessian (`OptimisedPlanner.curvature_at`), or the whole
+They use the problem's products with the Hessian (`Problem.curvature_at`), or the whole
 Hessian. lambda^T cost_utheta is a part of the derivative of the cost's gradient along lambda.
 """
 
 import dataclasses
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -25,9 +25,9 @@ from planner_jax.core.checks import numeric
 from planner_jax.core.choices import require_size
 from planner_jax.core.errors import ArgumentError, ArgumentTypeError
 from planner_jax.core.protocol import Plan
-from planner_jax.optimise.planner import OptimisedPlanner, pending
+from planner_jax.optimise.planner import Problem, pending
 from planner_jax.optimise.preconditioner import positive_inverse
-from planner_jax.optimise.settings import Curvature, Evaluation, Round, Settings
+from planner_jax.optimise.settings import Curvature, Evaluation, Settings
 
 Quantity = str | Callable[[PyTree], Array]
 Product = Callable[[Array], Array]  # product of a matrix with a vector (n,)
@@ -70,10 +70,10 @@ class _Context:
 
 
 @struct.dataclass
-class Differentiated(OptimisedPlanner):
-    """A planner that adds the gradient of one number to the plans of the inner planner."""
+class Differentiated(Problem):
+    """A problem that adds the gradient of one number to the plans of the inner problem."""
 
-    planner: OptimisedPlanner
+    problem: Problem
     # The differentiated number: a dotted name in the plan, such as "stroke.time", or a function.
     quantity: Quantity = struct.field(pytree_node=False)
     by: tuple[str, ...] = struct.field(pytree_node=False)  # dotted names in the case
@@ -92,59 +92,58 @@ class Differentiated(OptimisedPlanner):
         if not self.by:
             raise ArgumentError("by", "something in the case", verb="name", shown="nothing")
 
-    @property
-    def attempts(self) -> tuple[Round, ...]:
-        """The inner planner's rounds: attempts at a case, in order, until one solves it."""
-        return self.planner.rounds
+    def with_usual(self, names: Sequence[str]) -> "Differentiated":
+        """Return a copy whose inner problem has the default values of these fields."""
+        return dataclasses.replace(self, problem=self.problem.with_usual(names))
 
     def with_settings(self, settings: Settings) -> "Differentiated":
-        """Return a copy with other values of some fields of the inner planner."""
-        return dataclasses.replace(self, planner=self.planner.with_settings(settings))
+        """Return a copy with other values of some fields of the inner problem."""
+        return dataclasses.replace(self, problem=self.problem.with_settings(settings))
 
     def setting(self, name: str) -> PyTree:
-        """Return the value of a field of the inner planner."""
-        return self.planner.setting(name)
+        """Return the value of a field of the inner problem."""
+        return self.problem.setting(name)
 
     def prepare(self, case: PyTree) -> _Context:
-        """Return a case, and the data that the inner planner prepares for it."""
-        return _Context(case=case, inner=self.planner.prepare(case))
+        """Return a case, and the data that the inner problem prepares for it."""
+        return _Context(case=case, inner=self.problem.prepare(case))
 
     def guesses(self, context: _Context, num: int) -> Array:
-        """Return the first `num` starting points (num, n) of the inner planner."""
-        return self.planner.guesses(context.inner, num)
+        """Return the first `num` starting points (num, n) of the inner problem."""
+        return self.problem.guesses(context.inner, num)
 
     @property
     def held(self) -> np.ndarray | None:
         """Mask (n,) of variables that searches with `Stage.frozen` keep constant; None if none."""
-        return self.planner.held
+        return self.problem.held
 
     def network_inputs(self, context: _Context) -> Array:
-        """Return the features (F,) of a case for the inner planner's network."""
-        return self.planner.network_inputs(context.inner)
+        """Return the features (F,) of a case for the inner problem's network."""
+        return self.problem.network_inputs(context.inner)
 
     def first_start(self, guess: Array, features: Array, context: _Context) -> Array:
-        """Return the first starting point (n,) of the inner planner."""
-        return self.planner.first_start(guess, features, context.inner)
+        """Return the first starting point (n,) of the inner problem."""
+        return self.problem.first_start(guess, features, context.inner)
 
     def objective(self, point: Array, context: _Context) -> Evaluation:
-        """Evaluate the objective of the inner planner at a point (n,)."""
-        return self.planner.objective(point, context.inner)
+        """Evaluate the objective of the inner problem at a point (n,)."""
+        return self.problem.objective(point, context.inner)
 
     def curvature_at(self, point: Array, context: _Context) -> Curvature:
-        """Return the derivatives of the inner planner's objective at a point (n,)."""
-        return self.planner.curvature_at(point, context.inner)
+        """Return the derivatives of the inner problem's objective at a point (n,)."""
+        return self.problem.curvature_at(point, context.inner)
 
     def rules_out(self, context: _Context) -> Array:
-        """Return whether the inner planner proves that no plan exists."""
-        return self.planner.rules_out(context.inner)
+        """Return whether the inner problem proves that no plan exists."""
+        return self.problem.rules_out(context.inner)
 
     def decode(self, point: Array, context: _Context) -> DifferentiatedPlan:
         """Return the inner plan at a point (n,), with the gradient of its number `quantity`."""
-        plan = self.planner.decode(point, context.inner)
+        plan = self.problem.decode(point, context.inner)
         return DifferentiatedPlan(
             plan=plan,
             gradient=gradient_at(
-                self.planner,
+                self.problem,
                 context.case,
                 point,
                 self.quantity,
@@ -157,7 +156,7 @@ class Differentiated(OptimisedPlanner):
 
 
 def gradient_at(
-    planner: OptimisedPlanner,
+    problem: Problem,
     case: PyTree,
     point: Array,
     quantity: Quantity,
@@ -168,9 +167,9 @@ def gradient_at(
     """Return the gradient of one number of a plan by parts of its case, at a point; pure.
 
     Args:
-        planner: the planner whose objective the point minimises.
+        problem: the problem whose objective the point minimises.
         case: one case.
-        point: (n,) minimiser of the planner's objective. At another point the result
+        point: (n,) minimiser of the problem's objective. At another point the result
             is not the gradient at the optimum.
         quantity: dotted name of a number in the plan, or a function of the plan.
         by: dotted names of parts of the case, such as "limits.speed".
@@ -179,7 +178,7 @@ def gradient_at(
             correct for "cost": its derivative at an optimum is the derivative at a fixed point
             (envelope theorem). None: 40 for "products", 1 for "whole".
         curvature: "products" uses the products with the Hessian, and the preconditioner, that the
-            planner's `curvature_at` returns. "whole" uses the inverse of the full Hessian as
+            problem's `curvature_at` returns. "whole" uses the inverse of the full Hessian as
             preconditioner, which takes one product for each of n variables.
 
     Raises:
@@ -191,7 +190,7 @@ def gradient_at(
     def change_case(parts: dict) -> PyTree:
         return functools.reduce(lambda s, name: _with_part(s, name, parts[name]), parts, case)
 
-    context, pull = jax.vjp(lambda parts: planner.prepare(change_case(parts)), parts)
+    context, pull = jax.vjp(lambda parts: problem.prepare(change_case(parts)), parts)
     leaves, treedef = jax.tree.flatten(context)
     is_smooth = [jnp.issubdtype(leaf.dtype, jnp.floating) for leaf in leaves]
     smooth = [leaf for leaf, flag in zip(leaves, is_smooth, strict=True) if flag]
@@ -202,10 +201,10 @@ def gradient_at(
         return jax.tree.unflatten(treedef, [next(taken) if flag else leaf for leaf, flag in both])
 
     def cost(x: Array, smooth: list) -> Array:
-        return planner.objective(x, context_of(smooth)).cost
+        return problem.objective(x, context_of(smooth)).cost
 
     def value_of(x: Array, smooth: list) -> Array:
-        value = number(planner.decode(x, context_of(smooth)).replace(cost=cost(x, smooth)))
+        value = number(problem.decode(x, context_of(smooth)).replace(cost=cost(x, smooth)))
         if numeric(value) is None:
             raise ArgumentTypeError("of", "one number", value)
         if value.shape:
@@ -223,7 +222,7 @@ def gradient_at(
         residual = jnp.where(jnp.any(along_point != 0.0), jnp.ones_like(value), 0.0)
     else:
         if curvature == "products":
-            here = planner.curvature_at(point, context)
+            here = problem.curvature_at(point, context)
             solve = here.preconditioner(jnp.asarray(_DAMPING, point.dtype))
             product = here.products()
         else:

@@ -1,5 +1,6 @@
 """`pj.gradient`: it plans cases and differentiates one number of each plan by parts of its case."""
 
+import dataclasses
 import functools
 from collections.abc import Sequence
 from typing import Generic
@@ -88,6 +89,8 @@ def gradient(
         minimiser = minimiser.with_solver(solver)
     elif polish:
         minimiser = minimiser.with_polish()
-    differentiated = Differentiated(minimiser, of, by, steps, curvature or minimiser.adjoint)
-    plans = plan(differentiated, cases, chunk=chunk, devices=devices)
+    problem = minimiser.problem
+    problem = Differentiated(problem, of, by, steps, curvature or problem.adjoint)
+    minimiser = dataclasses.replace(minimiser, problem=problem)
+    plans = plan(minimiser, cases, chunk=chunk, devices=devices)
     return PlanGradient(plans=with_origin(plans.whole_plan(), cases), **fields_of(plans.gradient))

@@ -214,7 +214,7 @@ def solve(planner: Planner[CaseT, PlanT], cases: CaseT) -> PlanT:
     """Plan cases as a pure function, for compiled functions, `vmap` and `scan`.
 
     After the first attempt (search) only unsolved cases are searched again. This holds for hits,
-    catches, rallies, and every `OptimisedPlanner`; other planners repeat each attempt for all cases
+    catches, rallies, and every `SearchPlanner`; other planners repeat each attempt for all cases
     while one case is unsolved. `vmap` of this function plans its lanes as one batch. As for `plan`,
     compiled programs are stored on the disk.
 

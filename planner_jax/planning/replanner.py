@@ -1,90 +1,146 @@
-"""The base class of re-planners that minimise, with all that does not depend on the task."""
+"""The re-planner of all planners that minimise, with all that does not depend on the task."""
 
-import abc
 import dataclasses
-from typing import Self
+from collections.abc import Callable, Sequence
 
+import jax
 import jax.numpy as jnp
 from flax import struct
-from jax import Array
+from jax import Array, lax
 from jaxtyping import PyTree
 
-from planner_jax.core.planner import PlanT
-from planner_jax.optimise.planner import OptimisedPlanner
-from planner_jax.optimise.settings import Evaluation, Settings
+from planner_jax.core.protocol import Plan
+from planner_jax.optimise.planner import Problem, SearchPlanner
+from planner_jax.optimise.settings import Evaluation, Round, Settings
 from planner_jax.planning.replan import Replanning
 from planner_jax.robot.heading import continue_heading
 
 
 @struct.dataclass
-class ReplanContext:
+class RemainderContext:
     """Data of a re-plan: what remains of a case, and the starting point of the search."""
 
-    inner: PyTree  # what remains, as the inner planner prepares it
+    inner: PyTree  # what remains, as the inner problem prepares it
     task: Replanning
-    start: Array  # (n,), the inner planner's variables for the previous plan
+    start: Array  # (n,), the inner problem's variables for the previous plan
     # () bool, whether what remains of the previous plan is returned; None: a new plan is made.
     is_kept: PyTree = None
 
 
-class Replanner(OptimisedPlanner[Replanning, PlanT], abc.ABC):
-    """Base class of planners for `pj.replan`, which search from the plan that is being executed.
+@dataclasses.dataclass(frozen=True)
+class Remaining:
+    """What the re-planner needs to know of a task, as functions."""
 
-    A subclass is a frozen dataclass with the fields `planner`, which plans what remains of a case,
-    and `rounds`. It defines `begin`, which returns what remains, and `start_from`.
+    plan_type: type[Plan]
+    # `begin(cases, previous, elapsed, **news)` returns what remains of plans being executed.
+    begin: Callable[..., Replanning]
+    # `start_from(problem, task, context)` returns the point (n,) of the inner problem that is
+    # nearest to the previous plan. `context` is what remains, as the inner problem prepares it.
+    start_from: Callable[[PyTree, Replanning, PyTree], Array]
+    rounds: tuple[Round, ...]
+    shortest: float = 0.0  # [s], usual value of the field of `Remainder`
+    # `time_left(task, context)` returns the time () [s] to the next contact, or 0 after the last
+    # one. `keep(task, context)` returns what remains of the previous plan. None: always a new plan.
+    time_left: Callable[[Replanning, PyTree], Array] | None = None
+    keep: Callable[[Replanning, PyTree], PyTree] | None = None
+
+    def planner_of(self, problem: Problem, shortest: float | None = None) -> "Replanner":
+        """Return the planner that continues from existing plans of this problem.
+
+        `shortest` is the field of `Remainder`; None: its usual value.
+        """
+        least = self.shortest if shortest is None else shortest
+        return Replanner(Remainder(problem, self, least), self.rounds)
+
+
+@jax.tree_util.register_static
+@dataclasses.dataclass(frozen=True)
+class Remainder(Problem):
+    """The problem that remains while a plan is being executed, for `pj.replan`.
+
+    The search starts at the previous plan. If less than `shortest` [s] is left until the next
+    contact, the remainder of the previous plan is returned; hits and rallies ignore `shortest`.
     """
 
+    problem: Problem
+    of_task: Remaining
+    shortest: float
     case_type = Replanning
-    planner: PyTree  # an `OptimisedPlanner`, whose type subclasses state
 
-    @property
-    def inner(self) -> PyTree:
-        """The planner that plans what remains of each case, also for plans from scratch."""
-        return self.planner
-
-    @abc.abstractmethod
-    def start_from(self, task: Replanning, context: PyTree) -> Array:
-        """Return the point (n,) of the inner planner's search that is nearest to the previous plan.
-
-        `context` is what remains of the case, as the inner planner prepares it.
-        """
-
-    def prepare(self, case: Replanning) -> ReplanContext:
+    def prepare(self, case: Replanning) -> RemainderContext:
         """Return what remains of a case, and a starting point from the previous plan."""
         now = continue_heading(case.case, case.previous, case.elapsed)
-        task, context = dataclasses.replace(case, case=now), self.planner.prepare(now)
-        return ReplanContext(inner=context, task=task, start=self.start_from(task, context))
+        task, context = dataclasses.replace(case, case=now), self.problem.prepare(now)
+        time_left = self.of_task.time_left
+        return RemainderContext(
+            inner=context,
+            task=task,
+            start=self.of_task.start_from(self.problem, task, context),
+            is_kept=None if time_left is None else time_left(task, context) < self.shortest,
+        )
 
-    def guesses(self, context: ReplanContext, num: int) -> Array:
+    def guesses(self, context: RemainderContext, num: int) -> Array:
         """Return `num` starting points: the previous plan, then guesses for a new plan."""
         first = context.start[None]
         if num == 1:
             return first
-        return jnp.concatenate([first, self.planner.guesses(context.inner, num - 1)])
+        return jnp.concatenate([first, self.problem.guesses(context.inner, num - 1)])
 
-    def objective(self, point: Array, context: ReplanContext) -> Evaluation:
-        """Return the cost, and the largest relative excess over a limit, at n variables `point`."""
-        return self.planner.objective(point, context.inner)
+    def objective(self, point: Array, context: RemainderContext) -> Evaluation:
+        """Return cost and violation at n variables `point`, or of the previous plan if kept."""
+        if context.is_kept is not None:
+            point = jnp.where(context.is_kept, context.start, point)
+        return self.problem.objective(point, context.inner)
 
-    def decode(self, point: Array, context: ReplanContext) -> PlanT:
-        """Return the plan of what remains that the n decision variables `point` describe."""
-        return self.planner.decode(point, context.inner)
+    def decode(self, point: Array, context: RemainderContext) -> PyTree:
+        """Return the plan at n variables `point`, or what remains of the previous plan if kept."""
+        plan, keep = self.problem.decode(point, context.inner), self.of_task.keep
+        if keep is None:
+            return plan
+        remainder = lambda: keep(context.task, context.inner)  # noqa: E731
+        return lax.cond(context.is_kept, remainder, lambda: plan)
 
-    def with_settings(self, settings: Settings) -> Self:
-        """Return a copy with these values of its fields, or of fields of the inner planner."""
-        own = {name: value for name, value in settings if name in vars(self)}
-        inner = self.planner.with_settings(tuple(each for each in settings if each[0] not in own))
-        return dataclasses.replace(self, **{"planner": inner, **own})  # type: ignore[type-var]
+    def with_usual(self, names: Sequence[str]) -> "Remainder":
+        """Return a copy whose inner problem has the default values of these fields."""
+        return dataclasses.replace(self, problem=self.problem.with_usual(names))
+
+    def with_settings(self, settings: Settings) -> "Remainder":
+        """Return a copy with these values of `shortest`, or of fields of the inner problem."""
+        own = {name: value for name, value in settings if name == "shortest"}
+        inner = self.problem.with_settings(tuple(each for each in settings if each[0] not in own))
+        return dataclasses.replace(self, problem=inner, **own)  # type: ignore[arg-type]
 
     @property
     def weights(self) -> tuple[str, ...]:  # type: ignore[override]
-        """The inner planner's numbers of the cost that rounds may change."""
-        return self.planner.weights
+        """The inner problem's numbers of the cost that rounds may change."""
+        return self.problem.weights
 
-    def with_weights(self, weights: dict[str, PyTree]) -> Self:
-        """Return a copy whose inner planner has arrays in fields that are listed in `weights`."""
-        return dataclasses.replace(self, planner=self.planner.with_weights(weights))  # type: ignore[type-var]
+    def with_weights(self, weights: dict[str, PyTree]) -> "Remainder":
+        """Return a copy whose inner problem has arrays in fields that are listed in `weights`."""
+        return dataclasses.replace(self, problem=self.problem.with_weights(weights))
 
     def setting(self, name: str) -> PyTree:
-        """Return the value of a field of this planner or, if it has none, of the inner planner."""
-        return vars(self)[name] if name in vars(self) else self.planner.setting(name)
+        """Return the value of `shortest`, or of a field of the inner problem."""
+        return self.shortest if name == "shortest" else self.problem.setting(name)
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Replanner(SearchPlanner):
+    """The planner for `pj.replan`, which continues from the plans that are being executed."""
+
+    problem: Remainder
+
+    @property
+    def plan_type(self) -> type[Plan]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """The class of the previous plans."""
+        return self.problem.of_task.plan_type
+
+    @property
+    def inner(self) -> SearchPlanner:
+        """The planner of what remains of each case, also for plans from scratch."""
+        return SearchPlanner(self.problem.problem)
+
+    def begin(self, *args: PyTree, **news: PyTree) -> Replanning:
+        """Return what remains to be planned of cases whose plans are being executed."""
+        return self.problem.of_task.begin(*args, **news)

@@ -11,7 +11,7 @@ from planner_jax.core.protocol import Plan, is_solved, take
 from planner_jax.cost.quadrotor import flight_excess, flight_names, relative_excess
 from planner_jax.planning.plan import plan
 from planner_jax.recovery.braking import brake_arm, brake_car
-from planner_jax.recovery.planner import RecoveryPlanner
+from planner_jax.recovery.planner import RecoveryProblem
 from planner_jax.recovery.with_recovery import recovery_cases
 from planner_jax.robot.arm import ArmPlan
 from planner_jax.robot.car import CarPlan
@@ -61,7 +61,7 @@ def append_recovery(case: PyTree, found: Plan, to: str) -> Plan:
 def _end_flight(case: PyTree, found: QuadrotorPlan, to: str) -> QuadrotorPlan:
     cases, plans = jax.tree.map(lambda leaf: np.asarray(leaf)[None], (case, found))
     rest_case = recovery_cases(cases, plans)
-    rest = plan(RecoveryPlanner(to=to), rest_case)
+    rest = plan(RecoveryProblem.planner(to=to), rest_case)
     if is_solved(rest.status[0]):
         return take(dataclasses.replace(plans, recovery=rest.trajectory).with_heading(cases), 0)
     motion = sample_pieces(take(rest.trajectory, 0), _NODES)

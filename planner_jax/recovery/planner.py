@@ -1,4 +1,4 @@
-"""Planner of recovery trajectories: a quadrotor from any state to standstill, within limits."""
+"""Problem of recovery trajectories: a quadrotor from any state to standstill, within limits."""
 
 import dataclasses
 
@@ -9,7 +9,7 @@ from flax import struct
 from jax import Array
 
 from planner_jax.core.choices import RECOVERIES, require_one_of
-from planner_jax.optimise.chain import ChainEnds, ChainPlanner
+from planner_jax.optimise.chain import ChainEnds, ChainProblem
 from planner_jax.optimise.planner import pending
 from planner_jax.optimise.settings import LbfgsConfig, Round
 from planner_jax.recovery.case import RecoveryCase
@@ -26,15 +26,15 @@ _GUESSES = np.array([(1.0, 1.0), (1.6, 1.0), (0.7, 0.7), (2.5, 1.5), (1.2, 0.3),
 
 @struct.dataclass
 class RecoveryContext:
-    """The data with which `RecoveryPlanner` evaluates the cost of a trajectory: only the case."""
+    """The data with which `RecoveryProblem` evaluates the cost of a trajectory: only the case."""
 
     case: RecoveryCase
 
 
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
-class RecoveryPlanner(ChainPlanner[RecoveryCase, QuadrotorPlan]):
-    """Planner of minimum-snap trajectories to standstill, whose durations are free.
+class RecoveryProblem(ChainProblem[RecoveryCase, QuadrotorPlan]):
+    """Minimum-snap trajectories to standstill, whose durations are free.
 
     A trajectory of M pieces has n = 3 (M - 1) + 4 decision variables, in units of `scale`: offsets
     (3,) of M - 1 waypoints from the smoothest trajectory, the logarithm of the duration, and the
@@ -46,17 +46,9 @@ class RecoveryPlanner(ChainPlanner[RecoveryCase, QuadrotorPlan]):
     """
 
     case_type = RecoveryCase
-    package = "planner_jax.recovery"
-    shipped_name = "rest"
-    num_end_variables = 4
-    guess_table = _GUESSES
-    decode_nodes = (40, 40)
-    stands = True
-    proportions: tuple[float, ...] = (0.4, 0.8, 1.0, 1.0, 1.0)  # relative durations of the pieces
-    to: str = "brake"  # where to stand still: "brake" anywhere, "home" at the case's `home`
     # The recovery starts where the preceding plan ends, which may be closer to a limit than the
     # distance at which penalties start. So later rounds (attempts) reduce this distance, `margin`.
-    rounds: tuple[Round, ...] = (
+    rounds = (
         Round(starts=1, solver=LbfgsConfig(max_steps=25)),
         Round(starts=2, solver=LbfgsConfig(max_steps=80), settings=(("margin", 0.01),)),
         Round(
@@ -65,6 +57,14 @@ class RecoveryPlanner(ChainPlanner[RecoveryCase, QuadrotorPlan]):
             settings=(("energy_weight", 1e-10), ("margin", 0.005)),
         ),
     )
+    package = "planner_jax.recovery"
+    shipped_name = "rest"
+    num_end_variables = 4
+    guess_table = _GUESSES
+    decode_nodes = (40, 40)
+    stands = True
+    proportions: tuple[float, ...] = (0.4, 0.8, 1.0, 1.0, 1.0)  # relative durations of the pieces
+    to: str = "brake"  # where to stand still: "brake" anywhere, "home" at the case's `home`
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -15,8 +15,9 @@ from planner_jax.core.errors import NotOffered
 from planner_jax.core.planner import CaseT, Drive, Planner, PlannerAround, PlanT
 from planner_jax.core.protocol import Status, is_solved
 from planner_jax.cost.moving import MovingKeepOut
+from planner_jax.optimise.planner import SearchPlanner
 from planner_jax.recovery.case import RecoveryCase, end_state
-from planner_jax.recovery.planner import RecoveryPlanner
+from planner_jax.recovery.planner import RecoveryProblem
 
 
 @struct.dataclass
@@ -27,7 +28,7 @@ class RecoveringPlanner(PlannerAround[CaseT, PlanT]):
     fraction in `slower` of the case's speed limit. Without a recovery the plan counts as unsolved.
     """
 
-    recovery_planner: RecoveryPlanner
+    recovery_planner: SearchPlanner
     slower: tuple[float, ...] = struct.field(pytree_node=False, default=(0.8, 0.65, 0.5))
 
     def settle(
@@ -108,4 +109,4 @@ def add_recovery(planner: Planner[CaseT, PlanT], recovery: str) -> RecoveringPla
         ValueError: `recovery` is neither "brake" nor "home".
     """
     require_one_of(RECOVERIES, "recovery", recovery)
-    return RecoveringPlanner(planner, RecoveryPlanner(to=recovery))
+    return RecoveringPlanner(planner, RecoveryProblem.planner(to=recovery))

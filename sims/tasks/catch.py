@@ -19,6 +19,7 @@ from planner_jax.baselines.protocols import BY_ROW
 from planner_jax.core import GRAVITY
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.planner import Planner
+from planner_jax.optimise.planner import SearchPlanner
 from planner_jax.planning.decided import DecidedPlanner
 from planner_jax.robot.quadrotor_model import PAPER_CATCHER, QuadrotorModel
 from planner_jax.runs.columns import BOOL, Column, list_of
@@ -48,7 +49,7 @@ from planner_jax.sims.tasks.catch_ahead import (
 from planner_jax.sims.tasks.catch_pilot import LIFT, CatchPilot
 from planner_jax.task.catch.api import planner as catch_planner
 from planner_jax.task.catch.case import START, CatchCase
-from planner_jax.task.catch.default_planner import ExactCatch
+from planner_jax.task.catch.default_planner import CatchProblem
 from planner_jax.task.catch.plan import CatchPlan
 from planner_jax.task.catch.suites import LAUNCH, draw, earliest_throw
 from planner_jax.task.hit.spec import DRAG  # of hits, since [Yu2023catch] reports none
@@ -62,9 +63,10 @@ _AFTER = 0.05  # [s], simulated time after the end of the last ball's horizon
 def _steadier(
     planner: Planner[CatchCase, CatchPlan],
 ) -> Planner[CatchCase, CatchPlan]:
-    if isinstance(planner, DecidedPlanner) and isinstance(planner.planner, ExactCatch):
-        own = dataclasses.replace(planner.planner, lift=LIFT)
-        return dataclasses.replace(planner, planner=own)
+    if isinstance(planner, DecidedPlanner) and isinstance(planner.planner, SearchPlanner):
+        own = planner.planner
+        if isinstance(own.problem, CatchProblem):
+            return dataclasses.replace(planner, planner=own.with_settings((("lift", LIFT),)))
     return planner
 
 

@@ -13,13 +13,14 @@ from planner_jax.ball.prediction import PathTable, predict_path
 from planner_jax.core.protocol import is_better
 from planner_jax.optimise.settings import LbfgsConfig, Round
 from planner_jax.planning.replan import Replanning
+from planner_jax.planning.replanner import Replanner
 from planner_jax.robot.heading import continue_heading
 from planner_jax.sims.loop_state import Outlook, shapes_of_plans
 from planner_jax.sims.scoring import passage
 from planner_jax.task.catch.case import CatchCase
-from planner_jax.task.catch.default_planner import ExactCatch
+from planner_jax.task.catch.default_planner import CatchProblem
 from planner_jax.task.catch.plan import CatchPlan
-from planner_jax.task.catch.replan import ReplanCatch
+from planner_jax.task.catch.replan import REMAINDER
 from planner_jax.task.catch.spec import DECISIONS, TRAINED
 from planner_jax.task.decisions import find_decision
 
@@ -28,6 +29,9 @@ BORNE = 0.1  # greatest relative violation of a limit by a plan that is flown
 _KEPT = 0.01  # relative violation up to which a plan of the loop counts as feasible
 _CHEAPER = 0.95  # cost ratio below which a plan from scratch replaces a feasible warm-started plan
 _INSTANT = 1e-3  # [s], time shorter than any observation period
+# [s], time before a catch in which the plan is not changed. A change would cost more accuracy than
+# new observations of the ball gain.
+_SHORTEST = 0.2
 LIFT = 0.1  # thrust at every catch in initial guesses: 0 is hover, 1 the greatest thrust
 
 
@@ -35,9 +39,7 @@ LIFT = 0.1  # thrust at every catch in initial guesses: 0 is hover, 1 the greate
 class CatchPilot:
     """The part of the closed loop that replans catches in flight, and may change their order."""
 
-    # In the last 0.2 s before a catch the plan is not changed. A change would cost more accuracy
-    # than new observations of the ball gain.
-    planner: ReplanCatch = ReplanCatch(ExactCatch(lift=LIFT), shortest=0.2)
+    planner: Replanner = REMAINDER.planner_of(CatchProblem(lift=LIFT), _SHORTEST)
     # Greatest relative violations of a limit with which a new plan is always flown: with one
     # remaining catch, and with several. A plan that violates a limit more is flown only if the old
     # plan violates limits as much. The second number is larger, because most of the violation then
@@ -56,7 +58,7 @@ class CatchPilot:
 
     def plan_shapes(self, cases: CatchCase) -> CatchPlan:
         """Return the shapes of the plans of a batch of cases, as `jax.ShapeDtypeStruct`."""
-        return shapes_of_plans(self.planner.planner, cases)
+        return shapes_of_plans(self.planner.inner.problem, cases)
 
     def pose_problem(
         self, case: CatchCase, plan: CatchPlan, outlook: Outlook
@@ -102,10 +104,10 @@ class CatchPilot:
             fresh = found[1]
             # [s], time since a new order was last due. `_INSTANT` absorbs rounding errors.
             since = jnp.mod(outlook.time + _INSTANT, 1.0 / self.redecide)
-            take = (since < 2.0 * _INSTANT) & (fresh.times[0] >= self.planner.shortest)
+            take = (since < 2.0 * _INSTANT) & (fresh.times[0] >= _SHORTEST)
             take &= is_worth_flying(fresh, plan)
             plan = jax.tree.map(lambda new, old: jnp.where(take, new, old), fresh, plan)
-        good = left.present[left.order[0]] & (left.times[0] >= self.planner.shortest)
+        good = left.present[left.order[0]] & (left.times[0] >= _SHORTEST)
         excess = jnp.where(jnp.sum(left.present) > 1, self.excess[1], self.excess[0])
         return plan, good & (plan.violation <= jnp.maximum(excess, asked.previous.violation))
 
@@ -113,7 +115,7 @@ class CatchPilot:
         left = continue_heading(asked.case, asked.previous, asked.elapsed)
         choices = find_decision(DECISIONS, self.decide, TRAINED).propose(left)
         choice = jax.tree.map(lambda leaf: leaf[0], choices)
-        planner, case = self.planner.planner, left.with_choice(choice)
+        planner, case = self.planner.inner, left.with_choice(choice)
         return planner.solve(case, self.search)
 
 

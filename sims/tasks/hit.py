@@ -14,9 +14,11 @@ from jax import Array
 from planner_jax.ball.flight import BallState
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.planner import Planner
+from planner_jax.optimise.planner import SearchPlanner
 from planner_jax.optimise.settings import LbfgsConfig, Round
 from planner_jax.planning.plan import plan as plan_all
 from planner_jax.planning.replan import Replanning
+from planner_jax.planning.replanner import Replanner
 from planner_jax.robot.quadrotor_model import PAPER_HITTER, QuadrotorModel
 from planner_jax.runs.columns import BOOL, NUMBER, VECTOR, Column
 from planner_jax.runs.summary import percent
@@ -48,9 +50,9 @@ from planner_jax.task.hit import court
 from planner_jax.task.hit.api import planner as hit_planner
 from planner_jax.task.hit.case import HitCase
 from planner_jax.task.hit.court import landing
-from planner_jax.task.hit.default_planner import ExactHit
+from planner_jax.task.hit.default_planner import HitProblem
 from planner_jax.task.hit.plan import HitPlan
-from planner_jax.task.hit.replan import ReplanHit
+from planner_jax.task.hit.replan import REMAINDER
 from planner_jax.task.hit.spec import REAL_SCENARIOS
 from planner_jax.task.hit.suites import DEPTH, GRAVITY, SERVE_HEIGHT, generate_serves, to_cases
 
@@ -96,13 +98,13 @@ HIT_WORLD = World(
 )
 
 
-def smooth_planner() -> ExactHit:
-    """Return an `ExactHit` whose first search has 60 iterations, with drag of the returned ball.
+def smooth_planner() -> SearchPlanner:
+    """Return a planner whose first search has 60 iterations, with drag of the returned ball.
 
     Plans have no limit on angular acceleration. After few iterations, a plan may need more torque
     than the rotors have, so that the ball misses its target. A longer search avoids such plans.
     """
-    planner = ExactHit(drag_after_impact=True)
+    planner = HitProblem.planner(drag_after_impact=True)
     solver = LbfgsConfig(max_steps=60, tolerance=1e-5, patience=6)
     return dataclasses.replace(planner, rounds=(Round(1, solver), *planner.rounds[2:]))
 
@@ -111,7 +113,7 @@ def smooth_planner() -> ExactHit:
 class HitPilot:
     """The part of the closed loop that replans a hit in every period, from the current plan."""
 
-    planner: ReplanHit = ReplanHit(ExactHit(drag_after_impact=True))
+    planner: Replanner = REMAINDER.planner_of(HitProblem(drag_after_impact=True))
     # [s], least time before the impact at which the plan may change. A later change would cause a
     # tracking error that does not decay before the impact.
     shortest: float = 0.3
@@ -125,7 +127,7 @@ class HitPilot:
 
     def plan_shapes(self, cases: HitCase) -> HitPlan:
         """Return the shapes of the plans of a batch of cases, as `jax.ShapeDtypeStruct`."""
-        return shapes_of_plans(self.planner.planner, cases)
+        return shapes_of_plans(self.planner.inner.problem, cases)
 
     def pose_problem(
         self, case: HitCase, plan: HitPlan, outlook: Outlook

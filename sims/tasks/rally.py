@@ -148,10 +148,10 @@ def fly_rallies(
     trials = begin_trials(loop, cases, *believed, keys, _SEEN)
     known = first_cases(loop, trials, cases, min(_AHEAD, cases.places.shape[1]))
     clock = time.perf_counter()
-    first = jax.device_get(plan_all(pilot.planner.planner, known))
+    first = jax.device_get(plan_all(pilot.planner.inner, known))
     plans = [first]
     if cases.home is not None:
-        plans.append(jax.device_get(plan_all(pilot.planner.planner, partner_cases(known, first))))
+        plans.append(jax.device_get(plan_all(pilot.planner.inner, partner_cases(known, first))))
     planning = time.perf_counter() - clock
     plan = jax.tree.map(lambda *leaves: jnp.stack(leaves, axis=1), *plans)
     trials = dataclasses.replace(trials, plan=plan)

@@ -97,7 +97,7 @@ pj.catch.planner(decide='policy:gone') | checkpoint must be
 pj.hit.planner(rounds=(pj.LbfgsConfig(),)) | rounds must
 pj.group.planner(decide='nobody') | decide must be one of
 pj.plan('exact', hits) | planner must be one, such as
-pj.plan(exact, catches) | cases must be of the class HitCase, which ExactHit plans, got a CatchCase
+pj.plan(exact, catches) | cases must be of the class HitCase, which HitProblem plans, got a CatchCase
 pj.solve(catcher, hits) | cases must be of the class CatchCase
 pj.plan(exact, having(hits, 'drag', np.zeros(3, np.float32))) | drag must have the shape (2,), got (3,)
 pj.plan(exact, fill(hits, 'target', nan)) | target must be finite, got nan in lane 0 (1 more such lane)

@@ -53,13 +53,13 @@ def excess(acc: Array, case: MeetCase) -> Array:
 
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
-class SmoothMeet(pj.OptimisedPlanner):
-    """A planner that minimises by L-BFGS, with a penalty on accelerations close to the limit."""
+class SmoothMeet(pj.Problem):
+    """The meeting time, and a penalty on accelerations close to the limit."""
 
     case_type = MeetCase
+    rounds = (pj.Round(1, pj.LbfgsConfig(200, tolerance=1e-7, patience=6)),)
     weight: float = 30.0
     margin: float = 0.05
-    rounds: tuple[pj.Round, ...] = (pj.Round(1, pj.LbfgsConfig(200, tolerance=1e-7, patience=6)),)
 
     def prepare(self, case: MeetCase) -> MeetCase:
         return case
@@ -143,6 +143,6 @@ TASK = pj.Task(
     name="meet",
     summary="a point mass in the plane meets a moving point",
     home="meet",
-    planners={"smooth": "meet:SmoothMeet", "scipy": "meet:ScipyMeet"},
+    planners={"smooth": "meet:SmoothMeet.planner", "scipy": "meet:ScipyMeet"},
     suites={"square": "Targets anywhere in a square of 10 m, up to 1.4 m/s on either axis."},
 )

@@ -14,7 +14,7 @@ from planner_jax.core.choices import require, require_size
 from planner_jax.core.protocol import require_settings
 from planner_jax.cost.along import Along, integrate_along
 from planner_jax.cost.quadrotor import ground_excess, speed_excess
-from planner_jax.optimise.planner import OptimisedPlanner, pending
+from planner_jax.optimise.planner import Problem, pending
 from planner_jax.optimise.settings import Evaluation, LbfgsConfig, Round, Stage
 from planner_jax.robot.quadrotor import QuadrotorLimits, body_rate_squared, body_z
 from planner_jax.task.catch.case import CatchCase
@@ -101,8 +101,8 @@ class Catch:
 
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
-class PaperCatch(OptimisedPlanner):
-    """The planner of [Yu2023catch], which optimises catching times and states together.
+class PaperCatch(Problem):
+    """The problem of [Yu2023catch], in which catching times and states are optimised together.
 
     The cost (eqs 18-28) is a sum: the integral of |snap|^2; the weighted total time; smoothed
     penalties of speed, body rate, thrust and ground, integrated by the trapezoid rule; and
@@ -119,16 +119,8 @@ class PaperCatch(OptimisedPlanner):
     """
 
     case_type = CatchCase
-    num_pieces: int = 4  # number of polynomial pieces of one segment
-    nodes: int = 16  # number of intervals per piece in which penalties are integrated
-    time_weight: float = 1000.0  # weight of the time of the last catch
-    limit_weight: float = 1e5
-    ground_weight: float = 1e7
-    miss_weight: float = 1e4
-    angle_weight: float = 1e2
-    hinge_width: float = 0.01  # width of the smoothed penalties of limits and of the net's angle
     # Penalty weights rise in stages: a search that starts with the final weights converges badly.
-    rounds: tuple[Round, ...] = (
+    rounds = (
         Round(
             starts=1,
             solver=LbfgsConfig(max_steps=150, **_PATIENT),
@@ -144,6 +136,14 @@ class PaperCatch(OptimisedPlanner):
             ),
         ),
     )
+    num_pieces: int = 4  # number of polynomial pieces of one segment
+    nodes: int = 16  # number of intervals per piece in which penalties are integrated
+    time_weight: float = 1000.0  # weight of the time of the last catch
+    limit_weight: float = 1e5
+    ground_weight: float = 1e7
+    miss_weight: float = 1e4
+    angle_weight: float = 1e2
+    hinge_width: float = 0.01  # width of the smoothed penalties of limits and of the net's angle
     scale: tuple[float, ...] = ()  # units of one segment's variables; () selects tuned units
 
     def __post_init__(self) -> None:

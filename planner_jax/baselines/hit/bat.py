@@ -19,7 +19,7 @@ from planner_jax.baselines.parts.minimum_jerk import minimum_jerk
 from planner_jax.core.choices import require, require_size
 from planner_jax.core.protocol import require_settings
 from planner_jax.cost.penalty import join_trapezoid_weights, smooth_hinge
-from planner_jax.optimise.planner import OptimisedPlanner, pending
+from planner_jax.optimise.planner import Problem, SearchPlanner, pending
 from planner_jax.optimise.settings import Evaluation, LbfgsConfig, Round
 from planner_jax.task.hit.case import HitCase
 from planner_jax.task.hit.context import HitContext, Impact, is_too_far, prepare_hit
@@ -98,8 +98,8 @@ _UNITS = (0.1, 0.05, 0.3, 0.5)
 
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
-class BatHit(OptimisedPlanner):
-    """The planner of [Yu2023bat]; with `transition=False` its "Bat-Lite".
+class BatHit(Problem):
+    """The problem of [Yu2023bat], solved by its planner; with `transition=False` its "Bat-Lite".
 
     A trajectory of M polynomial pieces has M - 1 inner waypoints. The decision variables, in units
     of `scale`, are the waypoints' positions [m], the logarithm of the impact time T [s], y and z of
@@ -134,6 +134,14 @@ class BatHit(OptimisedPlanner):
     """
 
     case_type = HitCase
+    rounds = (
+        Round(
+            starts=1,
+            solver=LbfgsConfig(
+                max_steps=80, memory=16, trial_steps=(2.0, 0.7071, 0.25, 0.0884), patience=3
+            ),
+        ),
+    )
     transition: bool = True
     num_pieces: int = 4  # number of polynomial pieces
     nodes: int = 16  # number of intervals per piece in which penalties are integrated
@@ -146,14 +154,6 @@ class BatHit(OptimisedPlanner):
     first_angle: float = math.radians(60.0)  # [rad], ball's elevation after the guessed hit
     first_thrust_z: float = 1.1  # vertical thrust at the impact in the initial guess / gravity
     first_racket_vel_yz: tuple[float, float] = (0.0, 1.0)  # [m/s], in the initial guess
-    rounds: tuple[Round, ...] = (
-        Round(
-            starts=1,
-            solver=LbfgsConfig(
-                max_steps=80, memory=16, trial_steps=(2.0, 0.7071, 0.25, 0.0884), patience=3
-            ),
-        ),
-    )
     scale: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
@@ -313,9 +313,9 @@ class BatHit(OptimisedPlanner):
         ).with_heading(case)
 
 
-def bat_lite(**options: Any) -> BatHit:
-    """Create the baseline `bat-lite`: `BatHit` without the state at which a swing starts.
+def bat_lite(**options: Any) -> SearchPlanner:
+    """Make the planner `bat-lite`: of `BatHit` without the state at which a swing starts.
 
     `options` are other fields of `BatHit`.
     """
-    return BatHit(transition=False, **options)
+    return BatHit.planner(transition=False, **options)

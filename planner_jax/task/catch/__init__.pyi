@@ -9,7 +9,6 @@ from .decide import Given as Given
 from .decide import Greedy as Greedy
 from .decide import closest_approach as closest_approach
 from .decide import optimal_time_ratio as optimal_time_ratio
-from .default_planner import ExactCatch as ExactCatch
+from .default_planner import CatchProblem as CatchProblem
 from .plan import CatchPlan as CatchPlan
-from .replan import ReplanCatch as ReplanCatch
 from .suites import draw as draw

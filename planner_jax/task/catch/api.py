@@ -44,17 +44,17 @@ def planner(
         recovery: trajectory after the last catch: "brake" ends at standstill wherever this costs
             least, "home" at the start position. None: no such trajectory.
         effort: "feasible" stops as soon as every limit holds; "good" and "best" lower the cost.
-        **options: fields of the planner's dataclass, for example `rounds`.
+        **options: `rounds`, the attempts, and fields of the problem's dataclass, such as `margin`.
 
     Returns:
-        A planner for `pj.plan`, whose field `planner` is an `ExactCatch`, `PaperCatch` or
-        `MppCatch`. With a `recovery` this planner is the field `planner` of the result. Plans
-        contain the decided order and times.
+        A planner for `pj.plan`. Its field `planner` is an `MppCatch`, or a `SearchPlanner` of a
+        `CatchProblem` or `PaperCatch`. With a `recovery` this planner is the field `planner` of the
+        result. Plans contain the decided order and times.
 
     Raises:
         ValueError: no planner or decision has the requested name, the planner does not support the
             effort, or a file cannot be read.
-        TypeError: the planner's dataclass has no field of the name of an option.
+        TypeError: there is no field of the name of an option.
     """
     decision = find_decision(DECISIONS, decide, TRAINED)
     decided = DecidedPlanner(TASK.make_planner(name, options).with_effort(effort), decision)

@@ -6,7 +6,6 @@ catches the ball. Attitude and limits remain inequalities, which are met by pena
 """
 
 import dataclasses
-from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -14,8 +13,8 @@ import numpy as np
 from jax import Array
 
 from planner_jax.core.protocol import FEASIBILITY_TOLERANCE
-from planner_jax.optimise.chain import ChainEnds, ChainPlanner
-from planner_jax.optimise.planner import pending
+from planner_jax.optimise.chain import ChainEnds, ChainProblem
+from planner_jax.optimise.planner import SearchPlanner, pending
 from planner_jax.optimise.settings import LbfgsConfig, Round, Stage
 from planner_jax.optimise.shipped import StartNetwork, load_network
 from planner_jax.robot.quadrotor import add_drag, body_z, tangent_basis
@@ -30,9 +29,6 @@ from planner_jax.task.catch.context import (
 )
 from planner_jax.task.catch.plan import CatchPlan
 from planner_jax.trajectory.polynomial import PiecewisePolynomial
-
-if TYPE_CHECKING:
-    from planner_jax.task.catch.replan import ReplanCatch
 
 _PROPORTIONS = (0.3,) + (1.0,) * 5
 _FEATURE_TIMES = (-0.1, 0.1)  # [s] times of the network's inputs, after the estimated catch
@@ -79,8 +75,8 @@ _LEAN = 0.95
 
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
-class ExactCatch(ChainPlanner[CatchCase, CatchPlan]):
-    """A planner of minimum-snap catches whose decision variables put the ball into the net.
+class CatchProblem(ChainProblem[CatchCase, CatchPlan]):
+    """Minimum-snap catches whose decision variables put the ball into the net.
 
     A segment of M polynomial pieces leads to each catch. It has 3 (M - 1) + 12 variables in units
     of `scale`: offsets of its waypoints from the smoothest trajectory, logarithm of its duration,
@@ -94,12 +90,12 @@ class ExactCatch(ChainPlanner[CatchCase, CatchPlan]):
     """
 
     case_type = CatchCase
+    rounds = _ROUNDS
     package = "planner_jax.task.catch"
     num_end_variables = 12
     guess_table = _GUESSES
     proportions: tuple[float, ...] = _PROPORTIONS  # relative durations of the pieces
     catch_weight: float = 0.3  # [s] weight of the penalties at a catch
-    rounds: tuple[Round, ...] = _ROUNDS
     # Thrust at catches before the last one in the first starting point: -1 is the least, 0 hover, 1
     # the greatest thrust. Near -1 catches are earliest; larger values leave a margin for feedback
     # control in flight.
@@ -168,22 +164,22 @@ class ExactCatch(ChainPlanner[CatchCase, CatchPlan]):
         rows = jnp.asarray(rows, context.times.dtype)
         return jax.vmap(lambda guess: self._guess(context, guess))(rows)
 
-    def starts_long(self, cases: CatchCase) -> bool:
+    def starts_long(self, cases: CatchCase, rounds: tuple[Round, ...]) -> bool:
         """Return whether more than three targets must be caught, which needs more iterations."""
-        return self.rounds == _ROUNDS and cases.num_targets > _FEW and not cases.optional
+        return rounds == _ROUNDS and cases.num_targets > _FEW and not cases.optional
 
-    def fit_attempt(self, attempt: Round, case: CatchCase) -> Round:  # pyright: ignore[reportIncompatibleMethodOverride]
+    def fit_attempt(self, attempt: Round, cases: CatchCase, rounds: tuple[Round, ...]) -> Round:
         """Return an attempt (round) with more iterations for more targets."""
-        if self.starts_long(case) and attempt in _ROUNDS[:2]:
-            steps = _STEPS_A_TARGET * case.num_targets if attempt == _FIRST else _OF_MANY.max_steps
+        if self.starts_long(cases, rounds) and attempt in _ROUNDS[:2]:
+            steps = _STEPS_A_TARGET * cases.num_targets if attempt == _FIRST else _OF_MANY.max_steps
             return Round(starts=1, solver=dataclasses.replace(_OF_MANY, max_steps=steps))
-        if attempt.stages == (Stage(_FIRST.solver),) and case.num_targets > 1:
+        if attempt.stages == (Stage(_FIRST.solver),) and cases.num_targets > 1:
             # With several targets the search starts far from the optimum, where a small gain in one
             # iteration does not prove convergence: the tolerance must be smaller.
             slow = min(attempt.solver.tolerance, _CHAIN_TOLERANCE)
             solver = dataclasses.replace(attempt.solver, tolerance=slow)
             return dataclasses.replace(attempt, stages=(_LONG_CHAIN,), solver=solver)
-        is_near = attempt == _FIRST and self.start_network(case) is not None
+        is_near = attempt == _FIRST and self.start_network(cases) is not None
         return _FROM_LEARNED if is_near else attempt
 
     def limit_learned(self, point: Array) -> Array:
@@ -310,8 +306,8 @@ class ExactCatch(ChainPlanner[CatchCase, CatchPlan]):
             **pending(violation),
         ).with_heading(context.case)
 
-    def replanner(self) -> "ReplanCatch":
-        """Return the planner that `pj.replan` uses."""
-        from planner_jax.task.catch.replan import ReplanCatch
+    def replanner(self) -> SearchPlanner:
+        """Return the planner by which `pj.replan` updates plans in flight."""
+        from planner_jax.task.catch.replan import REMAINDER
 
-        return ReplanCatch(self)
+        return REMAINDER.planner_of(self)

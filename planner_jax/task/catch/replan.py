@@ -7,7 +7,6 @@ large changes, still need planning from scratch.
 
 import dataclasses
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -17,13 +16,13 @@ from planner_jax.ball.target import TargetPath
 from planner_jax.core.arithmetic import numpy_of, to_host
 from planner_jax.core.paths import require_path
 from planner_jax.optimise.chain_remainder import evaluate_pieces, fit_offsets
-from planner_jax.optimise.settings import Evaluation, LbfgsConfig, Round
+from planner_jax.optimise.settings import LbfgsConfig, Round
 from planner_jax.planning.replan import Replanning, check_elapsed, planned_state, resolve_argument
-from planner_jax.planning.replanner import ReplanContext, Replanner
+from planner_jax.planning.replanner import Remaining
 from planner_jax.robot.quadrotor import add_drag, body_z
 from planner_jax.task.catch.case import CatchCase
 from planner_jax.task.catch.context import CatchContext, targets_at
-from planner_jax.task.catch.default_planner import ExactCatch
+from planner_jax.task.catch.default_planner import CatchProblem
 from planner_jax.task.catch.plan import CatchPlan
 from planner_jax.trajectory import polynomial
 
@@ -36,117 +35,85 @@ _BINOMIALS, _SHIFTS = polynomial.shift_basis(8)
 _TRIALS = (1.0, 0.2, 0.04)
 
 
-@jax.tree_util.register_static
-@dataclasses.dataclass(frozen=True)
-class ReplanCatch(Replanner[CatchPlan]):
-    """A planner that re-plans catches from the previous plan, for `pj.replan`.
+def begin(
+    cases: CatchCase,
+    previous: CatchPlan,
+    elapsed: ArrayLike,
+    *,
+    targets: TargetPath,
+    head_state: ArrayLike | None = None,
+) -> Replanning:
+    """Return the catches that remain `elapsed` [s] after the start of their plans `previous`.
 
-    The search starts at the remainder of the previous trajectory, sampled at the new waypoints. Its
-    catches are moved to the times at which the targets are expected to pass the net's plane. For
-    unchanged targets and no elapsed time the starting point is the previous plan up to rounding. A
-    target that has moved is caught at another point of the net. If it would miss the net, the
-    starting trajectory is changed as smoothly as possible to reach it.
-
-    If less than `shortest` [s] is left until the next catch, the remainder of the previous plan is
-    returned. After the last catch the remainder is empty and stays at the position of that catch.
-
-    The first round (attempt) makes one iteration, and the next re-plan continues from its result:
-    the real-time iteration of [Diehl2005]. One iteration usually suffices to keep all limits.
+    `cases` are one case or a batch of B cases as they were planned, `elapsed` () or (B,) is
+    >= 0. Caught targets become absent; the remaining targets keep their order. `targets` are
+    the targets' paths as estimated at the present, which is time 0 of these paths. `head_state`
+    (..., 4, 3) has position, velocity, acceleration and jerk of the quadrotor, by default as
+    planned, after the end of a plan as at its end.
     """
-
-    plan_type = CatchPlan
-    planner: ExactCatch = ExactCatch()
-    rounds: tuple[Round, ...] = (
-        Round(starts=1, solver=LbfgsConfig(max_steps=1, memory=1, trial_steps=_TRIALS)),
-        Round(starts=1, solver=LbfgsConfig(max_steps=40, trial_steps=_TRIALS)),
-        Round(starts=3, solver=LbfgsConfig(max_steps=80)),
+    elapsed = check_elapsed(cases, elapsed)
+    require_path("targets", targets, np.shape(cases.present), 3)
+    own = planned_state(previous.trajectory, elapsed)
+    head_state = resolve_argument("head_state", head_state, own, elapsed)
+    since = elapsed[..., None]
+    order, times = to_host(previous.order), to_host(previous.times)
+    present, horizon = to_host(cases.present), to_host(cases.horizon)
+    is_past = times <= since
+    xp = numpy_of(order, is_past)  # jax.numpy if plans or times are traced
+    if times.shape[-1] == 1:  # a single target needs no new order
+        present = present & ~is_past
+    elif xp is jnp or is_past.any():
+        caught = xp.take_along_axis(is_past, xp.argsort(order, axis=-1), axis=-1)
+        present = present & ~caught
+        next_first = xp.argsort(is_past, axis=-1, stable=True)
+        order, times = (xp.take_along_axis(x, next_first, axis=-1) for x in (order, times))
+    left = dataclasses.replace(
+        cases,
+        targets=targets,
+        present=present,
+        horizon=horizon - since,
+        order=order,
+        times=numpy_of(is_past).maximum(times - since, _SHORTEST),
+        head_state=head_state,
     )
-    shortest: float = 0.05  # [s], least time to the next catch for which a new plan is made
+    return Replanning(case=left, previous=previous, elapsed=elapsed)
 
-    def begin(
-        self,
-        cases: CatchCase,
-        previous: CatchPlan,
-        elapsed: ArrayLike,
-        *,
-        targets: TargetPath,
-        head_state: ArrayLike | None = None,
-    ) -> Replanning:
-        """Return the catches that remain `elapsed` [s] after the start of their plans `previous`.
 
-        `cases` are one case or a batch of B cases as they were planned, `elapsed` () or (B,) is
-        >= 0. Caught targets become absent; the remaining targets keep their order. `targets` are
-        the targets' paths as estimated at the present, which is time 0 of these paths. `head_state`
-        (..., 4, 3) has position, velocity, acceleration and jerk of the quadrotor, by default as
-        planned, after the end of a plan as at its end.
-        """
-        elapsed = check_elapsed(cases, elapsed)
-        require_path("targets", targets, np.shape(cases.present), 3)
-        own = planned_state(previous.trajectory, elapsed)
-        head_state = resolve_argument("head_state", head_state, own, elapsed)
-        since = elapsed[..., None]
-        order, times = to_host(previous.order), to_host(previous.times)
-        present, horizon = to_host(cases.present), to_host(cases.horizon)
-        is_past = times <= since
-        xp = numpy_of(order, is_past)  # jax.numpy if plans or times are traced
-        if times.shape[-1] == 1:  # a single target needs no new order
-            present = present & ~is_past
-        elif xp is jnp or is_past.any():
-            caught = xp.take_along_axis(is_past, xp.argsort(order, axis=-1), axis=-1)
-            present = present & ~caught
-            next_first = xp.argsort(is_past, axis=-1, stable=True)
-            order, times = (xp.take_along_axis(x, next_first, axis=-1) for x in (order, times))
-        left = dataclasses.replace(
-            cases,
-            targets=targets,
-            present=present,
-            horizon=horizon - since,
-            order=order,
-            times=numpy_of(is_past).maximum(times - since, _SHORTEST),
-            head_state=head_state,
-        )
-        return Replanning(case=left, previous=previous, elapsed=elapsed)
+def start_from(problem: CatchProblem, task: Replanning, context: CatchContext) -> Array:
+    """Return the decision variables (n,) of the previous plan, fitted to the new targets.
 
-    def start_from(self, task: Replanning, context: CatchContext) -> Array:
-        """Return the decision variables (n,) of the previous plan, fitted to the new targets."""
-        planner, net = self.planner, task.case.net
-        trajectory = task.previous.trajectory
-        segments, times = _segments(task)
-        last = (segments + 1) * planner.num_pieces - 1
-        coeffs, ends = trajectory.coeffs[last], trajectory.durations[last]
-        tails = evaluate_pieces(coeffs, ends)
-        load = add_drag(task.case.limits.air, tails[:, 1], tails[:, 2])
-        axis = body_z(load, task.case.gravity)
-        ball = targets_at(context.targets, times)
-        above = jnp.sum((ball.pos - tails[:, 0]) * axis, axis=1) - net.height
-        closing = jnp.sum((tails[:, 1] - ball.vel) * axis, axis=1)
-        meeting = context.active & (closing > _CLOSING)
-        later = jnp.where(meeting, above / jnp.where(meeting, closing, 1.0), 0.0)
-        later = jnp.clip(later, -_LATEST, _LATEST)
-        tails = evaluate_pieces(coeffs, ends + later)
-        times = times + later
-        begins = jnp.concatenate([jnp.zeros_like(times[:1]), times[:-1]])
-        durations = jnp.maximum(times - begins, _SHORTEST)
-        begins = begins + task.elapsed
-        offsets = fit_offsets(planner, trajectory, begins, durations, tails)
-        return planner.encode(context, durations, tails, offsets)
+    The start is the remainder of the previous trajectory, sampled at the new waypoints. Its catches
+    are moved to the times at which the targets are expected to pass the net's plane. For unchanged
+    targets and no elapsed time it is the previous plan up to rounding. A target that has moved is
+    caught at another point of the net. If it would miss the net, the trajectory is changed as
+    smoothly as possible to reach it.
+    """
+    net = task.case.net
+    trajectory = task.previous.trajectory
+    segments, times = _segments(task)
+    last = (segments + 1) * problem.num_pieces - 1
+    coeffs, ends = trajectory.coeffs[last], trajectory.durations[last]
+    tails = evaluate_pieces(coeffs, ends)
+    load = add_drag(task.case.limits.air, tails[:, 1], tails[:, 2])
+    axis = body_z(load, task.case.gravity)
+    ball = targets_at(context.targets, times)
+    above = jnp.sum((ball.pos - tails[:, 0]) * axis, axis=1) - net.height
+    closing = jnp.sum((tails[:, 1] - ball.vel) * axis, axis=1)
+    meeting = context.active & (closing > _CLOSING)
+    later = jnp.where(meeting, above / jnp.where(meeting, closing, 1.0), 0.0)
+    later = jnp.clip(later, -_LATEST, _LATEST)
+    tails = evaluate_pieces(coeffs, ends + later)
+    times = times + later
+    begins = jnp.concatenate([jnp.zeros_like(times[:1]), times[:-1]])
+    durations = jnp.maximum(times - begins, _SHORTEST)
+    begins = begins + task.elapsed
+    offsets = fit_offsets(problem, trajectory, begins, durations, tails)
+    return problem.encode(context, durations, tails, offsets)
 
-    def prepare(self, case: Replanning) -> ReplanContext:
-        """Return the remaining catches, a starting point, and whether too little time is left."""
-        context = super().prepare(case)
-        left = _segments(context.task)[1][0]
-        is_kept = (left < self.shortest) | ~context.inner.active[0]
-        return dataclasses.replace(context, is_kept=is_kept)
 
-    def objective(self, point: Array, context: ReplanContext) -> Evaluation:
-        """Return cost and violation at `point`, or if too little time is left, of the old plan."""
-        return super().objective(jnp.where(context.is_kept, context.start, point), context)
-
-    def decode(self, point: Array, context: ReplanContext) -> CatchPlan:
-        """Return the plan at `point`, or if too little time is left, the old plan's remainder."""
-        plan = super().decode(point, context)
-        remainder = lambda: _remainder(context.task, context.inner)  # noqa: E731
-        return jax.lax.cond(context.is_kept, remainder, lambda: plan)
+def time_left(task: Replanning, context: CatchContext) -> Array:
+    """Return the time () [s] until the next catch; no time after the last catch."""
+    return jnp.where(context.active[0], _segments(task)[1][0], -jnp.inf)
 
 
 def _segments(task: Replanning) -> tuple[Array, Array]:
@@ -155,7 +122,7 @@ def _segments(task: Replanning) -> tuple[Array, Array]:
     return segments, times[segments] - task.elapsed
 
 
-def _remainder(task: Replanning, context: CatchContext) -> CatchPlan:
+def keep(task: Replanning, context: CatchContext) -> CatchPlan:
     """Return the remainder of the previous plan, in the same number of polynomial pieces."""
     previous, num = task.previous, context.times.size
     segments, times = _segments(task)
@@ -193,3 +160,21 @@ def _remainder(task: Replanning, context: CatchContext) -> CatchPlan:
         times=jnp.maximum(times, 0.0),
         iterations=jnp.zeros_like(previous.iterations),
     ).with_heading(task.case)
+
+
+# The first round (attempt) makes one iteration, and the next re-plan continues from its result: the
+# real-time iteration of [Diehl2005]. One iteration usually suffices to keep all limits. After the
+# last catch the remainder is empty, and stays at the position of that catch.
+REMAINDER = Remaining(
+    plan_type=CatchPlan,
+    begin=begin,
+    start_from=start_from,
+    rounds=(
+        Round(starts=1, solver=LbfgsConfig(max_steps=1, memory=1, trial_steps=_TRIALS)),
+        Round(starts=1, solver=LbfgsConfig(max_steps=40, trial_steps=_TRIALS)),
+        Round(starts=3, solver=LbfgsConfig(max_steps=80)),
+    ),
+    shortest=0.05,
+    time_left=time_left,
+    keep=keep,
+)

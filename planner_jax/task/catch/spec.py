@@ -48,8 +48,8 @@ TASK = Task(
     summary="a quadrotor catches flying targets with a net",
     home="planner_jax.task.catch",
     planners={
-        "exact": "planner_jax.task.catch.default_planner:ExactCatch",
-        "catch": "planner_jax.baselines.catch.paper:PaperCatch",
+        "exact": "planner_jax.task.catch.default_planner:CatchProblem.planner",
+        "catch": "planner_jax.baselines.catch.paper:PaperCatch.planner",
         "mpp": "planner_jax.baselines.catch.mpp:MppCatch",
     },
     suites={name: suite.description for name, suite in SUITES.items()},

@@ -4,7 +4,7 @@ from .api import planner as planner
 from .case import HitCase as HitCase
 from .case import HitLimits as HitLimits
 from .case import case as case
-from .default_planner import ExactHit as ExactHit
+from .default_planner import HitProblem as HitProblem
 from .plan import HitPlan as HitPlan
 from .plan import Stroke as Stroke
 from .published import read_serves as read_serves

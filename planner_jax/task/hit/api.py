@@ -83,15 +83,16 @@ def planner(
         recovery: trajectory after the impact, which keeps all limits: "brake" ends at standstill
             wherever this costs least, "home" at the start position. None: no such trajectory.
         effort: "feasible" stops as soon as every limit holds; "good" and "best" lower the cost.
-        **options: fields of the planner's dataclass, for example `rounds`.
+        **options: `rounds`, the attempts, and fields of the problem's dataclass, such as `margin`.
 
     Returns:
-        An `ExactHit`, `BatHit` (`bat` and `bat-lite`) or `JuggleHit`, for `pj.plan`. With a
+        A planner for `pj.plan`: a `JuggleHit`, or a `SearchPlanner` of a `HitProblem` or `BatHit`
+        (`bat` and `bat-lite`). With a
         `recovery` the result is a planner whose field `planner` holds this object.
 
     Raises:
         ValueError: no planner has the requested name, or it does not support the effort.
-        TypeError: the planner's dataclass has no field of the name of an option.
+        TypeError: there is no field of the name of an option.
         ModuleNotFoundError: the planner needs an optional dependency that is not installed.
     """
     own = TASK.make_planner(name, options).with_effort(effort)

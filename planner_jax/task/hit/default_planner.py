@@ -8,7 +8,6 @@ flight time after the impact is a variable instead, which avoids these divisions
 """
 
 import dataclasses
-from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -18,8 +17,8 @@ from jax import Array
 from planner_jax.ball.aim import aim_drag_free, aim_with_drag, apex_with_drag
 from planner_jax.ball.flight import BallState, drag_free_apex, gravity_vector, solve_impact
 from planner_jax.cost.quadrotor import Measure
-from planner_jax.optimise.chain import ChainEnds, ChainPlanner
-from planner_jax.optimise.planner import pending
+from planner_jax.optimise.chain import ChainEnds, ChainProblem
+from planner_jax.optimise.planner import SearchPlanner, pending
 from planner_jax.optimise.settings import LbfgsConfig, Round, Stage
 from planner_jax.optimise.shipped import StartNetwork, load_network
 from planner_jax.robot.quadrotor import tangent_basis, velocity_in_air
@@ -35,9 +34,6 @@ from planner_jax.task.hit.context import (
 from planner_jax.task.hit.plan import HitPlan, Stroke
 from planner_jax.trajectory.polynomial import PiecewisePolynomial
 from planner_jax.trajectory.proportional_minco import ProportionalMinco, proportional_minco
-
-if TYPE_CHECKING:
-    from planner_jax.task.hit.replan import ReplanHit
 
 _PROPORTIONS = (0.2, 0.5) + (1.0,) * 10
 _FEATURE_TIMES = (0.5, 0.75, 0.95)  # times of the ball that the network sees / landing time
@@ -118,8 +114,8 @@ _ROUNDS = (
 
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
-class ExactHit(ChainPlanner[HitCase, HitPlan]):
-    """A planner of minimum-snap hits whose decision variables satisfy the equations of the impact.
+class HitProblem(ChainProblem[HitCase, HitPlan]):
+    """Minimum-snap hits whose decision variables satisfy the equations of the impact.
 
     The trajectory has M polynomial pieces and M - 1 waypoints. The 3 (M - 1) + 8 decision
     variables, in units of `scale`, are the waypoints' offsets from the smoothest trajectory; the
@@ -137,6 +133,7 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
     """
 
     case_type = HitCase
+    rounds = _ROUNDS
     package = "planner_jax.task.hit"
     num_end_variables = 8
     guess_table = _GUESSES
@@ -150,7 +147,6 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
     energy_weight: float = 1e-8
     drag_after_impact: bool = False
     impact_weight: float = 0.3  # [s] weight of the penalties for apex and hitting speed
-    rounds: tuple[Round, ...] = _ROUNDS
     velocities: bool = False  # whether the velocities at the waypoints are variables
     learned: bool = True  # whether a network predicts starting points of usual cases
 
@@ -342,8 +338,8 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
             **pending(violation),
         ).with_heading(context.case)
 
-    def replanner(self) -> "ReplanHit":
-        """Return the planner by which `pj.replan` updates plans of this planner in flight."""
-        from planner_jax.task.hit.replan import ReplanHit
+    def replanner(self) -> SearchPlanner:
+        """Return the planner by which `pj.replan` updates plans in flight."""
+        from planner_jax.task.hit.replan import REMAINDER
 
-        return ReplanHit(self)
+        return REMAINDER.planner_of(self)

@@ -25,8 +25,8 @@ TASK = Task(
     summary="a quadrotor hits served balls to a target with a racket",
     home="planner_jax.task.hit",
     planners={
-        "exact": "planner_jax.task.hit.default_planner:ExactHit",
-        "bat": "planner_jax.baselines.hit.bat:BatHit",
+        "exact": "planner_jax.task.hit.default_planner:HitProblem.planner",
+        "bat": "planner_jax.baselines.hit.bat:BatHit.planner",
         "bat-lite": "planner_jax.baselines.hit.bat:bat_lite",
         "juggle": "planner_jax.baselines.hit.juggle:JuggleHit",
     },

@@ -27,6 +27,7 @@ from jax import Array, lax
 from planner_jax.core import protocol
 from planner_jax.core.choices import EFFORTS, require, require_one_of
 from planner_jax.core.planner import Planner
+from planner_jax.optimise.planner import SearchPlanner
 from planner_jax.task.intercept.case import InterceptCase
 from planner_jax.task.intercept.plan import InterceptPlan, explain, make_straight_plan
 from planner_jax.task.intercept.problem import (
@@ -122,7 +123,7 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
 
     def smooth_near(
         self, cases: InterceptCase, plans: InterceptPlan
-    ) -> tuple[SmoothIntercept, StartedCase]:
+    ) -> tuple[SearchPlanner, StartedCase]:
         """Return a planner and cases by which `pj.gradient` differentiates existing plans.
 
         The planner minimises the cost by least squares. The minimisation starts at the plans, which
@@ -130,13 +131,13 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
         """
         problem = self.problem
         start = problem.pack(plans.speed[..., 1:], plans.curvature[..., 1:], plans.time)
-        return SmoothIntercept(problem), add_start(cases, start)
+        return SmoothIntercept.planner(problem=problem), add_start(cases, start)
 
     def settle(
         self,
         cases: InterceptCase,
         plan_of: Callable[[Planner, InterceptCase], InterceptPlan] | None = None,
-    ) -> tuple[SmoothIntercept, StartedCase]:
+    ) -> tuple[SearchPlanner, StartedCase]:
         """Plan cases; return a planner and cases by which `pj.gradient` differentiates the plans.
 
         `plan_of(self, cases)` makes the plans. By default `solve` makes them with the first entry

@@ -22,8 +22,8 @@ from jax import Array, lax
 
 from planner_jax.core.protocol import is_solved, select
 from planner_jax.optimise.levenberg import LevenbergConfig, LevenbergState, Model, least_squares
-from planner_jax.optimise.planner import OptimisedPlanner
-from planner_jax.optimise.settings import Evaluation, LbfgsConfig, NewtonConfig, Round
+from planner_jax.optimise.planner import Problem
+from planner_jax.optimise.settings import Evaluation, LbfgsConfig, Round
 from planner_jax.plane.cell_paths import CellPath
 from planner_jax.plane.distance_field import DistanceField
 from planner_jax.plane.obstacles import join_obstacles
@@ -415,15 +415,16 @@ class _Context:
 
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
-class SmoothIntercept(OptimisedPlanner):
-    """Planner that minimises the cost of a `MotionProblem` from a plan; used by `pj.gradient`."""
+class SmoothIntercept(Problem):
+    """The cost of a `MotionProblem`, minimised from a plan; used by `pj.gradient`."""
 
     case_type: ClassVar[type] = StartedCase
     adjoint: ClassVar[str] = "whole"
+    guesses_minima: ClassVar[bool] = True
+    # A single attempt (round) without steps of L-BFGS: `guesses` already returns the minimum.
+    rounds: ClassVar[tuple[Round, ...]] = (Round(solver=LbfgsConfig(max_steps=0)),)
     problem: MotionProblem = MotionProblem()
     solver: LevenbergConfig = LevenbergConfig(2000, settled=12, tolerance=0.0)
-    # A single attempt (round) without steps of L-BFGS: `guesses` already returns the minimum.
-    rounds: tuple[Round, ...] = (Round(solver=LbfgsConfig(max_steps=0)),)
 
     def prepare(self, case: StartedCase) -> _Context:
         """Return the case, and a copy in which the walls are moving obstacles with speed 0.
@@ -476,10 +477,6 @@ class SmoothIntercept(OptimisedPlanner):
         problem = self.problem
         plan = problem.decode(context.moving, point, jnp.zeros((), jnp.int32))
         return leave_units(plan, context.case, context.units, is_early=problem.meet == "early")
-
-    def with_polish(self, solver: NewtonConfig | None = None) -> "SmoothIntercept":
-        """Return this planner unchanged: its plans are minima already and need no Newton steps."""
-        return self
 
 
 def add_start(case: InterceptCase, point: Array) -> StartedCase:

@@ -17,14 +17,14 @@ def planner(
         name: `exact`, which plans all hits together and meets every contact and place exactly, or
             the name of a planner of another package.
         effort: "feasible" stops as soon as every limit holds; "good" and "best" lower the cost.
-        **options: fields of the planner's dataclass, for example `rounds`.
+        **options: `rounds`, the attempts, and fields of the problem's dataclass, such as `margin`.
 
     Returns:
-        An `ExactRally` for `pj.plan` and `pj.replan`.
+        A `SearchPlanner` of a `RallyProblem`, for `pj.plan` and `pj.replan`.
 
     Raises:
         ValueError: no planner has the requested name, or it does not support the effort.
-        TypeError: the planner's dataclass has no field of the name of an option.
+        TypeError: there is no field of the name of an option.
     """
     return TASK.make_planner(name, options).with_effort(effort)
 

@@ -8,7 +8,6 @@ that keeps all limits, too.
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -21,8 +20,8 @@ from planner_jax.ball.arc import fly_between
 from planner_jax.ball.flight import BallState, drag_free_fall_time, solve_impact
 from planner_jax.core.arithmetic import reciprocal
 from planner_jax.cost.quadrotor import Measure
-from planner_jax.optimise.chain import ChainEnds, ChainPlanner
-from planner_jax.optimise.planner import pending
+from planner_jax.optimise.chain import ChainEnds, ChainProblem
+from planner_jax.optimise.planner import SearchPlanner, pending
 from planner_jax.optimise.settings import Curvature, LbfgsConfig, Round
 from planner_jax.optimise.shipped import load_scale
 from planner_jax.robot.quadrotor import tangent_basis
@@ -40,9 +39,6 @@ from planner_jax.task.rally.metric import Metric, load_metric
 from planner_jax.task.rally.plan import RallyPlan
 from planner_jax.trajectory.polynomial import PiecewisePolynomial
 from planner_jax.trajectory.proportional_minco import boundary_energy, boundary_rows
-
-if TYPE_CHECKING:
-    from planner_jax.task.rally.replan import ReplanRally
 
 _PROPORTIONS = (0.3,) + (1.0,) * 5
 # Starting points, the best first. Columns: height of the first contact between the least and the
@@ -91,8 +87,8 @@ class RallyContext(HitContext):
 
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
-class ExactRally(ChainPlanner[RallyCase, RallyPlan]):
-    """A planner of K minimum-snap segments; each segment ends at a hit.
+class RallyProblem(ChainProblem[RallyCase, RallyPlan]):
+    """Rallies of K minimum-snap segments; each segment ends at a hit.
 
     A segment of M polynomial pieces has 3 (M - 1) + 11 decision variables in units of `scale`:
     offsets of its waypoints; logarithms of its duration, of the ball's flight time after the hit,
@@ -114,10 +110,11 @@ class ExactRally(ChainPlanner[RallyCase, RallyPlan]):
     """
 
     case_type = RallyCase
+    rounds = ROUNDS
     package = "planner_jax.task.rally"
     num_end_variables = 11
     guess_table = _GUESSES
-    weights = (*ChainPlanner.weights, "place_weight", "apex_weight")
+    weights = (*ChainProblem.weights, "place_weight", "apex_weight")
     proportions: tuple[float, ...] = _PROPORTIONS
     nodes: int = 6  # intervals of each piece at whose ends penalties are evaluated
     time_weight: float = 0.0
@@ -126,7 +123,6 @@ class ExactRally(ChainPlanner[RallyCase, RallyPlan]):
     place_weight: float = 3e-3
     apex_weight: float = 3e-3
     next_weight: float = 3.0
-    rounds: tuple[Round, ...] = ROUNDS
     metric: bool = True  # whether the measured metric of the variables of two hits is used
 
     @property
@@ -169,7 +165,12 @@ class ExactRally(ChainPlanner[RallyCase, RallyPlan]):
         points = points.at[0].add(jnp.asarray(metric.shift, points.dtype))
         return jax.vmap(functools.partial(_multiply, metric.inverse))(points)
 
-    def fit_attempt(self, attempt: Round, cases: RallyCase) -> Round:
+    def fit_attempt(
+        self,
+        attempt: Round,
+        cases: RallyCase,
+        rounds: tuple[Round, ...],  # noqa: ARG002
+    ) -> Round:
         """Return an attempt (round), with fewer iterations if there is a metric."""
         size = cases.places.shape[-2] * len(self.scale)
         is_short = attempt == ROUNDS[0] and self._metric(size) is not None
@@ -319,11 +320,11 @@ class ExactRally(ChainPlanner[RallyCase, RallyPlan]):
             **pending(violation),
         ).with_heading(context.case)
 
-    def replanner(self) -> "ReplanRally":
+    def replanner(self) -> SearchPlanner:
         """Return the planner by which `pj.replan` updates plans in flight."""
-        from planner_jax.task.rally.replan import ReplanRally
+        from planner_jax.task.rally.replan import REMAINDER
 
-        return ReplanRally(self)
+        return REMAINDER.planner_of(self)
 
 
 def _multiply(matrix: np.ndarray, vector: Array) -> Array:

@@ -29,7 +29,7 @@ def planner(
         decide: how one robot's order of catches is found, as for `pj.catch.planner`. A joint search
             always decides which robot catches which targets.
         turns: how often each robot plans, with the other robots' plans as moving keep-outs.
-        **options: fields of the dataclass of `ExactCatch`.
+        **options: fields of the dataclass of `CatchProblem`.
 
     Returns:
         An `ExactTeam` for `pj.plan`; its field `planner` plans one robot's catches and recovery.

@@ -123,7 +123,10 @@ class ExactTeam(Planner[TeamCase, TeamPlan]):
 
     def _hover(self, drive: Drive, cases: TeamCase, k: int) -> PyTree:
         """Return plans (B, ...) in which robot k hovers at its start and catches nothing."""
-        start, pieces = cases.head_states[:, k, None, 0], self.planner.recovery_planner.num_pieces
+        start, pieces = (
+            cases.head_states[:, k, None, 0],
+            self.planner.recovery_planner.problem.num_pieces,
+        )
         still = np.zeros((len(start), pieces, 8, 3), start.dtype)
         still[:, :, 0] = start
         lasting = np.full(still.shape[:2], _HOVER / pieces, start.dtype)

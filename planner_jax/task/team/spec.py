@@ -9,7 +9,7 @@ TASK = Task(
     name="team",
     summary="several quadrotors catch flying targets and keep a distance from each other",
     home="planner_jax.task.team",
-    planners={"exact": "planner_jax.task.catch.default_planner:ExactCatch"},
+    planners={"exact": "planner_jax.task.catch.default_planner:CatchProblem.planner"},
     suites={
         k: f"The targets of `{of}`, shared by {num} robots." for k, (of, num) in SUITES.items()
     },
