@@ -355,4 +355,4 @@ def test_a_plan_or_world_of_another_robot_is_refused():
 def test_shapes_of_plans_are_known_without_planning():
     planner, cases = quick_hit(), pj.hit.draw(2)
     found = jax.eval_shape(functools.partial(pj.solve, planner), cases)
-    assert jax.tree.leaves(shapes_of_plans(planner, cases)) == jax.tree.leaves(found)
+    assert jax.tree.leaves(shapes_of_plans(planner.problem, cases)) == jax.tree.leaves(found)

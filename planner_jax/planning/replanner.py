@@ -39,8 +39,8 @@ class Remaining:
     start_from: Callable[[PyTree, Replanning, PyTree], Array]
     rounds: tuple[Round, ...]
     shortest: float = 0.0  # [s], usual value of the field of `Remainder`
-    # `time_left(task, context)` returns the time () [s] to the next contact, or 0 after the last
-    # one. `keep(task, context)` returns what remains of the previous plan. None: always a new plan.
+    # `time_left(task, context)` returns the time () [s] to the next contact, -inf if there is none.
+    # `keep(task, context)` returns what remains of the previous plan. None: always a new plan.
     time_left: Callable[[Replanning, PyTree], Array] | None = None
     keep: Callable[[Replanning, PyTree], PyTree] | None = None
 

@@ -48,6 +48,9 @@ def begin(
     in `cases`. `places` and `place_range` (..., K, 3) [m] belong to the hits to plan; by
     default places of finished hits are left out, and the last one is repeated. `head_state`
     (..., 4, 3) is the quadrotor's state, by default as planned.
+
+    A hit counts as done from its planned time on. The plan then continues with the next hits, and
+    with as many new hits as are done. Then `ball` is the ball after the last contact.
     """
     elapsed = check_elapsed(cases, elapsed)
     require_kind("ball", ball, BallState)
