@@ -197,7 +197,7 @@ def test_the_start_of_a_replan_is_the_plan_itself_and_the_ball_may_change():
     now = pj.fly(case.ball, elapsed, case.drag, case.gravity, num_steps=50)[0]
     moved = BallState(now.pos + jnp.array([0.05, -0.03, 0.0]), now.vel)
     new = pj.replan(planner, case, plan, elapsed, ball=moved)
-    left = again.begin(case, plan, elapsed, ball=moved).case
+    left = planner.replanner().begin(case, plan, elapsed, ball=moved).case
     assert pj.rally.judge(left, new).success
     assert abs(float(new.strokes.time[0]) - float(plan.strokes.time[0]) + elapsed) < 0.1
 
