@@ -26,6 +26,7 @@ from planner_jax.optimise.planner import SearchPlanner
 from planner_jax.optimise.settings import LbfgsConfig, Round
 from planner_jax.planning.programs import call_packed, solve_cases
 from planner_jax.planning.replan import Replanning
+from planner_jax.planning.replanner import TRIALS
 from planner_jax.robot.heading import with_request
 from planner_jax.robot.quadrotor_model import PAPER_CATCHER, PAPER_HITTER, QuadrotorModel
 from planner_jax.task.catch.case import CatchCase
@@ -48,7 +49,7 @@ _LONGEST = 4.0  # [s], latest time of a catch
 # is often no trajectory to standstill within the limits, so it could not be flown.
 _SHARE = 0.97
 # Settings to improve the previous plan by two steps of L-BFGS; it is close to the optimum already.
-_AGAIN = Round(starts=1, solver=LbfgsConfig(max_steps=2, memory=2, trial_steps=(1.0, 0.2, 0.04)))
+_AGAIN = Round(starts=1, solver=LbfgsConfig(max_steps=2, memory=2, trial_steps=TRIALS))
 
 CaseT = TypeVar("CaseT", HitCase, CatchCase)
 PlanT = TypeVar("PlanT", HitPlan, CatchPlan)

@@ -29,7 +29,7 @@ _BY_EFFORT = {
 def polish_rounds(
     problem: Problem, rounds: tuple[Round, ...], solver: NewtonConfig | str | None
 ) -> tuple[Round, ...]:
-    """Return rounds (attempts) of which the first continues by Newton's method.
+    """Return attempts (rounds) whose first search is followed by Newton's method.
 
     `solver` has the settings of the method. An effort, "good" or "best", or None, which continues
     to a local optimum, stand for settings with the problem's number of subspace vectors. If the

@@ -155,7 +155,7 @@ class Problem(Generic[CaseT, PlanT], abc.ABC):
         return self.with_settings(tuple(pair for pair in usual if pair[1] is not None))
 
     @classmethod
-    def planner(cls, rounds: tuple[Round, ...] = (), **numbers: object) -> "SearchPlanner":
+    def planner(cls, rounds: tuple[Round, ...] | None = None, **numbers: object) -> "SearchPlanner":
         """Make a planner of the problem with these attempts (`rounds`) and values of its fields."""
         return SearchPlanner(cls(**numbers), rounds)
 
@@ -166,11 +166,11 @@ class SearchPlanner(Planner[CaseT, PlanT]):
     """A planner that minimises in rounds: attempts at the cases that are still unsolved."""
 
     problem: PyTree  # a `Problem`, whose class the type checker does not know
-    # Attempts, in order; if empty, the usual ones of the problem.
-    rounds: tuple[Round, ...] = dataclasses.field(default=(), metadata={"static": True})
+    # Attempts, in order; by default the usual ones of the problem.
+    rounds: PyTree = dataclasses.field(default=None, metadata={"static": True})
 
     def __post_init__(self) -> None:
-        if not self.rounds:
+        if self.rounds is None:
             object.__setattr__(self, "rounds", self.problem.rounds)
         require_attempts("rounds", self.rounds, Round)
 

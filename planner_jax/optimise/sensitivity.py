@@ -12,7 +12,7 @@ Hessian. lambda^T cost_utheta is a part of the derivative of the cost's gradient
 
 import dataclasses
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -25,9 +25,10 @@ from planner_jax.core.checks import numeric
 from planner_jax.core.choices import require_size
 from planner_jax.core.errors import ArgumentError, ArgumentTypeError
 from planner_jax.core.protocol import Plan
+from planner_jax.optimise.around import ProblemAround
 from planner_jax.optimise.planner import Problem, pending
 from planner_jax.optimise.preconditioner import positive_inverse
-from planner_jax.optimise.settings import Curvature, Evaluation, Settings
+from planner_jax.optimise.settings import Curvature, Evaluation
 
 Quantity = str | Callable[[PyTree], Array]
 Product = Callable[[Array], Array]  # product of a matrix with a vector (n,)
@@ -70,7 +71,7 @@ class _Context:
 
 
 @struct.dataclass
-class Differentiated(Problem):
+class Differentiated(ProblemAround):
     """A problem that adds the gradient of one number to the plans of the inner problem."""
 
     problem: Problem
@@ -91,18 +92,6 @@ class Differentiated(Problem):
             raise ArgumentTypeError("of", "a name or a function of a plan", self.quantity)
         if not self.by:
             raise ArgumentError("by", "something in the case", verb="name", shown="nothing")
-
-    def with_usual(self, names: Sequence[str]) -> "Differentiated":
-        """Return a copy whose inner problem has the default values of these fields."""
-        return dataclasses.replace(self, problem=self.problem.with_usual(names))
-
-    def with_settings(self, settings: Settings) -> "Differentiated":
-        """Return a copy with other values of some fields of the inner problem."""
-        return dataclasses.replace(self, problem=self.problem.with_settings(settings))
-
-    def setting(self, name: str) -> PyTree:
-        """Return the value of a field of the inner problem."""
-        return self.problem.setting(name)
 
     def prepare(self, case: PyTree) -> _Context:
         """Return a case, and the data that the inner problem prepares for it."""

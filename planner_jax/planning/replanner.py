@@ -1,7 +1,7 @@
 """The re-planner of all planners that minimise, with all that does not depend on the task."""
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -10,10 +10,15 @@ from jax import Array, lax
 from jaxtyping import PyTree
 
 from planner_jax.core.protocol import Plan
+from planner_jax.optimise.around import ProblemAround
 from planner_jax.optimise.planner import Problem, SearchPlanner
-from planner_jax.optimise.settings import Evaluation, Round, Settings
+from planner_jax.optimise.settings import Evaluation, Round
 from planner_jax.planning.replan import Replanning
 from planner_jax.robot.heading import continue_heading
+
+# Step lengths that L-BFGS tries, relative to its proposed step. Small lengths are needed, because
+# the first step ignores the cost's curvature and is too long.
+TRIALS = (1.0, 0.2, 0.04)
 
 
 @struct.dataclass
@@ -29,7 +34,7 @@ class RemainderContext:
 
 @dataclasses.dataclass(frozen=True)
 class Remaining:
-    """What the re-planner needs to know of a task, as functions."""
+    """The functions and attempts by which the re-planner continues plans of a task."""
 
     plan_type: type[Plan]
     # `begin(cases, previous, elapsed, **news)` returns what remains of plans being executed.
@@ -55,7 +60,7 @@ class Remaining:
 
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
-class Remainder(Problem):
+class Remainder(ProblemAround):
     """The problem that remains while a plan is being executed, for `pj.replan`.
 
     The search starts at the previous plan. If less than `shortest` [s] is left until the next
@@ -100,16 +105,6 @@ class Remainder(Problem):
         remainder = lambda: keep(context.task, context.inner)  # noqa: E731
         return lax.cond(context.is_kept, remainder, lambda: plan)
 
-    def with_usual(self, names: Sequence[str]) -> "Remainder":
-        """Return a copy whose inner problem has the default values of these fields."""
-        return dataclasses.replace(self, problem=self.problem.with_usual(names))
-
-    def with_settings(self, settings: Settings) -> "Remainder":
-        """Return a copy with these values of `shortest`, or of fields of the inner problem."""
-        own = {name: value for name, value in settings if name == "shortest"}
-        inner = self.problem.with_settings(tuple(each for each in settings if each[0] not in own))
-        return dataclasses.replace(self, problem=inner, **own)  # type: ignore[arg-type]
-
     @property
     def weights(self) -> tuple[str, ...]:  # type: ignore[override]
         """The inner problem's numbers of the cost that rounds may change."""
@@ -118,10 +113,6 @@ class Remainder(Problem):
     def with_weights(self, weights: dict[str, PyTree]) -> "Remainder":
         """Return a copy whose inner problem has arrays in fields that are listed in `weights`."""
         return dataclasses.replace(self, problem=self.problem.with_weights(weights))
-
-    def setting(self, name: str) -> PyTree:
-        """Return the value of `shortest`, or of a field of the inner problem."""
-        return self.shortest if name == "shortest" else self.problem.setting(name)
 
 
 @jax.tree_util.register_dataclass

@@ -95,6 +95,7 @@ pj.block.planner('library:') | planner must name
 pj.block.planner('library:gone') | library must be a file, got 'gone'
 pj.catch.planner(decide='policy:gone') | checkpoint must be
 pj.hit.planner(rounds=(pj.LbfgsConfig(),)) | rounds must
+pj.hit.planner(rounds=()) | rounds must have an entry
 pj.group.planner(decide='nobody') | decide must be one of
 pj.plan('exact', hits) | planner must be one, such as
 pj.plan(exact, catches) | cases must be of the class HitCase, which HitProblem plans, got a CatchCase

@@ -99,7 +99,7 @@ _UNITS = (0.1, 0.05, 0.3, 0.5)
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class BatHit(Problem):
-    """The problem of [Yu2023bat], solved by its planner; with `transition=False` its "Bat-Lite".
+    """The problem that [Yu2023bat] minimises; with `transition=False`, that of its "Bat-Lite".
 
     A trajectory of M polynomial pieces has M - 1 inner waypoints. The decision variables, in units
     of `scale`, are the waypoints' positions [m], the logarithm of the impact time T [s], y and z of
@@ -314,7 +314,7 @@ class BatHit(Problem):
 
 
 def bat_lite(**options: Any) -> SearchPlanner:
-    """Make the planner `bat-lite`: of `BatHit` without the state at which a swing starts.
+    """Make the planner `bat-lite`, of a `BatHit` without the state at which a swing starts.
 
     `options` are other fields of `BatHit`.
     """

@@ -18,7 +18,7 @@ from planner_jax.core.paths import require_path
 from planner_jax.optimise.chain_remainder import evaluate_pieces, fit_offsets
 from planner_jax.optimise.settings import LbfgsConfig, Round
 from planner_jax.planning.replan import Replanning, check_elapsed, planned_state, resolve_argument
-from planner_jax.planning.replanner import Remaining
+from planner_jax.planning.replanner import TRIALS, Remaining
 from planner_jax.robot.quadrotor import add_drag, body_z
 from planner_jax.task.catch.case import CatchCase
 from planner_jax.task.catch.context import CatchContext, targets_at
@@ -30,9 +30,6 @@ _LATEST = 0.05  # [s], greatest shift of a catch's time in the starting point
 _SHORTEST = 0.01  # [s], least duration of a segment in the starting point
 _CLOSING = 0.1  # [m/s], least speed towards the net's plane at which a catch's time is shifted
 _BINOMIALS, _SHIFTS = polynomial.shift_basis(8)
-# Step lengths that L-BFGS tries, relative to its proposed step. Small lengths are needed, because
-# the first step ignores the cost's curvature and is too long.
-_TRIALS = (1.0, 0.2, 0.04)
 
 
 def begin(
@@ -170,8 +167,8 @@ REMAINDER = Remaining(
     begin=begin,
     start_from=start_from,
     rounds=(
-        Round(starts=1, solver=LbfgsConfig(max_steps=1, memory=1, trial_steps=_TRIALS)),
-        Round(starts=1, solver=LbfgsConfig(max_steps=40, trial_steps=_TRIALS)),
+        Round(starts=1, solver=LbfgsConfig(max_steps=1, memory=1, trial_steps=TRIALS)),
+        Round(starts=1, solver=LbfgsConfig(max_steps=40, trial_steps=TRIALS)),
         Round(starts=3, solver=LbfgsConfig(max_steps=80)),
     ),
     shortest=0.05,

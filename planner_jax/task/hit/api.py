@@ -87,8 +87,8 @@ def planner(
 
     Returns:
         A planner for `pj.plan`: a `JuggleHit`, or a `SearchPlanner` of a `HitProblem` or `BatHit`
-        (`bat` and `bat-lite`). With a
-        `recovery` the result is a planner whose field `planner` holds this object.
+        (`bat` and `bat-lite`). With a `recovery` the result is a planner whose field `planner`
+        holds this planner.
 
     Raises:
         ValueError: no planner has the requested name, or it does not support the effort.

@@ -17,7 +17,7 @@ from planner_jax.core.checks import require_kind
 from planner_jax.core.paths import require_beginning
 from planner_jax.optimise.settings import LbfgsConfig, Round
 from planner_jax.planning.replan import Replanning, check_elapsed, planned_state, resolve_argument
-from planner_jax.planning.replanner import Remaining
+from planner_jax.planning.replanner import TRIALS, Remaining
 from planner_jax.robot.quadrotor import add_drag, net_thrust, tangent_basis
 from planner_jax.task.hit.case import HitCase
 from planner_jax.task.hit.context import HitContext
@@ -26,9 +26,6 @@ from planner_jax.task.hit.plan import HitPlan
 from planner_jax.trajectory.polynomial import evaluate, total_duration
 
 _SHORTEST = 0.01  # [s] least time to the impact in a starting point
-# Step lengths that L-BFGS tries, relative to its proposed step. Small lengths are needed, because
-# the first step ignores the cost's curvature and is too long.
-_TRIALS = (1.0, 0.2, 0.04)
 
 
 def begin(
@@ -75,7 +72,7 @@ REMAINDER = Remaining(
     begin=begin,
     start_from=start_from,
     rounds=(
-        Round(starts=1, solver=LbfgsConfig(max_steps=2, memory=2, trial_steps=_TRIALS)),
-        Round(starts=1, solver=LbfgsConfig(max_steps=40, trial_steps=_TRIALS)),
+        Round(starts=1, solver=LbfgsConfig(max_steps=2, memory=2, trial_steps=TRIALS)),
+        Round(starts=1, solver=LbfgsConfig(max_steps=40, trial_steps=TRIALS)),
     ),
 )
