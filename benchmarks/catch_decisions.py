@@ -34,7 +34,7 @@ from jax.flatten_util import ravel_pytree
 import planner_jax as pj
 from planner_jax.benchmarks.run import Bench, argument_parser, begin, parse_names
 from planner_jax.core.errors import ArgumentError
-from planner_jax.optimise.settings import LbfgsConfig, Round
+from planner_jax.optimise.settings import Attempt, LbfgsConfig
 from planner_jax.planning.decided import DecidedPlanner
 from planner_jax.policies.policy import policy
 from planner_jax.task.catch.decide import Random
@@ -43,7 +43,7 @@ from planner_jax.task.catch.spec import SUITES
 
 OTHERS = ("throws", "hard", "square4", "pentagon5", "heptagon7")
 TRAINED_ON = [name for name in SUITES if name not in OTHERS]
-SHORT = CatchProblem.planner(rounds=(Round(starts=1, solver=LbfgsConfig(max_steps=25)),))
+SHORT = CatchProblem.planner(attempts=(Attempt(starts=1, solver=LbfgsConfig(max_steps=25)),))
 
 
 def decision_time(decision: Any, cases: Any, num: int) -> float:

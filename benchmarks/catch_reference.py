@@ -38,7 +38,7 @@ from planner_jax.baselines.catch.paper import COST_UNIT, PaperCatch
 from planner_jax.benchmarks.catch_peer import peer
 from planner_jax.benchmarks.cost_gap import cost_gaps, gap_figures
 from planner_jax.benchmarks.run import Bench, argument_parser, begin
-from planner_jax.optimise.settings import Round, Stage
+from planner_jax.optimise.settings import Attempt, Stage
 
 SETS = ("paper", "hard")
 BATCH_COPIES = 64
@@ -151,11 +151,11 @@ def quick_paper_catch() -> pj.SearchPlanner:
     stage at all samples. The weights of the penalties are as published with [Yu2023catch].
     """
     chosen = PaperCatch.planner()
-    (full,) = chosen.rounds
+    (full,) = chosen.attempts
     solver = dataclasses.replace(full.solver, max_steps=_QUICK, tolerance=1e-7, patience=5)
     coarse = dataclasses.replace(solver, max_steps=_QUICK_COARSE)
     stages = (Stage(coarse, (("nodes", 4),)),)
-    return dataclasses.replace(chosen, rounds=(Round(1, solver, (), stages),))
+    return dataclasses.replace(chosen, attempts=(Attempt(1, solver, (), stages),))
 
 
 def report_set(bench: Bench, data: Path, name: str, repeats: int) -> None:

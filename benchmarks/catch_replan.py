@@ -344,7 +344,7 @@ def main() -> None:
         warm_up(lanes[0])
         bench.say(
             f"{options.num} throws, {jax.devices()[0].platform}, jax {jax.__version__}, load "
-            f"average {os.getloadavg()[0]:.1f}; compilation of all rounds "
+            f"average {os.getloadavg()[0]:.1f}; compilation of all attempts "
             f"{time.perf_counter() - began:.1f} s"
         )
         if options.alone:

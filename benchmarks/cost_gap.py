@@ -13,14 +13,14 @@ import numpy as np
 from planner_jax.core.protocol import are_solved
 from planner_jax.core.registry import Task
 from planner_jax.optimise.planner import SearchPlanner
-from planner_jax.optimise.settings import LbfgsConfig, NewtonConfig, Round, Stage
+from planner_jax.optimise.settings import Attempt, LbfgsConfig, NewtonConfig, Stage
 from planner_jax.planning.decided import DecidedPlanner
 from planner_jax.planning.plan import plan
 
 COMPARED = 1024  # Maximum number of plans of a batch that are compared with a long search.
 # The long search starts from the planner's initial guess. It runs L-BFGS, then Newton's method,
 # which also converges along directions in which the cost changes very little.
-TO_THE_OPTIMUM = Round(
+TO_THE_OPTIMUM = Attempt(
     solver=NewtonConfig(max_steps=100, tolerance=1e-8, patience=10),
     stages=(Stage(LbfgsConfig(max_steps=200, tolerance=1e-6, patience=5)),),
 )
@@ -77,7 +77,7 @@ def _reference_planner(planner: Any, cases: Any, card: Task | None) -> Any:
 
 def with_long_search(planner: SearchPlanner) -> SearchPlanner:
     """Return a copy of the planner whose only search is long, so that it finds the optimum."""
-    return dataclasses.replace(planner, rounds=(TO_THE_OPTIMUM,))
+    return dataclasses.replace(planner, attempts=(TO_THE_OPTIMUM,))
 
 
 def gap_figures(*gaps: np.ndarray | None) -> dict[str, float | None]:

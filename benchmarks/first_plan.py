@@ -8,9 +8,9 @@ compiled. The CPU time is measured from the start of the process until the first
 returns; it includes imports and the drawing of cases. The device is JAX's default, or the one that
 the variable JAX_PLATFORMS names.
 
-Planners search unsolved cases again in later rounds, which need other programs. A row whose name
-starts with "later" measures a case that needs later rounds. Its process first plans a usual case of
-the task, and the row's times start after that plan.
+Planners search unsolved cases again in later attempts, which need other programs. A row whose name
+starts with "later" measures a case that needs later attempts. Its process first plans a usual case
+of the task, and the row's times start after that plan.
 """
 
 import dataclasses

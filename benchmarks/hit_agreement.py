@@ -51,9 +51,9 @@ def run_row(bench: Bench, name: str, serves: Serves) -> dict[str, Any]:
     planner: Any = pj.hit.planner(planner_name)
     cases = pj.hit.to_cases(serves)
     if iterations is not None:
-        (full,) = planner.rounds
+        (full,) = planner.attempts
         solver = dataclasses.replace(full.solver, max_steps=iterations)
-        planner = dataclasses.replace(planner, rounds=(dataclasses.replace(full, solver=solver),))
+        planner = dataclasses.replace(planner, attempts=(dataclasses.replace(full, solver=solver),))
     if restitution is not None:
         filled = np.full_like(cases.restitution, restitution)
         cases = dataclasses.replace(cases, restitution=filled)

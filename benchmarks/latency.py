@@ -54,7 +54,7 @@ def main() -> None:
         parser.error("--elapsed is for --task intercept")
     suite = options.suite or next(iter(card.suites))
     try:
-        planner = card.make_planner(options.planner or next(iter(card.planners)), {})
+        planner = card.planner(options.planner or next(iter(card.planners)))
         batch = jax.tree.map(np.asarray, card.draw(options.num, suite, options.seed))
     except ValueError as error:
         parser.error(str(error))

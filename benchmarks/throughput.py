@@ -75,15 +75,15 @@ def measure(bench: Bench, settings: ThroughputSettings) -> None:
     effort = {} if settings.effort is None else {"effort": settings.effort}
     made = card.planner(str(settings.planner), **card.bench, **effort)
     solver = made.planner if isinstance(made, DecidedPlanner) else made
-    has_rounds = isinstance(solver, SearchPlanner)
+    has_attempts = isinstance(solver, SearchPlanner)
     if iterations is not None:
-        rule = "left out for a planner without rounds"
-        require(has_rounds, "iterations", rule, iterations)
+        rule = "left out for a planner without attempts"
+        require(has_attempts, "iterations", rule, iterations)
         made = _with_iterations(made, iterations)
-    first = iterations or (solver.rounds[0].solver.max_steps if has_rounds else None)
+    first = iterations or (solver.attempts[0].solver.max_steps if has_attempts else None)
     bench.say(
         f"{card.name}, {len(used)} x {used[0].device_kind}, jax {jax.__version__}, load average "
-        f"{os.getloadavg()[0]:.1f}" + (f"; first round: {first} iterations" if first else ""),
+        f"{os.getloadavg()[0]:.1f}" + (f"; first attempt: {first} iterations" if first else ""),
         "| plans | first call [s] | its compilation [s] | fastest [ms] | median [ms] | plans/s | "
         "refereed | cost above a longer search (median, p90, p99) | memory [GiB] |",
         "|---|---|---|---|---|---|---|---|---|",
@@ -105,9 +105,11 @@ def measure(bench: Bench, settings: ThroughputSettings) -> None:
 def _with_iterations(planner: Any, iterations: int) -> Any:
     if isinstance(planner, DecidedPlanner):
         return dataclasses.replace(planner, planner=_with_iterations(planner.planner, iterations))
-    first, *rest = planner.rounds
+    first, *rest = planner.attempts
     solver = dataclasses.replace(first.solver, max_steps=iterations)
-    return planner.with_settings((("rounds", (dataclasses.replace(first, solver=solver), *rest)),))
+    return planner.with_settings(
+        (("attempts", (dataclasses.replace(first, solver=solver), *rest)),)
+    )
 
 
 @dataclasses.dataclass(frozen=True)

@@ -30,7 +30,7 @@ class ThroughputSettings:
     batch: tuple[int, ...] = option((1024, 16384), "B", "plans in one call, one or more sizes")
     devices: int | None = option(None, "N", "number of devices that share a batch (default: all)")
     iterations: int | None = option(
-        None, "K", "iterations of the first round (default: the planner's own)"
+        None, "K", "iterations of the first attempt (default: the planner's own)"
     )
     effort: str | None = option(None, "NAME", f"effort of the planner: {', '.join(EFFORTS)}")
     repeat: int = option(5, "R", "number of timed calls")

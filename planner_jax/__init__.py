@@ -29,8 +29,7 @@ Classes for parts of cases and plans:
 * obstacles of a car: `Obstacles`, made by `obstacles`
 * trajectories: `PiecewisePolynomial`, `evaluate`
 * base classes and settings for planners and tasks that a user writes: `Planner`, `Plan`, `Attempt`,
-  `outcome`, `Problem`, `SearchPlanner`, `pending`, `Round`, `LbfgsConfig`, `NewtonConfig`,
-  `Evaluation`, `Verdict`, `Task`
+  `outcome`, `Problem`, `SearchPlanner`, `pending`, `LbfgsConfig`, `NewtonConfig`, `Verdict`, `Task`
 
 All errors are `PlannerJaxError`s. A wrong argument raises an `ArgumentError`, which is a
 `ValueError` or, for a wrong type, a `TypeError`. A wrong number in a case raises a `CaseError`, a

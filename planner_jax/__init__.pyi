@@ -12,7 +12,6 @@ from .core.errors import ArgumentError as ArgumentError
 from .core.errors import CaseError as CaseError
 from .core.errors import PlannerJaxError as PlannerJaxError
 from .core.planner import Planner as Planner
-from .core.protocol import Attempt as Attempt
 from .core.protocol import Plan as Plan
 from .core.protocol import Status as Status
 from .core.protocol import are_solved as are_solved
@@ -33,10 +32,9 @@ from .optimise.implicit import optimal_plan as optimal_plan
 from .optimise.planner import Problem as Problem
 from .optimise.planner import SearchPlanner as SearchPlanner
 from .optimise.planner import pending as pending
-from .optimise.settings import Evaluation as Evaluation
+from .optimise.settings import Attempt as Attempt
 from .optimise.settings import LbfgsConfig as LbfgsConfig
 from .optimise.settings import NewtonConfig as NewtonConfig
-from .optimise.settings import Round as Round
 from .plane.make_obstacles import obstacles as obstacles
 from .plane.obstacles import Obstacles as Obstacles
 from .plane.target import PolynomialPath as PolynomialPath

@@ -25,7 +25,7 @@ with contextlib.redirect_stdout(io.StringIO()):  # hides the message that Warp i
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.protocol import is_solved
 from planner_jax.optimise.rows import Group, Table, load_group
-from planner_jax.optimise.settings import LbfgsConfig, Round
+from planner_jax.optimise.settings import Attempt, LbfgsConfig
 from planner_jax.policies.observation import FEATURES, PER_TARGET, choice_of, observe
 from planner_jax.policies.settings import WEIGHTS
 from planner_jax.task.catch.case import CatchCase, CatchChoice
@@ -235,7 +235,7 @@ def _plan(cases: CatchCase, choices: CatchChoice, iterations: int) -> tuple[Catc
 
 
 def _search(iterations: int) -> Table:
-    attempt = Round(starts=1, solver=LbfgsConfig(max_steps=iterations))
+    attempt = Attempt(starts=1, solver=LbfgsConfig(max_steps=iterations))
     return load_group(CatchProblem(), Group.of((attempt,), (0,)))[1]
 
 

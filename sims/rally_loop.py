@@ -372,7 +372,7 @@ def _plan(
             home=None if case.home is None else case.home * side,
         )
         task = Replanning(case=own_case, previous=plan, elapsed=elapsed)
-        new = pilot.planner.solve(task, pilot.planner.rounds[0])
+        new = pilot.planner.solve(task, pilot.planner.attempts[0])
         left = plan.strokes.time - elapsed
         is_free = ~jnp.any((left > -pilot.settled) & (left < pilot.shortest))
         is_free &= (own == planned) & (new.strokes.time[0] >= pilot.shortest)

@@ -16,9 +16,9 @@ from planner_jax.baselines.block.library.planner import LibraryBlock
 from planner_jax.baselines.intercept.projection import Projection
 from planner_jax.baselines.intercept.static_paths import PathSource
 from planner_jax.core.planner import Kind
-from planner_jax.core.protocol import Attempt, Plan, outcome
+from planner_jax.core.protocol import BaseAttempt, Plan, outcome
 from planner_jax.optimise.levenberg import LevenbergConfig
-from planner_jax.optimise.settings import LbfgsConfig, Round
+from planner_jax.optimise.settings import Attempt, LbfgsConfig
 from planner_jax.plane.reach import Lattice
 from planner_jax.task.block.default_planner import Search as BlockSearch
 from planner_jax.task.intercept.problem import MotionProblem
@@ -54,10 +54,10 @@ class LibraryPlanner(pj.Planner):
     """A planner that selects the stored point nearest to the goal, of 8 points and then of 64."""
 
     points: Array  # (K, 2), stored points
-    attempts: ClassVar[tuple[Attempt, ...]] = (Attempt(1), Attempt(2))
+    attempts: ClassVar[tuple[BaseAttempt, ...]] = (BaseAttempt(1), BaseAttempt(2))
     case_type: ClassVar[type] = Place
 
-    def solve(self, case: Place, attempt: Attempt) -> Stand:
+    def solve(self, case: Place, attempt: BaseAttempt) -> Stand:
         points = self.points[: 8 * attempt.starts**3]
         along = jnp.matmul(points, case.goal, precision=lax.Precision.HIGHEST)
         away = jnp.sum(points**2, axis=1) - 2.0 * along + jnp.sum(case.goal**2)
@@ -70,10 +70,10 @@ class LibraryPlanner(pj.Planner):
 class NumpyPlanner(pj.Planner):
     """A planner in NumPy that steps by 0.5 towards the goal, and by 1 in its second attempt."""
 
-    attempts: ClassVar[tuple[Attempt, ...]] = (Attempt(1), Attempt(2))
+    attempts: ClassVar[tuple[BaseAttempt, ...]] = (BaseAttempt(1), BaseAttempt(2))
     case_type: ClassVar[type] = Place
 
-    def solve_on_host(self, cases: Place, attempt: Attempt) -> Stand:
+    def solve_on_host(self, cases: Place, attempt: BaseAttempt) -> Stand:
         away = np.linalg.norm(cases.goal, axis=1)
         share = np.minimum(0.5 * attempt.starts / away, 1.0)[:, None]
         point = share * cases.goal
@@ -88,8 +88,8 @@ def library(seed):
 
 # Settings with which each planner compiles quickly, because compilation takes most of the tests'
 # time: two iterations of the optimiser, or none.
-FEW = {"rounds": (Round(solver=LbfgsConfig(max_steps=2, memory=1, trial_steps=(1.0,))),)}
-NONE = {"rounds": (Round(solver=LbfgsConfig(max_steps=0)),)}
+FEW = {"attempts": (Attempt(solver=LbfgsConfig(max_steps=2, memory=1, trial_steps=(1.0,))),)}
+NONE = {"attempts": (Attempt(solver=LbfgsConfig(max_steps=0)),)}
 # Several test modules plan blocks with these settings, so that they share compiled programs.
 SMALL_SEARCH = {
     "pieces": 6,

@@ -10,7 +10,7 @@ import pyarrow.parquet as pq
 import pytest
 
 import planner_jax as pj
-from planner_jax.optimise.settings import LbfgsConfig, Round
+from planner_jax.optimise.settings import Attempt, LbfgsConfig
 from planner_jax.runs.run_folder import LOCK, RunFolder
 from planner_jax.sweep.report import write_report
 from planner_jax.sweep.run import SweepInterrupted, resume_sweep, start_sweep
@@ -19,12 +19,12 @@ from planner_jax.task.hit.default_planner import HitProblem
 
 
 def quick_hit(**options):
-    return HitProblem.planner(rounds=HitProblem.planner().rounds[:1], **options)
+    return HitProblem.planner(attempts=HitProblem.planner().attempts[:1], **options)
 
 
 def quick_catch(**options):
-    rounds = (Round(1, LbfgsConfig(max_steps=20)),)
-    return pj.catch.planner(rounds=rounds, **{"decide": "greedy", **options})
+    attempts = (Attempt(1, LbfgsConfig(max_steps=20)),)
+    return pj.catch.planner(attempts=attempts, **{"decide": "greedy", **options})
 
 
 def columns(out):

@@ -8,7 +8,7 @@ from test_solve import Well, WellProblem
 
 import planner_jax as pj
 from planner_jax.core.protocol import Status, is_solved
-from planner_jax.optimise.settings import Evaluation, LbfgsConfig, Round, Stage
+from planner_jax.optimise.settings import Attempt, Evaluation, LbfgsConfig, Stage
 from planner_jax.planning.decided import first_choice
 from planner_jax.planning.plan import plan
 from planner_jax.referee.catch import referee_catches
@@ -21,7 +21,7 @@ from tests.jaxpr import assert_full_precision
 from tests.trees import assert_same
 
 PROBLEM = CatchProblem()
-PLANNER = pj.SearchPlanner(PROBLEM, (Round(1, LbfgsConfig(max_steps=20)),))
+PLANNER = pj.SearchPlanner(PROBLEM, (Attempt(1, LbfgsConfig(max_steps=20)),))
 NUM = 8
 THROWS = NUM // 2  # Number of cases with one ball, which come first. The others have two balls.
 
@@ -173,7 +173,7 @@ class Bowl(WellProblem):
 
 def solve(starts, solver, *, settings=(), goals=()):
     stages = tuple(Stage(SEARCH, (("goal", goal),)) for goal in goals)
-    attempt = Round(starts, solver, settings, stages)
+    attempt = Attempt(starts, solver, settings, stages)
     return jax.jit(lambda case: Bowl.planner().solve(case, attempt))(Well(np.zeros((), np.float32)))
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from planner_jax.core.protocol import Status, is_solved, take
-from planner_jax.optimise.settings import LbfgsConfig, Round
+from planner_jax.optimise.settings import Attempt, LbfgsConfig
 from planner_jax.planning.plan import plan
 from planner_jax.referee.catch import referee_catches
 from planner_jax.task.catch.default_planner import CatchProblem
@@ -14,11 +14,11 @@ from planner_jax.task.catch.replan import REMAINDER
 from planner_jax.task.catch.suites import draw
 from planner_jax.trajectory.polynomial import states_at
 
-SCRATCH = CatchProblem.planner(rounds=(Round(starts=1, solver=LbfgsConfig(max_steps=20)),))
+SCRATCH = CatchProblem.planner(attempts=(Attempt(starts=1, solver=LbfgsConfig(max_steps=20)),))
 USUAL = REMAINDER.planner_of(CatchProblem())
 _SHORT = LbfgsConfig(max_steps=12, trial_steps=(1.0, 0.2, 0.04))
-AGAIN = dataclasses.replace(USUAL, rounds=(Round(starts=1, solver=_SHORT),))
-UNCHANGED = dataclasses.replace(USUAL, rounds=(Round(solver=LbfgsConfig(max_steps=0)),))
+AGAIN = dataclasses.replace(USUAL, attempts=(Attempt(starts=1, solver=_SHORT),))
+UNCHANGED = dataclasses.replace(USUAL, attempts=(Attempt(solver=LbfgsConfig(max_steps=0)),))
 
 
 def plan_first(name, num):
@@ -124,7 +124,7 @@ def test_of_several_targets_those_not_caught_yet_are_planned_on():
     cases, _ = plan_first("triangle3", 4)
     order = np.array([2, 0, 1], np.int32)
     cases = dataclasses.replace(cases, order=np.tile(order, (4, 1)))
-    longer = CatchProblem.planner(rounds=(Round(starts=1, solver=LbfgsConfig(max_steps=40)),))
+    longer = CatchProblem.planner(attempts=(Attempt(starts=1, solver=LbfgsConfig(max_steps=40)),))
     plans = plan(longer, cases)
     solved = is_solved(plans.status)
     assert solved.any()

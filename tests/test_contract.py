@@ -13,7 +13,7 @@ from jaxpr import assert_full_precision
 
 import planner_jax as pj
 from planner_jax.core import planner as planner_module
-from planner_jax.core.protocol import Attempt, Plan, is_solved, outcome
+from planner_jax.core.protocol import BaseAttempt, Plan, is_solved, outcome
 from planner_jax.core.rules import has_rules
 from planner_jax.optimise.planner import SearchPlanner
 from planner_jax.task.intercept.default_planner import SpacetimeIntercept
@@ -289,7 +289,7 @@ def test_what_is_for_other_devices_is_not_traced_where_there_are_none(only_cpu, 
 def test_a_planner_that_is_no_pytree_is_told_how_to_become_one(call):
     @dataclasses.dataclass(frozen=True)
     class Plain(pj.Planner):
-        attempts: ClassVar[tuple[Attempt, ...]] = (Attempt(),)
+        attempts: ClassVar[tuple[BaseAttempt, ...]] = (BaseAttempt(),)
 
         def solve(self, case, attempt):
             raise AssertionError("it must not come to this")

@@ -9,7 +9,7 @@ import planner_jax as pj
 from planner_jax.ball.flight import BallState
 from planner_jax.ball.target import BallPath
 from planner_jax.core.protocol import Status, is_solved, is_unsolved
-from planner_jax.optimise.settings import LbfgsConfig, Round
+from planner_jax.optimise.settings import Attempt, LbfgsConfig
 from planner_jax.planning import batch
 from planner_jax.planning.decided import DecidedPlanner, first_choice
 from planner_jax.planning.plan import plan
@@ -21,7 +21,7 @@ from planner_jax.task.catch.estimate import follow, timetable
 from planner_jax.task.catch.suites import draw
 from tests.trees import assert_same
 
-PLANNER = CatchProblem.planner(rounds=(Round(1, LbfgsConfig(max_steps=20)),))
+PLANNER = CatchProblem.planner(attempts=(Attempt(1, LbfgsConfig(max_steps=20)),))
 NUM = 8
 NEAR, FAR = (-1.0, 0.0, 1.2), (2.0, 0.0, 1.2)  # [m] Targets; the quadrotor starts at (0, 0, 1).
 
@@ -180,7 +180,7 @@ def test_one_case_alone_is_decided_on_and_planned_as_in_its_batch(decide, pairs)
 class LongFirst(CatchProblem):
     """A problem whose first search tries every order of catches, and later searches only few."""
 
-    def starts_long(self, cases, rounds):
+    def starts_long(self, cases, attempts):
         return True
 
 
@@ -202,7 +202,7 @@ def test_later_rounds_are_for_cases_without_any_solved_order(kind, num, calls, p
         return plan_batch(planner, attempts, cases, *where)
 
     monkeypatch.setattr(batch, "plan_batch", note_call)
-    plans = plan(by(Best(), kind.planner(num * PLANNER.rounds[:1])), pairs)
+    plans = plan(by(Best(), kind.planner(num * PLANNER.attempts[:1])), pairs)
     assert is_solved(np.delete(plans.status, [1, 2])).all()
     assert is_unsolved(plans.status[1]) and plans.status[2] == Status.TOO_FAR
     assert planned == calls

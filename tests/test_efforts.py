@@ -18,10 +18,12 @@ from planner_jax.task.block.default_planner import OnlineBlock
 def test_more_effort_is_a_longer_first_round_and_the_default_is_the_planner_itself(task):
     own = task.planner("exact")
     assert task.planner("exact", effort="feasible") == own
-    rounds = [task.planner("exact", effort=x).inner.rounds for x in ("feasible", "good", "best")]
-    assert len({each[1:] for each in rounds}) == 1
-    feasible, good, best = (each[0] for each in rounds)
-    assert feasible == own.inner.rounds[0]
+    attempts = [
+        task.planner("exact", effort=x).inner.attempts for x in ("feasible", "good", "best")
+    ]
+    assert len({each[1:] for each in attempts}) == 1
+    feasible, good, best = (each[0] for each in attempts)
+    assert feasible == own.inner.attempts[0]
     assert good.stages == best.stages == (Stage(feasible.solver),)
     assert isinstance(good.solver, pj.NewtonConfig) and isinstance(best.solver, pj.NewtonConfig)
     assert good.solver.max_steps < best.solver.max_steps

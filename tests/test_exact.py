@@ -21,7 +21,7 @@ from tests.trees import assert_same
 
 PROBLEM, SUPPLE = HitProblem(), HitProblem(velocities=True)
 PLANNER = pj.SearchPlanner(PROBLEM)
-FIRST_ROUND = pj.SearchPlanner(PROBLEM, PLANNER.rounds[:1])
+FIRST_ATTEMPT = pj.SearchPlanner(PROBLEM, PLANNER.attempts[:1])
 NUM = 16
 apex_of = jax.jit(apex_with_drag)
 
@@ -61,7 +61,7 @@ def test_hits_at_utm_coordinates_have_the_same_plans(cases, plans):
 
 def test_a_ball_that_lies_on_the_ground_is_too_far(cases):
     ball = BallState(cases.ball.pos * np.float32([1.0, 1.0, 0.0]), 0.0 * cases.ball.vel)
-    assert (plan(FIRST_ROUND, cases.replace(ball=ball)).status == Status.TOO_FAR).all()
+    assert (plan(FIRST_ATTEMPT, cases.replace(ball=ball)).status == Status.TOO_FAR).all()
 
 
 def test_any_decision_vector_meets_the_ball_and_reaches_the_target(cases):
@@ -79,7 +79,7 @@ def test_any_decision_vector_meets_the_ball_and_reaches_the_target(cases):
 def test_the_violation_of_a_plan_is_the_excess_that_the_referee_finds(cases):
     rates = np.linspace(0.2, 0.5, NUM, dtype=np.float32) * cases.limits.body_rate
     limits = cases.limits.replace(speed=0.4 * cases.limits.speed, body_rate=rates)
-    found = plan(FIRST_ROUND, cases.replace(limits=limits))
+    found = plan(FIRST_ATTEMPT, cases.replace(limits=limits))
     verdict = referee_hits(cases.replace(limits=limits), found)
     excess = np.maximum(verdict.max_speed / limits.speed, verdict.max_body_rate / limits.body_rate)
     assert (found.violation > excess - 1.0 - 5e-4).all()  # Other limits count, too.
@@ -109,7 +109,7 @@ def test_an_impossible_lane_says_so_and_stays_finite(cases):
     crippled = cases.limits.scale(0.05, cases.gravity)
     crippled_lane = np.arange(NUM) == 1
     limits = jax.tree.map(lambda a, b: np.where(crippled_lane, b, a), cases.limits, crippled)
-    found = plan(FIRST_ROUND, cases.replace(limits=limits))
+    found = plan(FIRST_ATTEMPT, cases.replace(limits=limits))
     assert found.status[1] == Status.TOO_FAR
     assert found.violation[1] > 0.0
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(found))
@@ -222,7 +222,7 @@ def test_all_guesses_but_the_first_have_the_tangential_velocity_of_an_even_motio
 def test_late_hits_that_no_short_search_finds_are_found_by_the_rounds_after_it():
     late = jax.tree.map(np.asarray, to_cases(generate_serves(300, 3), delay=0.6))
     by_rounds = [
-        referee_hits(late, plan(dataclasses.replace(PLANNER, rounds=PLANNER.rounds[:k]), late))
+        referee_hits(late, plan(dataclasses.replace(PLANNER, attempts=PLANNER.attempts[:k]), late))
         for k in (2, 3, 6)
     ]
     shares = [verdict.success.mean() for verdict in by_rounds]

@@ -19,7 +19,7 @@ from tests.derivatives import assert_gradient_matches_differences
 
 FREE = pj.hit.HitProblem(learned=False)
 CATCH = pj.catch.planner("exact", decide="given")
-HIT = pj.SearchPlanner(FREE, FREE.rounds[1:2])  # One attempt needs one program.
+HIT = pj.SearchPlanner(FREE, FREE.attempts[1:2])  # One attempt needs one program.
 NUM, AT, FAR = 4, np.zeros(3), np.full((4, 3), 50.0)
 TRACES = []
 # Values with which the five limits and costs that `having` adds to cases have no effect.

@@ -15,7 +15,7 @@ from planner_jax.core.protocol import is_solved
 from planner_jax.lanes import kernels, over_lanes
 from planner_jax.optimise.multistart import minimise
 from planner_jax.optimise.sensitivity import gradient_at
-from planner_jax.optimise.settings import LbfgsConfig, Round
+from planner_jax.optimise.settings import Attempt, LbfgsConfig
 from planner_jax.planning.plan import plan
 from planner_jax.task.catch.suites import draw
 from planner_jax.task.hit.default_planner import HitProblem
@@ -53,7 +53,7 @@ def test_hits_are_those_of_a_cpu(devices, serves):
 
 
 def test_compiled_programs_hold_their_kernels(devices, serves):
-    attempt = Round(1, LbfgsConfig(max_steps=2))
+    attempt = Attempt(1, LbfgsConfig(max_steps=2))
     hits = jax.jit(lambda cases: HitProblem.planner().solve_lanes(cases, attempt))
     program = hits.lower(jax.device_put(serves, devices[0])).compile().as_text()
     assert program.count('custom_call_target="__gpu$xla.gpu.triton"') >= 5
@@ -137,10 +137,10 @@ def test_several_gpus_give_the_plans_of_one(devices, serves):
     if len(gpus) == 1:
         pytest.skip("there is one GPU")
     planner = HitProblem.planner()
-    first = Round(1, LbfgsConfig(max_steps=0))  # the guess itself
-    planner = dataclasses.replace(planner, rounds=(first, *planner.rounds))
+    first = Attempt(1, LbfgsConfig(max_steps=0))  # the guess itself
+    planner = dataclasses.replace(planner, attempts=(first, *planner.attempts))
     some = jax.tree.map(lambda leaf: jax.device_put(leaf[:-3], gpus[0]), serves)
-    begun = plan(dataclasses.replace(planner, rounds=(first,)), some, devices=gpus[:1])
+    begun = plan(dataclasses.replace(planner, attempts=(first,)), some, devices=gpus[:1])
     assert not is_solved(begun.status).all()
     one, all_of_them = (plan(planner, some, devices=used) for used in (gpus[:1], gpus))
     assert is_solved(one.status).all()

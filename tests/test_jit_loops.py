@@ -9,13 +9,13 @@ from trees import as_numpy
 import planner_jax as pj
 from planner_jax.core.protocol import Status
 from planner_jax.core.rules import is_sound
-from planner_jax.optimise.settings import LbfgsConfig, Round
+from planner_jax.optimise.settings import Attempt, LbfgsConfig
 
 BALL, VELOCITY = np.float32([4.0, 0.5, 2.0]), np.float32([-7.0, 0.0, 6.0])
 TARGET, PLACES = np.float32([3.0, 0.0, 0.0]), np.float32([[0.0, 0.0, 1.6]] * 2)
 NUM = 3
 POSITIONS = BALL + np.linspace(0.0, 0.2, NUM, dtype=np.float32)[:, None]
-FEW = (Round(1, LbfgsConfig(max_steps=20)),)
+FEW = (Attempt(1, LbfgsConfig(max_steps=20)),)
 FLIGHT = {  # arguments of all three builders
     "start": np.float32([0.3, -0.2, 1.0]),
     "start_velocity": np.float32([0.1, 0.2, 0.3]),
@@ -196,7 +196,7 @@ def test_wrong_shapes_and_kinds_raise_while_a_function_is_traced(words):
 @pytest.mark.slow
 def test_a_scan_plans_and_plans_again(task):
     decide = {"decide": "greedy"} if task == "catch" else {}
-    planner = pj.task_named(task).planner("exact", rounds=FEW, **decide)
+    planner = pj.task_named(task).planner("exact", attempts=FEW, **decide)
 
     def step(pos, elapsed):
         case, moved = make(task, pos), pos + elapsed * VELOCITY
@@ -222,8 +222,8 @@ def test_a_scan_plans_and_plans_again(task):
 def test_vmap_plans_every_lane(task):
     planners = {
         "hit": pj.hit.planner("juggle"),
-        "catch": pj.catch.planner("exact", decide="greedy", rounds=FEW),
-        "rally": pj.rally.planner("exact", rounds=FEW),
+        "catch": pj.catch.planner("exact", decide="greedy", attempts=FEW),
+        "rally": pj.rally.planner("exact", attempts=FEW),
     }
     planner = planners[task]
     bad = POSITIONS.copy()

@@ -13,14 +13,14 @@ from planner_jax.core.errors import ArgumentError
 from planner_jax.lanes import kernels, over_lanes
 from planner_jax.optimise.preconditioner import positive_inverse
 from planner_jax.optimise.sensitivity import gradient_at
-from planner_jax.optimise.settings import LbfgsConfig, Round
+from planner_jax.optimise.settings import Attempt, LbfgsConfig
 from planner_jax.runs.environment import require_backend
 from planner_jax.task.catch.default_planner import CatchProblem
 from planner_jax.task.hit.default_planner import HitProblem
 
 LANES = 128
 # Number of GPU kernels by name in the compiled program of one search of the planner of hits.
-ROUND = {"flight_table": 1, "integrate_along": 2, "lbfgs_turn": 1, "greatest_along": 1}
+ATTEMPT = {"flight_table": 1, "integrate_along": 2, "lbfgs_turn": 1, "greatest_along": 1}
 # Number of GPU kernels by name in the compiled program that differentiates a plan of a hit.
 GRADIENT = {"flight_table": 2, "integrate_along": 2, "positive_inverse": 1}
 
@@ -41,8 +41,8 @@ def kernels_in(function, *args):
     return {name: names.count(name) for name in set(names)}
 
 
-def round_of(planner):
-    attempt = Round(1, LbfgsConfig(max_steps=2))
+def attempt_of(planner):
+    attempt = Attempt(1, LbfgsConfig(max_steps=2))
     return lambda cases: planner.solve_lanes(cases, attempt)
 
 
@@ -58,13 +58,13 @@ X = np.broadcast_to(np.eye(3, dtype=np.float32)[..., None], (3, 3, LANES))
 
 
 def test_a_round_of_hits_contains_its_kernels(gpu):
-    assert kernels_in(round_of(HitProblem.planner()), serves()) == ROUND
+    assert kernels_in(attempt_of(HitProblem.planner()), serves()) == ATTEMPT
 
 
 @pytest.mark.slow
 def test_a_round_of_catches_contains_its_kernels(gpu):
-    held = kernels_in(round_of(CatchProblem.planner()), pj.catch.draw(LANES, "throws"))
-    assert held | {"flight_table": 1} == ROUND and "flight_table" not in held
+    held = kernels_in(attempt_of(CatchProblem.planner()), pj.catch.draw(LANES, "throws"))
+    assert held | {"flight_table": 1} == ATTEMPT and "flight_table" not in held
 
 
 @pytest.mark.slow

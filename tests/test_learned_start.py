@@ -38,10 +38,10 @@ def test_the_learnt_guess_costs_a_hundredth_and_little_more_than_the_optimum(tas
 
 def test_late_hits_begin_where_a_few_iterations_find_what_all_guesses_do_not():
     late = pj.hit.to_cases(pj.hit.generate_serves(64, 3), delay=0.7)
-    (search,) = [each for each in pj.hit.HitProblem.rounds if each.solver.max_steps == 150]
+    (search,) = [each for each in pj.hit.HitProblem.attempts if each.solver.max_steps == 150]
 
     def share(learned):
-        planner = pj.hit.HitProblem.planner(learned=learned, rounds=(search,))
+        planner = pj.hit.HitProblem.planner(learned=learned, attempts=(search,))
         return pj.are_solved(pj.plan(planner, late)).mean()
 
     assert share(True) > share(False) + 0.1

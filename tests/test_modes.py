@@ -23,7 +23,7 @@ from test_task_reach import reach
 import planner_jax as pj
 from planner_jax import task
 from planner_jax.core.errors import NotOffered
-from planner_jax.core.protocol import Attempt, Plan, outcome
+from planner_jax.core.protocol import BaseAttempt, Plan, outcome
 from planner_jax.core.registry import all_tasks
 from planner_jax.planning.programs import program_key
 from tests.trees import as_numpy, assert_same
@@ -112,10 +112,10 @@ PERMITTED = np.array([0.1, 0.7])  # NumPy's default precision, as constants of a
 class Nearest(pj.Planner):
     """A planner whose branches have the same type only if it computes in the cases' precision."""
 
-    attempts: ClassVar[tuple[Attempt, ...]] = (Attempt(1),)
+    attempts: ClassVar[tuple[BaseAttempt, ...]] = (BaseAttempt(1),)
     case_type: ClassVar[type] = Line
 
-    def solve(self, case: Line, attempt: Attempt) -> Point:
+    def solve(self, case: Line, attempt: BaseAttempt) -> Point:
         permitted = PERMITTED.copy()  # JAX 0.10 remembers the first precision of a constant
         away = jnp.abs(permitted - case.goal[None])
         snap = lambda: jnp.sum(jnp.where(away == jnp.min(away), permitted, 0.0))  # noqa: E731
@@ -153,5 +153,5 @@ def test_threads_know_programs_of_each_precision_apart():
     keys = set()
     for is_double in (False, True):
         with options({"jax_enable_x64": is_double}):
-            keys.add(program_key(Nearest(), Attempt(1), 16, lines(np.float32), False))
+            keys.add(program_key(Nearest(), BaseAttempt(1), 16, lines(np.float32), False))
     assert len(keys) == 2

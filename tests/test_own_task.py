@@ -159,7 +159,7 @@ def test_a_broken_package_beside_it_is_named_in_one_line_and_the_rest_works(tmp_
 def test_the_gradient_is_that_of_plans_made_anew(meet, float64):
     search = pj.LbfgsConfig(400, tolerance=1e-12, patience=20)
     cases = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), meet.draw(6, seed=1))
-    planner = meet.planner("smooth", rounds=(pj.Round(1, search),))
+    planner = meet.planner("smooth", attempts=(pj.Attempt(1, search),))
     found = pj.gradient(planner, cases, of="time", by="most", steps=3)
     apart = 1e-4 * cases.most
     later, sooner = (pj.plan(planner, cases.replace(most=cases.most + d)) for d in (apart, -apart))

@@ -78,7 +78,7 @@ def test_impossible_hits_are_given_up_after_the_first_round(serves):
     assert plans.status[1] == plans.status[2] == Status.TOO_FAR
     assert pj.are_solved(plans).tolist() == [True, False, False, True]
     assert not is_unsolved(plans.status).any()
-    assert (plans.iterations[1:3] <= HIT.rounds[0].solver.max_steps).all()
+    assert (plans.iterations[1:3] <= HIT.attempts[0].solver.max_steps).all()
     assert Status.TOO_FAR.message.startswith("no plan exists")
 
 

@@ -226,7 +226,7 @@ def test_an_export_without_a_fitting_case_or_recovery_is_refused_and_writes_noth
 
 def test_nothing_is_written_if_no_recovery_keeps_the_limits(hit, here, monkeypatch):
     case, plan = hit
-    monkeypatch.setattr(pj.RecoveryProblem, "rounds", pj.RecoveryProblem.rounds[:1])
+    monkeypatch.setattr(pj.RecoveryProblem, "attempts", pj.RecoveryProblem.attempts[:1])
     slow = dataclasses.replace(case.limits, speed=np.float32(0.1))
     says = "^recovery must be none .* keeps every limit, got 'brake' .speed: .* above its limit"
     assert_refused(says, export, plan, case=dataclasses.replace(case, limits=slow))

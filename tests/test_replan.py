@@ -7,19 +7,21 @@ import numpy as np
 import pytest
 
 import planner_jax as pj
-from planner_jax.optimise.settings import LbfgsConfig, Round
+from planner_jax.optimise.settings import Attempt, LbfgsConfig
 from planner_jax.planning.replan import Replanning
 from planner_jax.trajectory.polynomial import states_at
 
 NUM = 4
-NONE = (Round(solver=LbfgsConfig(max_steps=0)),)
-HIT = pj.hit.HitProblem.planner(pj.hit.HitProblem.rounds[:1])  # a program of test_exact
-CATCH = pj.catch.planner("exact", decide="greedy", rounds=(Round(1, LbfgsConfig(max_steps=20)),))
+NONE = (Attempt(solver=LbfgsConfig(max_steps=0)),)
+HIT = pj.hit.HitProblem.planner(pj.hit.HitProblem.attempts[:1])  # a program of test_exact
+CATCH = pj.catch.planner(
+    "exact", decide="greedy", attempts=(Attempt(1, LbfgsConfig(max_steps=20)),)
+)
 
 
 def unchanged(planner):
     """Return the planner's re-planner that makes no iterations."""
-    return dataclasses.replace(planner.replanner(), rounds=NONE)
+    return dataclasses.replace(planner.replanner(), attempts=NONE)
 
 
 @pytest.fixture(scope="module")

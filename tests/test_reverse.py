@@ -11,7 +11,7 @@ import planner_jax as pj
 from planner_jax.plane.reach import Lattice, Vehicle, grid_of, reach_set
 
 PLANNER = pj.intercept.planner()
-# A corridor in which the car cannot turn round in one sweep.
+# A corridor in which the car cannot turn attempt in one sweep.
 CORRIDOR = [
     np.array([[0.0, y], [8.0, y], [8.0, y + 0.1], [0.0, y + 0.1]], np.float32) for y in (3.4, 4.5)
 ]

@@ -12,7 +12,7 @@ from planner_jax.core.protocol import Status, is_solved
 from planner_jax.lanes import over_lanes
 from planner_jax.lanes.packing import Packing
 from planner_jax.optimise import lbfgs
-from planner_jax.optimise.settings import LbfgsConfig, NewtonConfig, Round
+from planner_jax.optimise.settings import Attempt, LbfgsConfig, NewtonConfig
 from planner_jax.recovery.case import RecoveryCase
 from planner_jax.recovery.planner import RecoveryProblem
 from planner_jax.runs.timing import CompileClock
@@ -56,11 +56,11 @@ def test_rows_list_the_stages_of_all_rounds(task, programs, models):
 
 def test_other_numbers_of_rounds_and_of_the_cost_are_data_of_the_same_program():
     cases, planner = pj.catch.draw(1), CatchProblem.planner()
-    first, second, *others = planner.rounds
+    first, second, *others = planner.attempts
     solver = dataclasses.replace(second.solver, max_steps=31, tolerance=1e-5)
     longer = dataclasses.replace(second, solver=solver, within=0.1)
-    rounds = (first, longer, *others)
-    changed = CatchProblem.planner(rounds, margin=0.1, energy_weight=1e-7)
+    attempts = (first, longer, *others)
+    changed = CatchProblem.planner(attempts, margin=0.1, energy_weight=1e-7)
     before, after = (
         each.load(each.group_attempts(each.attempts, cases, is_whole=True)[0], cases)
         for each in (planner, changed)
@@ -71,8 +71,8 @@ def test_other_numbers_of_rounds_and_of_the_cost_are_data_of_the_same_program():
 
 @pytest.mark.parametrize("kind", [float, np.float32])
 def test_weights_of_any_kind_give_way_to_those_of_a_round(kind):
-    rounds = Round(), Round(settings=(("margin", 0.004),))
-    planner = CatchProblem.planner(rounds, margin=kind(0.05))
+    attempts = Attempt(), Attempt(settings=(("margin", 0.004),))
+    planner = CatchProblem.planner(attempts, margin=kind(0.05))
     (table,) = tables_of(planner, pj.catch.draw(1), is_whole=True)
     np.testing.assert_allclose(table.rows.weights["margin"], [0.05, 0.004], rtol=1e-6)
 
@@ -87,17 +87,17 @@ def test_another_margin_compiles_nothing_and_is_kept():
 
 
 @pytest.mark.parametrize(
-    ("rounds", "programs"),
+    ("attempts", "programs"),
     [
-        ((Round(), Round(improves=True)), 1),
-        ((Round(), Round(solver=NewtonConfig())), 1),
-        ((Round(), Round(settings=(("catch_weight", 1.0),))), 2),
-        ((Round(), Round(solver=LbfgsConfig(max_steps=0))), 1),
+        ((Attempt(), Attempt(improves=True)), 1),
+        ((Attempt(), Attempt(solver=NewtonConfig())), 1),
+        ((Attempt(), Attempt(settings=(("catch_weight", 1.0),))), 2),
+        ((Attempt(), Attempt(solver=LbfgsConfig(max_steps=0))), 1),
     ],
     ids=["improves", "Newton", "another field", "no iterations"],
 )
-def test_rounds_that_prepare_cases_differently_have_their_own_programs(rounds, programs):
-    planner = CatchProblem.planner(rounds)
+def test_rounds_that_prepare_cases_differently_have_their_own_programs(attempts, programs):
+    planner = CatchProblem.planner(attempts)
     assert len(tables_of(planner, pj.catch.draw(1), is_whole=True)) == programs
 
 

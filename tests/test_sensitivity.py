@@ -44,9 +44,9 @@ class BowlPlan(pj.Plan):
 @dataclasses.dataclass(frozen=True)
 class BowlProblem(pj.Problem):
     weight: float = 1.0
-    rounds = (
-        pj.Round(starts=2, solver=pj.LbfgsConfig(max_steps=40, tolerance=1e-14), settings=()),
-        pj.Round(starts=1, solver=pj.LbfgsConfig(max_steps=5), settings=(("weight", 2.0),)),
+    attempts = (
+        pj.Attempt(starts=2, solver=pj.LbfgsConfig(max_steps=40, tolerance=1e-14), settings=()),
+        pj.Attempt(starts=1, solver=pj.LbfgsConfig(max_steps=5), settings=(("weight", 2.0),)),
     )
 
     def prepare(self, case):
@@ -57,7 +57,7 @@ class BowlProblem(pj.Problem):
 
     def objective(self, point, context):
         energy = 0.5 * self.weight * jnp.sum(point * (CURVED @ point))
-        return pj.Evaluation(energy - jnp.sum(point * context["force"]), -jnp.ones(()))
+        return energy - jnp.sum(point * context["force"]), -jnp.ones(())
 
     def decode(self, point, context):
         return BowlPlan(point=point, **pj.pending(-jnp.ones(())))
@@ -89,7 +89,9 @@ def test_gradient_of_a_quadratic_is_the_closed_form(bowls, options):
 
 
 def test_the_gradient_is_nan_where_the_hessian_is_not_positive(bowls):
-    planner = BowlProblem.planner(weight=-1.0, rounds=(pj.Round(1, pj.LbfgsConfig(max_steps=0)),))
+    planner = BowlProblem.planner(
+        weight=-1.0, attempts=(pj.Attempt(1, pj.LbfgsConfig(max_steps=0)),)
+    )
     found = pj.gradient(planner, bowls, of=lambda plan: plan.point[0], by="b")
     assert np.isnan(found.by["b"]).all() and np.isnan(found.residual).all()
 

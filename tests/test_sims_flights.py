@@ -249,9 +249,9 @@ class TracedProblem(WellProblem):
 
 
 def test_attempts_compiled_ahead_are_not_traced_again():
-    first, second = WellProblem.rounds
+    first, second = WellProblem.attempts
     own = dataclasses.replace(first, solver=pj.LbfgsConfig(max_steps=41, step_cap=0.2))
-    planner, easy = TracedProblem.planner(rounds=(own, second, own)), Well(GOALS[:1].repeat(3))
+    planner, easy = TracedProblem.planner(attempts=(own, second, own)), Well(GOALS[:1].repeat(3))
     compile_attempts(planner, easy)
     before = len(TRACES)
     assert before > 0
@@ -264,14 +264,14 @@ def test_compiling_ahead_also_accepts_a_planner_on_the_host():
     tried = []
 
     class OnHost(pj.Planner):
-        attempts = WellProblem.rounds
+        attempts = WellProblem.attempts
 
         def solve_on_host(self, cases, attempt):
             tried.append(attempt)
-            return jax.device_get(plan(WellProblem.planner(rounds=(attempt,)), cases))
+            return jax.device_get(plan(WellProblem.planner(attempts=(attempt,)), cases))
 
     compile_attempts(OnHost(), Well(GOALS))
-    assert tried == [WellProblem.rounds[0]]
+    assert tried == [WellProblem.attempts[0]]
 
 
 @pytest.mark.slow

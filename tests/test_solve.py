@@ -12,7 +12,7 @@ from jax import Array
 
 import planner_jax as pj
 from planner_jax.core.protocol import Plan, Status, is_solved
-from planner_jax.optimise.settings import Evaluation, LbfgsConfig, Round, Stage
+from planner_jax.optimise.settings import Attempt, Evaluation, LbfgsConfig, Stage
 from planner_jax.planning import batch
 from tests.trees import assert_same
 
@@ -34,9 +34,9 @@ class Reached(Plan):
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class WellProblem(pj.Problem):
-    rounds = (
-        Round(1, LbfgsConfig(max_steps=40, step_cap=0.2)),
-        Round(2, LbfgsConfig(max_steps=40, step_cap=0.2)),
+    attempts = (
+        Attempt(1, LbfgsConfig(max_steps=40, step_cap=0.2)),
+        Attempt(2, LbfgsConfig(max_steps=40, step_cap=0.2)),
     )
 
     def prepare(self, case):
@@ -58,7 +58,7 @@ GOALS = np.array([0.5, 3.5, -1.0, 4.5, 1.0], np.float32)
 
 
 def test_lanes_unsolved_in_one_round_are_solved_in_the_next():
-    first = pj.plan(WellProblem.planner(rounds=WellProblem.rounds[:1]), Well(GOALS))
+    first = pj.plan(WellProblem.planner(attempts=WellProblem.attempts[:1]), Well(GOALS))
     both = pj.plan(WellProblem.planner(), Well(GOALS))
     assert list(is_solved(first.status)) == [True, False, True, False, True]
     assert is_solved(both.status).all()
@@ -68,7 +68,7 @@ def test_lanes_unsolved_in_one_round_are_solved_in_the_next():
 
 def keep_starts(keep):
     short, long = (LbfgsConfig(max_steps=num, step_cap=0.2) for num in (3, 40))
-    return WellProblem.planner(rounds=(Round(2, long, stages=(Stage(short, keep=keep),)),))
+    return WellProblem.planner(attempts=(Attempt(2, long, stages=(Stage(short, keep=keep),)),))
 
 
 @pytest.mark.parametrize("keep", [1, 5])
@@ -89,7 +89,7 @@ def test_a_start_whose_cost_is_not_finite_is_the_last_to_be_kept():
         def guesses(self, context, num):
             return jnp.array([[jnp.nan], [context.goal]])[:num]
 
-    plans = pj.plan(Cliff.planner(rounds=keep_starts(1).rounds), Well(GOALS))
+    plans = pj.plan(Cliff.planner(attempts=keep_starts(1).attempts), Well(GOALS))
     np.testing.assert_allclose(plans.point[:, 0], GOALS, atol=0.05)
 
 
@@ -100,9 +100,9 @@ def test_a_stage_that_keeps_no_starts_and_a_round_within_no_violation_are_refuse
             Stage(LbfgsConfig(), keep=keep)
     for within in (0.0, -1.0, np.nan):
         with pytest.raises(ValueError, match="^within must be "):
-            Round(within=within)
+            Attempt(within=within)
     with pytest.raises(TypeError, match="^within must be "):
-        Round(within="near")
+        Attempt(within="near")
 
 
 def test_chunks_and_padding_change_nothing():
@@ -225,8 +225,8 @@ def test_a_later_round_takes_only_what_is_unsolved(monkeypatch):
 
 
 def retry_within(within):
-    first, second = WellProblem.rounds
-    return WellProblem.planner(rounds=(first, dataclasses.replace(second, within=within)))
+    first, second = WellProblem.attempts
+    return WellProblem.planner(attempts=(first, dataclasses.replace(second, within=within)))
 
 
 @pytest.mark.parametrize("kind", ["host", "as on a GPU", "one by one", "compiled"])
@@ -244,7 +244,7 @@ def test_a_round_leaves_alone_what_is_farther_off_than_it_says(kind, monkeypatch
             return pj.plan(planner, Well(jnp.asarray(goals)))
         return pj.plan(planner, Well(goals))
 
-    first = plan_goals(WellProblem.planner(rounds=WellProblem.rounds[:1]))
+    first = plan_goals(WellProblem.planner(attempts=WellProblem.attempts[:1]))
     near = plan_goals(retry_within(2.0))
     assert (np.asarray(first.violation) <= 2.0).tolist() == [True, False, True, False]
     assert is_solved(np.asarray(near.status)).tolist() == [True, False, True, False]
@@ -254,8 +254,10 @@ def test_a_round_leaves_alone_what_is_farther_off_than_it_says(kind, monkeypatch
 
 
 def test_a_round_behind_one_that_had_nothing_to_try_is_made():
-    first, second = WellProblem.rounds
-    planner = WellProblem.planner(rounds=(first, dataclasses.replace(second, within=1e-3), second))
+    first, second = WellProblem.attempts
+    planner = WellProblem.planner(
+        attempts=(first, dataclasses.replace(second, within=1e-3), second)
+    )
     for goals in (GOALS, jnp.asarray(GOALS)):
         assert is_solved(np.asarray(pj.plan(planner, Well(goals)).status)).all()
     assert is_solved(pj.plan(planner, Well(GOALS[1])).status)

@@ -11,7 +11,7 @@ import planner_jax as pj
 from planner_jax.core.errors import CaseError
 from planner_jax.cost.along import Along
 from planner_jax.cost.moving import MovingKeepOut, integrate
-from planner_jax.optimise.settings import LbfgsConfig, Round
+from planner_jax.optimise.settings import Attempt, LbfgsConfig
 from planner_jax.task.catch.plan import CatchPlan
 from planner_jax.task.team.decide import assign
 from planner_jax.task.team.plan import TeamPlan
@@ -21,7 +21,7 @@ from tests.trees import assert_same
 
 REST_TO_REST = np.array([0.0, 0.0, 0.0, 0.0, 35.0, -84.0, 70.0, -20.0])  # of the path's fraction
 # A planner that compiles one program, and its recovery.
-QUICK = {"rounds": (Round(1, LbfgsConfig(max_steps=60)),)}
+QUICK = {"attempts": (Attempt(1, LbfgsConfig(max_steps=60)),)}
 NET = 0.3  # [m], height of the net in `hanging`
 
 

@@ -157,14 +157,14 @@ def test_chunks_of_a_round_are_not_begun_after_the_time(clock):
     found = pj.plan(Rounds(), Task(numbers), chunk=16, time_limit=3.5, progress=clock.progress)
     assert (found.status == pj.Status.OUT_OF_TIME).all()
     last = clock.reports[-1]
-    assert (last.round, last.tried, last.cases) == (2, 0, 32)
+    assert (last.attempt, last.tried, last.cases) == (2, 0, 32)
 
 
 def test_all_attempts_are_reported_and_a_report_is_a_line(clock):
     pj.plan(Rounds(), Task(NUMBERS), progress=clock.progress)
     expected = [(1, 0, 5), (1, 5, 5), (2, 0, 3), (2, 3, 3), (3, 0, 2), (3, 2, 2)]
-    assert [(one.round, one.tried, one.cases) for one in clock.reports] == expected
-    assert str(clock.reports[3]) == "round 2 of at most 3: 3 of 3 cases tried, after 3.0 s"
+    assert [(one.attempt, one.tried, one.cases) for one in clock.reports] == expected
+    assert str(clock.reports[3]) == "attempt 2 of at most 3: 3 of 3 cases tried, after 3.0 s"
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ from jaxtyping import PyTree
 from planner_jax.core.choices import EFFORTS, require_one_of
 from planner_jax.core.compiled import Fixed, has_only_cpu, traced_platform
 from planner_jax.core.errors import ArgumentError, ArgumentTypeError, NotOffered
-from planner_jax.core.protocol import Attempt, Plan
+from planner_jax.core.protocol import BaseAttempt, Plan
 from planner_jax.core.rules import Case
 
 CaseT = TypeVar("CaseT", bound=Case)
@@ -47,7 +47,7 @@ class Drive(Protocol):
         ...
 
     def __call__(
-        self, planner: "Planner", cases: PyTree, attempts: Sequence[Attempt] | None = None
+        self, planner: "Planner", cases: PyTree, attempts: Sequence[BaseAttempt] | None = None
     ) -> tuple[PyTree, PyTree]:
         """Plan a batch by the listed attempts (searches) of a planner, by default by all of them.
 
@@ -92,11 +92,11 @@ class Planner(Generic[CaseT, PlanT]):
             cls.kind = Kind.COMPILED
 
     @property
-    def attempts(self) -> Sequence[Attempt]:
+    def attempts(self) -> Sequence[BaseAttempt]:
         """The attempts (settings of a search), in order; each is for cases still unsolved."""
-        return (Attempt(),)
+        return (BaseAttempt(),)
 
-    def attempts_for(self, cases: CaseT) -> Sequence[Attempt]:
+    def attempts_for(self, cases: CaseT) -> Sequence[BaseAttempt]:
         """Return the attempts that are useful for these cases, by default all `attempts`.
 
         The cases are in arrays, or traced inside compiled functions.

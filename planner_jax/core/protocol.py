@@ -169,7 +169,7 @@ def require_settings(planner: PyTree) -> None:
             require_size(name, value, min(default, 1))
         elif isinstance(default, float):
             require_number(name, value, NOT_NEGATIVE if default >= 0.0 else FINITE)
-        elif isinstance(default, tuple) and default and isinstance(default[0], Attempt):
+        elif isinstance(default, tuple) and default and isinstance(default[0], BaseAttempt):
             require_attempts(name, value, type(default[0]))
         elif isinstance(default, tuple):
             require_numbers(name, value)
@@ -186,7 +186,7 @@ def require_attempts(name: str, value: object, kind: type) -> None:
 
 
 @dataclasses.dataclass(frozen=True)
-class Attempt:
+class BaseAttempt:
     """Settings of one search for cases that earlier attempts left unsolved; static under jit."""
 
     continues: ClassVar[bool] = False  # whether a search needs the numbers of the best plans so far
@@ -201,7 +201,7 @@ class Attempt:
         if self.within is not None:
             require_number("within", self.within, POSITIVE)
 
-    def place_among(self, attempts: Sequence["Attempt"]) -> int:
+    def place_among(self, attempts: Sequence["BaseAttempt"]) -> int:
         """Return its index among a planner's attempts, or 0 if it is none of them."""
         return attempts.index(self) if self in attempts else 0
 

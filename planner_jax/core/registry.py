@@ -131,7 +131,7 @@ def _require_options(planner: str, maker: object, options: Collection[str]) -> N
     owner = getattr(maker, "__self__", maker)  # of `Problem.planner`
     if isinstance(owner, type) and dataclasses.is_dataclass(owner):
         known = [field.name for field in dataclasses.fields(owner) if field.init]
-        known += ["rounds"] if owner is not maker else []
+        known += ["attempts"] if owner is not maker else []
         for option in options:
             if option not in known:
                 rule = f"one of {', '.join(known)}" if known else "left out"

@@ -52,7 +52,7 @@ def with_recovery(
     """Append a trajectory to standstill to a plan's path; return both, and if the limits hold."""
     state: Any = state_on(path, np.sum(path.durations))
     case = RecoveryCase(state, state[0], gravity, limits.of_recovery(state, gravity))
-    rest: QuadrotorPlan = solve_one(_REST_PLANNER, case, _REST.rounds[0])
+    rest: QuadrotorPlan = solve_one(_REST_PLANNER, case, _REST.attempts[0])
     return Course(_join(path, rest.trajectory), gravity, limits.air), bool(is_solved(rest.status))
 
 

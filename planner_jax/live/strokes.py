@@ -23,7 +23,7 @@ from planner_jax.ball.linear_drag import linear_drag_flight
 from planner_jax.ball.target import BallPath
 from planner_jax.core import GRAVITY
 from planner_jax.optimise.planner import SearchPlanner
-from planner_jax.optimise.settings import LbfgsConfig, Round
+from planner_jax.optimise.settings import Attempt, LbfgsConfig
 from planner_jax.planning.programs import call_packed, solve_cases
 from planner_jax.planning.replan import Replanning
 from planner_jax.planning.replanner import TRIALS
@@ -49,7 +49,7 @@ _LONGEST = 4.0  # [s], latest time of a catch
 # is often no trajectory to standstill within the limits, so it could not be flown.
 _SHARE = 0.97
 # Settings to improve the previous plan by two steps of L-BFGS; it is close to the optimum already.
-_AGAIN = Round(starts=1, solver=LbfgsConfig(max_steps=2, memory=2, trial_steps=TRIALS))
+_AGAIN = Attempt(starts=1, solver=LbfgsConfig(max_steps=2, memory=2, trial_steps=TRIALS))
 
 CaseT = TypeVar("CaseT", HitCase, CatchCase)
 PlanT = TypeVar("PlanT", HitPlan, CatchPlan)
@@ -73,7 +73,7 @@ class Stroke(abc.ABC, Generic[CaseT, PlanT]):
         self._case = dataclasses.replace(self.case, limits=jax.tree.map(np.asarray, limits))
         self.flight, self.drag = flight, drag
         self._planner = SearchPlanner(problem)
-        self._replanner = dataclasses.replace(self._planner.replanner(), rounds=(_AGAIN,))
+        self._replanner = dataclasses.replace(self._planner.replanner(), attempts=(_AGAIN,))
         # Functions (optimiser's settings, planner, case) -> plan, called by `first` and `again`.
         self._solve_first, self._solve_again = solvers
         self.pieces = problem.num_pieces  # number of polynomial pieces of a plan
@@ -91,7 +91,7 @@ class Stroke(abc.ABC, Generic[CaseT, PlanT]):
         case = dataclasses.replace(self._with_ball(ball), head_state=head_state)
         if yaw is not None and case.heading is not None:
             case = with_request(case, dataclasses.replace(case.heading, start=yaw))
-        return call_packed(self._solve_first, self._planner.rounds[1], self._planner, case)
+        return call_packed(self._solve_first, self._planner.attempts[1], self._planner, case)
 
     def again(self, plan: PlanT, elapsed: float, ball: BallState) -> PlanT:
         """Improve a plan flown for `elapsed` [s], given a newer estimate of the ball."""
@@ -113,11 +113,11 @@ def _state_in(task: Replanning) -> Array:
     return jnp.stack([evaluate(path, elapsed, order) for order in range(4)])
 
 
-def _solve(attempt: Round, planner: SearchPlanner, case: PyTree) -> PyTree:
+def _solve(attempt: Attempt, planner: SearchPlanner, case: PyTree) -> PyTree:
     return solve_cases(planner, case, attempt)
 
 
-def _hit_again(attempt: Round, planner: SearchPlanner, task: Replanning) -> HitPlan:
+def _hit_again(attempt: Attempt, planner: SearchPlanner, task: Replanning) -> HitPlan:
     case = dataclasses.replace(task.case, head_state=_state_in(task))
     return _solve(attempt, planner, dataclasses.replace(task, case=case))
 
@@ -169,14 +169,14 @@ def _time_left(case: CatchCase) -> Array:
     return jnp.where(path.at(start).pos[2] > height, low, 0.0)[None]
 
 
-def _catch_first(attempt: Round, planner: SearchPlanner, case: CatchCase) -> CatchPlan:
+def _catch_first(attempt: Attempt, planner: SearchPlanner, case: CatchCase) -> CatchPlan:
     """Plan a catch from scratch; the first guess is the earliest catch within the robot's reach."""
     case = dataclasses.replace(case, horizon=_time_left(case))
     case = case.with_choice(jax.tree.map(lambda leaf: leaf[0], Greedy().propose(case)))
     return _solve(attempt, planner, case)
 
 
-def _catch_again(attempt: Round, planner: SearchPlanner, task: Replanning) -> CatchPlan:
+def _catch_again(attempt: Attempt, planner: SearchPlanner, task: Replanning) -> CatchPlan:
     previous = task.previous
     case = dataclasses.replace(
         task.case,

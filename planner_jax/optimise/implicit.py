@@ -21,7 +21,7 @@ from planner_jax.core.origin import with_origin
 from planner_jax.core.planner import Planner, require_fit
 from planner_jax.core.protocol import mark_bad_input, status_of
 from planner_jax.optimise.multistart import minimise
-from planner_jax.optimise.settings import LbfgsConfig, Objective
+from planner_jax.optimise.settings import Evaluation, LbfgsConfig, Objective
 
 
 @struct.dataclass
@@ -127,11 +127,11 @@ def optimal_plan(planner: Planner, case: PyTree, *, solver: LbfgsConfig | None =
     stationarity = 1e2 * float(jnp.finfo(start.dtype).eps)
 
     def cost(point: Array) -> Array:
-        return problem.objective(point, context).cost
+        return problem.objective(point, context)[0]
 
     def solve(_: Callable, start: Array) -> tuple[Array, Array]:
         def objective(point: Array):
-            return problem.objective(point, context)
+            return Evaluation(*problem.objective(point, context))
 
         found = minimise(objective, start, solver)
         tolerance = stationarity * jnp.abs(found.evaluation.cost)

@@ -281,7 +281,7 @@ def _choose(
     moved = of_chosen(costs) < here.cost + slack
     there = jax.tree.map(lambda new, old: jnp.where(moved, of_chosen(new), old), trials, here)
     best = jax.tree.map(lambda a, b: jnp.where(numbers.iteration == 0, a, b), here, numbers.best)
-    before = best.replace(cost=best.cost + slack)
+    before = best._replace(cost=best.cost + slack)
     is_best = is_better(there, before, tolerance=0.0) | ~jnp.isfinite(before.cost)
     is_best &= moved
     factors = jnp.maximum(jnp.asarray(config.trial_dampings, costs.dtype), config.ease)

@@ -18,12 +18,13 @@ from planner_jax.core.choices import EFFORTS, require_one_of
 from planner_jax.core.planner import CaseT, Planner, PlanT
 from planner_jax.core.protocol import Score, require_attempts
 from planner_jax.core.rules import Case
-from planner_jax.optimise.rows import Group, Table, group_rounds, load_group
+from planner_jax.optimise.rows import Group, Table, join_attempts, load_group
 from planner_jax.optimise.settings import (
+    Attempt,
+    Attempts,
     Curvature,
     Evaluation,
     NewtonConfig,
-    Round,
     Settings,
     Solver,
 )
@@ -49,12 +50,12 @@ class Problem(Generic[CaseT, PlanT], abc.ABC):
     """
 
     case_type: ClassVar[type] = Case  # cases of other classes are rejected
-    rounds: ClassVar[tuple[Round, ...]] = (Round(),)  # usual attempts of planners, in order
+    attempts: ClassVar[Attempts] = (Attempt(),)  # usual attempts of planners, in order
     # Fields with numbers of the cost, which compiled programs read at run time. They do not change
-    # `prepare`, `guesses` and `decode`. The `settings` of rounds may change them.
+    # `prepare`, `guesses` and `decode`. The `settings` of attempts may change them.
     weights: ClassVar[tuple[str, ...]] = ()
-    # Fields that the `settings` of rounds may change to refine plans. A plan of a coarse planner is
-    # one of a fine planner, whose additional variables, `held`, are zero.
+    # Fields that the `settings` of attempts may change to refine plans. A plan of a coarse planner
+    # is one of a fine planner, whose additional variables, `held`, are zero.
     refinements: ClassVar[tuple[str, ...]] = ()
     # Number of Newton's subspace vectors. With 0 the preconditioner counts as inverse Hessian.
     subspace: ClassVar[int] = 4
@@ -72,8 +73,8 @@ class Problem(Generic[CaseT, PlanT], abc.ABC):
         """Return the first `num` starting points in n variables, (num, n), best first."""
 
     @abc.abstractmethod
-    def objective(self, point: Array, context: PyTree) -> Evaluation:
-        """Return the cost and the largest violation of a limit at a point (n,)."""
+    def objective(self, point: Array, context: PyTree) -> tuple[Array, Array]:
+        """Return the cost and the largest violation of a limit at a point (n,), two arrays ()."""
 
     def curvature_at(self, point: Array, context: PyTree) -> Curvature:
         """Return gradient, products with the Hessian, and preconditioner at a point (n,).
@@ -83,7 +84,7 @@ class Problem(Generic[CaseT, PlanT], abc.ABC):
         """
         from planner_jax.optimise.newton import by_products  # only planners that polish need it
 
-        return by_products(lambda x: self.objective(x, context))(point)
+        return by_products(lambda x: Evaluation(*self.objective(x, context)))(point)
 
     @abc.abstractmethod
     def decode(self, point: Array, context: PyTree) -> PyTree:
@@ -122,12 +123,14 @@ class Problem(Generic[CaseT, PlanT], abc.ABC):
         guess = self.guesses(context, 1)[0]
         return self.first_start(guess, self.network_inputs(context), context)
 
-    def fit_attempt(self, attempt: Round, cases: PyTree, rounds: tuple[Round, ...]) -> Round:
-        """Return one of a planner's `rounds` with settings for the shapes of these cases."""
+    def fit_attempt(
+        self, attempt: Attempt, cases: PyTree, attempts: tuple[Attempt, ...]
+    ) -> Attempt:
+        """Return one of a planner's `attempts` with settings for the shapes of these cases."""
         return attempt
 
-    def starts_long(self, cases: PyTree, rounds: tuple[Round, ...]) -> bool:
-        """Return whether the first of a planner's `rounds` (attempts) takes long."""
+    def starts_long(self, cases: PyTree, attempts: Attempts) -> bool:
+        """Return whether the first of a planner's `attempts` takes long."""
         return False
 
     def replanner(self) -> "SearchPlanner | None":
@@ -155,24 +158,26 @@ class Problem(Generic[CaseT, PlanT], abc.ABC):
         return self.with_settings(tuple(pair for pair in usual if pair[1] is not None))
 
     @classmethod
-    def planner(cls, rounds: tuple[Round, ...] | None = None, **numbers: object) -> "SearchPlanner":
-        """Make a planner of the problem with these attempts (`rounds`) and values of its fields."""
-        return SearchPlanner(cls(**numbers), rounds)
+    def planner(
+        cls, attempts: tuple[Attempt, ...] | None = None, **numbers: object
+    ) -> "SearchPlanner":
+        """Make a planner of the problem with these `attempts` and values of its fields."""
+        return SearchPlanner(cls(**numbers), attempts)
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class SearchPlanner(Planner[CaseT, PlanT]):
-    """A planner that minimises in rounds: attempts at the cases that are still unsolved."""
+    """A planner that minimises, in attempts at the cases that are still unsolved."""
 
     problem: PyTree  # a `Problem`, whose class the type checker does not know
     # Attempts, in order; by default the usual ones of the problem.
-    rounds: PyTree = dataclasses.field(default=None, metadata={"static": True})
+    attempts: PyTree = dataclasses.field(default=None, metadata={"static": True})
 
     def __post_init__(self) -> None:
-        if self.rounds is None:
-            object.__setattr__(self, "rounds", self.problem.rounds)
-        require_attempts("rounds", self.rounds, Round)
+        if self.attempts is None:
+            object.__setattr__(self, "attempts", self.problem.attempts)
+        require_attempts("attempts", self.attempts, Attempt)
 
     @property
     def title(self) -> str:
@@ -190,40 +195,35 @@ class SearchPlanner(Planner[CaseT, PlanT]):
 
     def starts_long(self, cases: CaseT) -> bool:
         """Return whether the first attempt (search) for these cases takes long."""
-        return self.problem.starts_long(cases, self.rounds)
-
-    @property
-    def attempts(self) -> tuple[Round, ...]:
-        """The planner's rounds: attempts at a case, in order, until one attempt solves it."""
-        return self.rounds
+        return self.problem.starts_long(cases, self.attempts)
 
     def group_attempts(
-        self, attempts: Sequence[Round], cases: PyTree, *, is_whole: bool
+        self, attempts: Sequence[Attempt], cases: PyTree, *, is_whole: bool
     ) -> list[Group]:
-        """Join rounds (attempts) that share a compiled program."""
+        """Join attempts that share a compiled program."""
         known, places = tuple(self.attempts), tuple(range(len(attempts)))
         if attempts is not known and tuple(attempts) != known:
             places = tuple(known.index(each) if each in known else -1 for each in attempts)
-            if -1 in places:  # rounds that the planner does not have
+            if -1 in places:  # attempts that the planner does not have
                 known, places = tuple(attempts), tuple(range(len(attempts)))
-        fitted = tuple([self.problem.fit_attempt(each, cases, self.rounds) for each in known])
-        return group_rounds(self.problem, fitted, places, is_whole)
+        fitted = tuple([self.problem.fit_attempt(each, cases, self.attempts) for each in known])
+        return join_attempts(self.problem, fitted, places, is_whole)
 
-    def load(self, attempt: Round | Group, cases: PyTree) -> tuple[PyTree, Table]:
-        """Return arguments of compiled programs for a round, or a group of rounds (attempts)."""
-        if isinstance(attempt, Round):
-            attempt = Group.of((self.problem.fit_attempt(attempt, cases, self.rounds),), (0,))
+    def load(self, attempt: Attempt | Group, cases: PyTree) -> tuple[PyTree, Table]:
+        """Return arguments of compiled programs for an attempt, or a group of attempts."""
+        if isinstance(attempt, Attempt):
+            attempt = Group.of((self.problem.fit_attempt(attempt, cases, self.attempts),), (0,))
         return load_group(self.problem, attempt)
 
-    def solve(self, case: PyTree, attempt: Round | Table, before: Score | None = None) -> PyTree:
-        """Return the plan that rounds (attempts) find for one case; see `solve_lanes`."""
+    def solve(self, case: PyTree, attempt: Attempt | Table, before: Score | None = None) -> PyTree:
+        """Return the plan that an attempt, or a table of them, finds for one case."""
         cases, before = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], (case, before))
         return jax.tree.map(lambda leaf: leaf[0], self.solve_lanes(cases, attempt, before))
 
     def solve_lanes(
-        self, cases: PyTree, attempt: Round | Table, before: Score | None = None
+        self, cases: PyTree, attempt: Attempt | Table, before: Score | None = None
     ) -> PyTree:
-        """Return the plans that rounds (attempts) find for a batch of cases.
+        """Return the plans that an attempt, or a table of attempts, finds for a batch of cases.
 
         `before` are the numbers of earlier plans; only better plans are returned, see
         `search.solve_table`. None: there are no earlier plans.
@@ -231,7 +231,7 @@ class SearchPlanner(Planner[CaseT, PlanT]):
         from planner_jax.optimise.search import solve_table  # reads the class of problems
 
         cases = jax.tree.map(jnp.asarray, cases)
-        table = self.load(attempt, cases)[1] if isinstance(attempt, Round) else attempt
+        table = self.load(attempt, cases)[1] if isinstance(attempt, Attempt) else attempt
         before = Score.none(cases.batch_shape, float_type(cases)) if before is None else before
         return solve_table(self.problem, table, cases, jax.tree.map(jnp.asarray, before))
 
@@ -244,30 +244,30 @@ class SearchPlanner(Planner[CaseT, PlanT]):
     def with_settings(self, settings: Settings) -> Self:
         """Return a copy with the values in `settings`, pairs (name, value).
 
-        The names are `rounds` and fields of the problem.
+        The names are `attempts` and fields of the problem.
         """
         values = dict(settings)
-        rounds: PyTree = values.pop("rounds", self.rounds)
+        attempts: PyTree = values.pop("attempts", self.attempts)
         problem = self.problem.with_settings(tuple(values.items())) if values else self.problem
-        return dataclasses.replace(self, problem=problem, rounds=rounds)
+        return dataclasses.replace(self, problem=problem, attempts=attempts)
 
     def with_solver(self, solver: Solver | None = None) -> Self:
         """Return a copy that makes one search from its best first guess, by default a long one."""
         from planner_jax.optimise.efforts import LONG  # usual searches are shorter
 
-        return dataclasses.replace(self, rounds=(Round(solver=solver or LONG),))
+        return dataclasses.replace(self, attempts=(Attempt(solver=solver or LONG),))
 
     def with_polish(self, solver: NewtonConfig | None = None) -> Self:
-        """Return a copy of the planner whose first round (attempt) continues by Newton's method.
+        """Return a copy of the planner whose first attempt continues by Newton's method.
 
         `solver` has the settings of the method; None: settings that continue to a local optimum.
         """
-        from planner_jax.optimise.efforts import polish_rounds
+        from planner_jax.optimise.efforts import polish
 
-        return dataclasses.replace(self, rounds=polish_rounds(self.problem, self.rounds, solver))
+        return polish(self, solver)
 
     def with_effort(self, effort: str) -> Self:
-        """Return a copy whose first round (attempt) lowers the cost further when limits hold.
+        """Return a copy whose first attempt lowers the cost further when limits hold.
 
         Args:
             effort: "good" adds one iteration of Newton's method for each case, "best" adds up to 8.
@@ -277,6 +277,6 @@ class SearchPlanner(Planner[CaseT, PlanT]):
         require_one_of(EFFORTS, "effort", effort)
         if effort == EFFORTS[0]:
             return self
-        from planner_jax.optimise.efforts import polish_rounds
+        from planner_jax.optimise.efforts import polish
 
-        return dataclasses.replace(self, rounds=polish_rounds(self.problem, self.rounds, effort))
+        return polish(self, effort)

@@ -1,9 +1,7 @@
 """A table of the searches of a planner that minimises: a row for each stage of each attempt.
 
-An attempt of such a planner is called round, and each stage of a round is one search.
-
 A row has the numbers of a stage, which a compiled program reads at run time. What a program must
-know when it is compiled, such as the number of variables, is in the `Model` of a row. Rounds that
+know when it is compiled, such as the number of variables, is in the `Model` of a row. Attempts that
 can share a program are one `Group`, whose table `load_group` makes.
 """
 
@@ -21,9 +19,9 @@ from jax.core import Tracer
 from jaxtyping import PyTree
 
 from planner_jax.core.errors import ArgumentError
-from planner_jax.core.protocol import Attempt
+from planner_jax.core.protocol import BaseAttempt
 from planner_jax.lanes import kernels
-from planner_jax.optimise.settings import LbfgsConfig, Round, Settings, Solver, Stage
+from planner_jax.optimise.settings import Attempt, LbfgsConfig, Settings, Solver, Stage
 
 if TYPE_CHECKING:
     from planner_jax.optimise.planner import Problem
@@ -42,13 +40,13 @@ class Row:
     width: Number  # () int32, number of starting points of a case
     keep: Number  # () int32, number of starting points that the next row continues
     first: Number  # () int32, index of the first starting point among the guesses
-    within: Number  # (), greatest violation of a case for which the round is made
-    improves: Number  # () bool, whether the round is made for solved cases, too
-    is_first: Number  # () bool, in the first round of a call, which is due for all cases
+    within: Number  # (), greatest violation of a case for which the attempt is made
+    improves: Number  # () bool, whether the attempt is made for solved cases, too
+    is_first: Number  # () bool, in the first attempt of a call, which is due for all cases
     is_last: Number  # () bool, whether it returns the plan of the best start, without a search
-    starts: Number  # () bool, whether the row is the first one of a round
+    starts: Number  # () bool, whether the row is the first one of an attempt
     ends: Number  # () bool, whether `keep` selects by the status of the plans, not only by cost
-    writes: Number  # () bool, whether the plans compete with the best plans of earlier rounds
+    writes: Number  # () bool, whether the plans compete with the best plans of earlier attempts
     frozen: Number  # () bool, whether the variables `Problem.held` are constant
 
 
@@ -64,7 +62,7 @@ class Model:
 
 @struct.dataclass
 class Table:
-    """The rows of a group of rounds (attempts) as an argument of compiled programs."""
+    """The rows of a group of attempts as an argument of compiled programs."""
 
     numbers: Array | np.ndarray  # (R, F), a row for each of R searches
     models: tuple[Model, ...] = struct.field(pytree_node=False)
@@ -99,39 +97,39 @@ class Table:
 
 
 @dataclasses.dataclass(frozen=True)
-class Group(Attempt):
-    """Rounds (attempts) that share a compiled program, as one attempt."""
+class Group(BaseAttempt):
+    """Attempts that share a compiled program, as one attempt."""
 
     continues: ClassVar[bool] = True  # only plans better than the best plans so far are returned
-    rounds: tuple[Round, ...] = ()  # all rounds for which the program is compiled
-    made: tuple[int, ...] = ()  # indices of the rounds that are made
-    is_whole: bool = False  # whether the program has no other rounds
+    attempts: tuple[Attempt, ...] = ()  # all attempts for which the program is compiled
+    made: tuple[int, ...] = ()  # indices of the attempts that are made
+    is_whole: bool = False  # whether the program has no other attempts
     is_first: bool = True  # whether no attempt has been made before
-    place: int = 0  # index of its first round among the planner's attempts
+    place: int = 0  # index of its first attempt among the planner's attempts
     # Arguments of programs in float32 and in float64, after the first use.
     loaded: dict[bool, tuple] = dataclasses.field(default_factory=dict, compare=False, repr=False)
 
-    def place_among(self, attempts: Sequence[Attempt]) -> int:
-        """Return the index of its first round among a planner's attempts."""
+    def place_among(self, attempts: Sequence[BaseAttempt]) -> int:
+        """Return the index of its first attempt among a planner's attempts."""
         return self.place
 
     @classmethod
     def of(
         cls,
-        rounds: tuple[Round, ...],
+        attempts: tuple[Attempt, ...],
         made: tuple[int, ...],
         is_whole: bool = True,
         is_first: bool = True,
         place: int = 0,
     ) -> "Group":
-        """Return a group that makes some of these rounds, for the cases that need one of them."""
-        own = [rounds[k] for k in made]
+        """Return a group that makes some of these attempts, for the cases that need one of them."""
+        own = [attempts[k] for k in made]
         bounds = [np.inf if each.within is None else each.within for each in own]
         return cls(
             starts=max(each.starts for each in own),
             within=None if np.inf in bounds else max(bounds),
             improves=any(each.improves for each in own),
-            rounds=rounds,
+            attempts=attempts,
             made=made,
             is_whole=is_whole,
             is_first=is_first,
@@ -144,23 +142,23 @@ _RECENT: dict[int, tuple] = {}
 _MOST_RECENT = 256
 
 
-def group_rounds(
+def join_attempts(
     problem: "Problem",
-    rounds: tuple[Round, ...],
+    attempts: tuple[Attempt, ...],
     places: tuple[int, ...],
     is_whole: bool,
 ) -> list[Group]:
-    """Return groups of those rounds (attempts) whose indices are `places`, in order.
+    """Return groups of those attempts whose indices are `places`, in order.
 
-    Unless `is_whole`, each group makes one round, though other rounds can share its program. The
-    last groups of each problem are stored.
+    Unless `is_whole`, each group makes one attempt, though other attempts can share its program.
+    The last groups of each problem are stored.
     """
-    key, known = (rounds, places, is_whole), _RECENT.get(id(problem))
+    key, known = (attempts, places, is_whole), _RECENT.get(id(problem))
     if known is not None and known[0] is problem and known[1] == key:
         return known[2]
     groups: list[Group] = []
-    for part in _divide(problem, rounds, is_whole):
-        own, made = rounds[part.start : part.stop], [k for k in places if k in part]
+    for part in _divide(problem, attempts, is_whole):
+        own, made = attempts[part.start : part.stop], [k for k in places if k in part]
         together = [made] if is_whole and made else [[k] for k in made]
         for some in together:
             indices = tuple(k - part.start for k in some)
@@ -171,25 +169,25 @@ def group_rounds(
     return groups
 
 
-def _divide(problem: "Problem", rounds: tuple[Round, ...], is_whole: bool) -> list[range]:
-    """Return the indices of consecutive rounds (attempts) that one compiled program can make.
+def _divide(problem: "Problem", attempts: tuple[Attempt, ...], is_whole: bool) -> list[range]:
+    """Return the indices of consecutive attempts that one compiled program can make.
 
-    These rounds have equal values of all fields of the problem that `weights` and `refinements` do
-    not list. Unless `is_whole`, they also have the same models. The first rounds of one stage and
-    one starting point are then apart, because their program is compiled fast.
+    These attempts have equal values of all fields of the problem that `weights` and `refinements`
+    do not list. Unless `is_whole`, they also have the same models. The first attempts of one stage
+    and one starting point are then apart, because their program is compiled fast.
     """
-    names = {name for each in rounds for stage in each.all_stages for name, _ in stage.settings}
+    names = {name for each in attempts for stage in each.all_stages for name, _ in stage.settings}
     fixed = sorted(names - {*problem.weights, *problem.refinements})
     keys: list[Hashable] = []
     leads = True
-    for each in rounds:
+    for each in attempts:
         own, is_plain = problem.with_settings(each.settings), each.starts == 1 and not each.stages
         shared = tuple(own.setting(name) for name in fixed)
         models = frozenset(_key_of_model(problem, stage) for stage in each.all_stages)
         leads = leads and is_plain and (not keys or keys[0] == (shared, models, True))
         keys.append(shared if is_whole else (shared, models, leads))
     groups: list[range] = []
-    for k in range(len(rounds)):
+    for k in range(len(attempts)):
         if groups and keys[groups[-1].start] == keys[k]:
             groups[-1] = range(groups[-1].start, k + 1)
         else:
@@ -207,10 +205,10 @@ def _key_of_model(problem: "Problem", stage: Stage) -> tuple:
 
 
 def load_group(problem: "Problem", group: Group) -> tuple[PyTree, Table]:
-    """Return a planner and a table, in a jax array, as arguments of programs for a group of rounds.
+    """Return a planner and a table, in a jax array, as arguments of programs for a group.
 
-    The table has the numbers of the rounds and of the problem's `weights`. The returned planner has
-    their defaults, so that problems with other numbers share programs.
+    The table has the numbers of the attempts and of the problem's `weights`. The returned planner
+    has their defaults, so that problems with other numbers share programs.
     """
     is_double = bool(jax.config.jax_enable_x64)  # type: ignore[attr-defined]
     if is_double not in group.loaded:
@@ -224,11 +222,11 @@ def load_group(problem: "Problem", group: Group) -> tuple[PyTree, Table]:
 
 
 def _make_table(problem: "Problem", group: Group) -> Table:
-    stages = list(dict.fromkeys(s for each in group.rounds for s in each.all_stages))
+    stages = list(dict.fromkeys(s for each in group.attempts for s in each.all_stages))
     own = {name: problem.setting(name) for name in sorted(problem.weights)}
     weights = [n for n, x in own.items() if np.ndim(x) == 0 and not isinstance(x, Tracer)]
     models = list_models(problem, stages, weights, group.is_whole)
-    lists = [_rows_of(problem, each, models, weights) for each in group.rounds]
+    lists = [_rows_of(problem, each, models, weights) for each in group.attempts]
     rows = list(itertools.chain(*(lists[k] for k in group.made)))
     every = list(itertools.chain(*lists))
     for k in range(len(lists[group.made[0]]) if group.is_first else 0):
@@ -237,7 +235,7 @@ def _make_table(problem: "Problem", group: Group) -> Table:
         most = max(map(len, lists))
         unmade = dataclasses.replace(lists[0][0], within=-np.inf, improves=False)
         rows += [unmade] * (most - len(rows))
-    lasts = [each.all_stages[-1] for each in group.rounds]
+    lasts = [each.all_stages[-1] for each in group.attempts]
     finest = max(lasts, key=lambda stage: problem.with_settings(stage.settings).size).settings
     finest = tuple(pair for pair in finest if pair[0] not in weights)
     numbers = np.array([[float(x) for x in jax.tree.leaves(row)] for row in rows])
@@ -284,7 +282,7 @@ def list_models(
             free = () if held is None else tuple(np.flatnonzero(~held).tolist())
             if len(free) != first.size:
                 rule = "of stages that search all variables, or all that are not `held`"
-                raise ArgumentError("rounds", rule, shown="")
+                raise ArgumentError("attempts", rule, shown="")
         pairs, solver = tuple(settings.items()), group[0].solver
         if isinstance(solver, LbfgsConfig):  # the rows have the numbers
             most = min(_TURNS, *(stage.solver.max_steps for stage in group))
@@ -295,7 +293,7 @@ def list_models(
 
 
 def _rows_of(
-    problem: "Problem", attempt: Round, models: dict[Stage, Model], weights: list[str]
+    problem: "Problem", attempt: Attempt, models: dict[Stage, Model], weights: list[str]
 ) -> list[Row]:
     places = {model: k for k, model in enumerate(dict.fromkeys(models.values()))}
     width, last, rows = attempt.starts, len(attempt.all_stages) - 1, []

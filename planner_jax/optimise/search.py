@@ -1,6 +1,6 @@
 """The searches of planners that minimise, for `pj.plan` and `pj.solve`.
 
-A planner's rounds (attempts) consist of stages, each a search whose settings are one row of a
+A planner's attempts consist of stages, each a search whose settings are one row of a
 table. A table of a single row, as first attempts have, is one search for each case; for other
 tables see `tiles`. The lanes (cases) are last in the arrays of this module.
 """
@@ -78,7 +78,7 @@ class Search:
     ) -> tuple[Item, PyTree]:
         """Search from guesses, or from where earlier searches ended; the lanes are last.
 
-        With `before` as None, the row is the first one of a round.
+        With `before` as None, the row is the first one of an attempt.
         """
         most = self.table.guesses
         contexts = over(self.finest.prepare)(cases)
@@ -100,12 +100,12 @@ class Search:
             found = dataclasses.replace(found, iterations=spent + found.iterations)
             found = jax.tree.map(lambda new, old: jnp.where(row.is_last, old, new), found, old)
         plan = over(functools.partial(plan_at, self.finest))(found, contexts)
-        evaluation = dataclasses.replace(found.evaluation, violation=plan.violation)
+        evaluation = found.evaluation._replace(violation=plan.violation)
         found = dataclasses.replace(found, evaluation=evaluation)
         return Item(found, plan.status), plan
 
     def _if_starts(self, row: Row, function: Callable, otherwise: PyTree, *args: PyTree) -> PyTree:
-        """Return a function's result if a row is the first one of a round, else an array."""
+        """Return a function's result if a row is the first one of an attempt, else an array."""
         if self.table.is_plain:
             return function(*args)
         return lax.cond(row.starts, function, lambda *_: otherwise, *args)
@@ -136,7 +136,7 @@ class Search:
             start, context = given
             if held is not None:
                 point = jnp.where(held, start, point)
-            return problem.objective(point, context)
+            return Evaluation(*problem.objective(point, context))
 
         given = starts, contexts
         if isinstance(solver, LbfgsConfig) and solver.max_steps > 0:
@@ -177,7 +177,7 @@ def over(function: Callable) -> Callable:
 
 
 def find_due(row: Row, score: Score, is_usable: Array | bool) -> Array:
-    """Return which cases need the round of a row, (B,) bool; padding of a batch needs none."""
+    """Return which cases need the attempt of a row, (B,) bool; padding of a batch needs none."""
     again = is_unsolved(score.status) & (score.violation <= row.within)
     again = (again | is_solved(score.status) & row.improves) & is_usable
     return again | row.is_first & is_unsolved(score.status)

@@ -28,7 +28,7 @@ from planner_jax.core.protocol import Plan
 from planner_jax.optimise.around import ProblemAround
 from planner_jax.optimise.planner import Problem, pending
 from planner_jax.optimise.preconditioner import positive_inverse
-from planner_jax.optimise.settings import Curvature, Evaluation
+from planner_jax.optimise.settings import Curvature
 
 Quantity = str | Callable[[PyTree], Array]
 Product = Callable[[Array], Array]  # product of a matrix with a vector (n,)
@@ -114,7 +114,7 @@ class Differentiated(ProblemAround):
         """Return the first starting point (n,) of the inner problem."""
         return self.problem.first_start(guess, features, context.inner)
 
-    def objective(self, point: Array, context: _Context) -> Evaluation:
+    def objective(self, point: Array, context: _Context) -> tuple[Array, Array]:
         """Evaluate the objective of the inner problem at a point (n,)."""
         return self.problem.objective(point, context.inner)
 
@@ -190,7 +190,7 @@ def gradient_at(
         return jax.tree.unflatten(treedef, [next(taken) if flag else leaf for leaf, flag in both])
 
     def cost(x: Array, smooth: list) -> Array:
-        return problem.objective(x, context_of(smooth)).cost
+        return problem.objective(x, context_of(smooth))[0]
 
     def value_of(x: Array, smooth: list) -> Array:
         value = number(problem.decode(x, context_of(smooth)).replace(cost=cost(x, smooth)))

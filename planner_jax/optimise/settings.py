@@ -1,11 +1,10 @@
-"""Types of objectives, and settings of a planner's attempts (rounds), each of several searches."""
+"""Types of objectives, and settings of a planner's attempts, each of several searches."""
 
 import dataclasses
 from collections.abc import Callable
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from flax import struct
 from jax import Array
 
 from planner_jax.core.checks import (
@@ -17,15 +16,14 @@ from planner_jax.core.checks import (
 from planner_jax.core.choices import require_size
 from planner_jax.core.compiled import with_run_time_numbers
 from planner_jax.core.errors import ArgumentError, ArgumentTypeError
-from planner_jax.core.protocol import Attempt
+from planner_jax.core.protocol import BaseAttempt
 from planner_jax.core.rules import NOT_NEGATIVE, Rule
 
 MOST_DAMPING = 1e4  # greatest damping of one problem in Newton's method
 
 
-@struct.dataclass
-class Evaluation:
-    """The value of an objective at one point: the cost, and the largest violation of a limit."""
+class Evaluation(NamedTuple):
+    """The pair that objectives return for a point: the cost, and the largest violation."""
 
     cost: Array  # (), to be minimised
     violation: Array  # (), largest relative excess over a limit; feasible if <= 0
@@ -132,7 +130,7 @@ class Stage:
     solver: Solver
     settings: Settings = ()
     keep: int | None = None  # number of a case's cheapest starts that continue; None for all
-    # Whether L-BFGS leaves the variables unchanged that `OptimisedPlanner.held` marks.
+    # Whether L-BFGS leaves the variables unchanged that `Problem.held` marks.
     frozen: bool = False
 
     def __post_init__(self) -> None:
@@ -143,8 +141,8 @@ class Stage:
 
 
 @dataclasses.dataclass(frozen=True)
-class Round(Attempt):
-    """One attempt (search) of a planner that minimises: solver, settings, preliminary searches."""
+class Attempt(BaseAttempt):
+    """One attempt of a planner that minimises: solver, settings, preliminary searches."""
 
     solver: Solver = LbfgsConfig()
     settings: Settings = ()  # values of planner fields during this attempt
@@ -158,5 +156,8 @@ class Round(Attempt):
 
     @property
     def all_stages(self) -> tuple[Stage, ...]:
-        """The preliminary searches of the round, and its own search as the last stage."""
+        """The preliminary searches of the attempt, and its own search as the last stage."""
         return (*self.stages, Stage(self.solver, self.settings))
+
+
+Attempts = tuple[Attempt, ...]

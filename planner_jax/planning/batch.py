@@ -19,7 +19,7 @@ from jaxtyping import PyTree
 
 from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import (
-    Attempt,
+    BaseAttempt,
     Score,
     is_resident,
     is_unsolved,
@@ -52,7 +52,7 @@ _Call = tuple[np.ndarray, int]
 
 def plan_batch(
     planner: Planner,
-    attempts: Sequence[Attempt],
+    attempts: Sequence[BaseAttempt],
     cases: PyTree,
     chunk: int | None,
     devices: Sequence[jax.Device] | None,  # pyright: ignore[reportInvalidTypeForm]
@@ -88,13 +88,13 @@ def plan_batch(
 
 
 def plan_on_host(
-    planner: Planner, attempts: Sequence[Attempt], cases: PyTree, watch: "Watch"
+    planner: Planner, attempts: Sequence[BaseAttempt], cases: PyTree, watch: "Watch"
 ) -> tuple[PyTree, int]:
     """Return NumPy plans, and the number of unsolved ones, by a planner that runs on the host."""
     alone = cases.batch_shape == ()
     cases = jax.tree.map(lambda leaf: np.asarray(leaf)[None] if alone else np.asarray(leaf), cases)
 
-    def try_lanes(attempt: Attempt, lanes: np.ndarray, plans: PyTree) -> PyTree:
+    def try_lanes(attempt: BaseAttempt, lanes: np.ndarray, plans: PyTree) -> PyTree:
         watch.report(planner, attempt, 0, lanes.size)
         some = jax.tree.map(lambda leaf: leaf[lanes], cases)
         later = mark_bad_input(planner.solve_on_host(some, attempt), some)
@@ -106,10 +106,10 @@ def plan_on_host(
 
 
 def _try_in_turn(
-    attempts: Sequence[Attempt],
+    attempts: Sequence[BaseAttempt],
     num: int,
     watch: "Watch",
-    try_lanes: Callable[[Attempt, np.ndarray, PyTree], PyTree],
+    try_lanes: Callable[[BaseAttempt, np.ndarray, PyTree], PyTree],
 ) -> tuple[PyTree, int]:
     """Return plans of `num` cases after all attempts (searches), and the number of unsolved plans.
 
@@ -141,12 +141,12 @@ class Batch:
 
     compiles_quickly: bool  # for a batch of few cases on a CPU
 
-    def sizes(self, attempt: Attempt) -> Sizes:
+    def sizes(self, attempt: BaseAttempt) -> Sizes:
         """Return the numbers of cases that one compiled call of an attempt may solve."""
         return sizes_of(self.planner, attempt, self.chunk, self.mesh)
 
     def try_lanes(
-        self, cases: PyTree, attempt: Attempt, lanes: np.ndarray, plans: PyTree
+        self, cases: PyTree, attempt: BaseAttempt, lanes: np.ndarray, plans: PyTree
     ) -> PyTree:
         """Return the plans after an attempt at the cases in NumPy arrays with indices `lanes`."""
         calls = self._calls(attempt, lanes)
@@ -171,7 +171,7 @@ class Batch:
                 plans = select_into(plans, later, call[:num])
         return mark_out_of_time(plans, untried) if untried.any() else plans
 
-    def _calls(self, attempt: Attempt, lanes: np.ndarray) -> list[_Call]:
+    def _calls(self, attempt: BaseAttempt, lanes: np.ndarray) -> list[_Call]:
         calls, devices = [], self.mesh.size
         for first, size in self.sizes(attempt).cuts(-(-lanes.size // devices)):
             part = lanes[first * devices :][: size * devices]
@@ -180,7 +180,7 @@ class Batch:
         return calls
 
     def _results(
-        self, attempt: Attempt, cases: PyTree, calls: list[_Call], before: PyTree
+        self, attempt: BaseAttempt, cases: PyTree, calls: list[_Call], before: PyTree
     ) -> Iterator[PyTree]:
         """Yield the plans of each compiled call, or None after the time limit.
 
@@ -217,11 +217,13 @@ class Batch:
             yield from alone
             yield from later
 
-    def _solve(self, attempt: Attempt, cases: PyTree, before: Score | None) -> tuple[PyTree, Array]:
+    def _solve(
+        self, attempt: BaseAttempt, cases: PyTree, before: Score | None
+    ) -> tuple[PyTree, Array]:
         quickly = self.compiles_quickly
         return solve_on_devices(
             self.planner, attempt, self.mesh, cases, before, compiles_quickly=quickly
         )
 
-    def _key(self, attempt: Attempt, num: int, cases: PyTree) -> Hashable:
+    def _key(self, attempt: BaseAttempt, num: int, cases: PyTree) -> Hashable:
         return program_key(self.planner, attempt, num, cases, self.compiles_quickly)

@@ -65,8 +65,8 @@ def gradient(
             even where limits are active. "whole" uses the inverse Hessian as preconditioner, which
             costs as much as n solver iterations for n decision variables; planners that search for
             a path first, such as `pj.intercept.planner("spacetime")`, use it by default.
-        solver: settings of one search that replaces the planner's rounds.
-        polish: whether the first round continues to the optimum; ignored if there is a `solver`.
+        solver: settings of one search that replaces the planner's attempts.
+        polish: whether the first attempt continues to the optimum; ignored if there is a `solver`.
             Planners that search for a path first reach the optimum in any case.
         chunk: as for `plan`.
         devices: as for `plan`.

@@ -18,7 +18,7 @@ from planner_jax.core.errors import ArgumentError, ArgumentTypeError, NotOffered
 from planner_jax.core.origin import with_origin, without_origin
 from planner_jax.core.planner import CaseT, Kind, Planner, PlanT, require_fit
 from planner_jax.core.protocol import (
-    Attempt,
+    BaseAttempt,
     Status,
     is_better,
     is_resident,
@@ -33,23 +33,23 @@ from planner_jax.planning.programs import solve_one
 
 _ARRAYS = (jax.Array, np.ndarray, np.generic)
 
-_QUIET = 1.0  # [s] least time between two progress reports of one round
+_QUIET = 1.0  # [s] least time between two progress reports of one attempt
 
 
 @dataclasses.dataclass(frozen=True)
 class Progress:
     """Report of `plan` on the progress of an attempt (search); `str` formats it as one line."""
 
-    round: int  # number of this round, counted from 1
-    rounds: int  # greatest number of rounds that the planner makes
-    tried: int  # number of cases that this round has tried so far
-    cases: int  # number of cases of this round: all that earlier rounds left unsolved
+    attempt: int  # number of this attempt, counted from 1
+    attempts: int  # greatest number of attempts that the planner makes
+    tried: int  # number of cases that this attempt has tried so far
+    cases: int  # number of cases of this attempt: all that earlier attempts left unsolved
     seconds: float  # [s] time since the start of planning
 
     def __str__(self) -> str:
         return (
-            f"round {self.round} of at most {self.rounds}: {self.tried:,} of {self.cases:,} cases "
-            f"tried, after {self.seconds:.1f} s"
+            f"attempt {self.attempt} of at most {self.attempts}: {self.tried:,} of {self.cases:,} "
+            f"cases tried, after {self.seconds:.1f} s"
         )
 
 
@@ -86,17 +86,17 @@ class Watch:
         """True if the time limit has passed."""
         return self._limit is not None and time.monotonic() - self._start >= self._limit
 
-    def report(self, planner: Planner, attempt: Attempt, tried: int, cases: int) -> None:
+    def report(self, planner: Planner, attempt: BaseAttempt, tried: int, cases: int) -> None:
         """Report progress at the start and end of a search, and else at most once a second."""
         if self._progress is None:
             return
-        seconds, rounds = time.monotonic() - self._start, tuple(planner.attempts)
-        place = attempt.place_among(rounds) + 1
+        seconds, attempts = time.monotonic() - self._start, tuple(planner.attempts)
+        place = attempt.place_among(attempts) + 1
         last_place, last = self._reported
         if 0 < tried < cases and place == last_place and seconds - last < _QUIET:
             return
         self._reported = place, seconds
-        self._progress(Progress(place, max(len(rounds), place), int(tried), int(cases), seconds))
+        self._progress(Progress(place, max(len(attempts), place), int(tried), int(cases), seconds))
 
 
 def plan(
@@ -271,7 +271,7 @@ class Driver:
 
     @with_own_precision
     def __call__(
-        self, planner: Planner, cases: PyTree, attempts: Sequence[Attempt] | None = None
+        self, planner: Planner, cases: PyTree, attempts: Sequence[BaseAttempt] | None = None
     ) -> tuple[PyTree, PyTree]:
         """Plan by these attempts (searches), or by all attempts of the planner.
 
@@ -318,7 +318,9 @@ class Driver:
         return select_into(plans, plan_of(jax.tree.map(lambda leaf: leaf[lanes], cases)), lanes)
 
 
-def _plan_one(planner: Planner, attempts: Sequence[Attempt], case: PyTree, watch: Watch) -> PyTree:
+def _plan_one(
+    planner: Planner, attempts: Sequence[BaseAttempt], case: PyTree, watch: Watch
+) -> PyTree:
     """Return the plan of one case: make searches until one solves the case or the time is over."""
     best: PyTree = None
     for attempt in attempts:

@@ -22,7 +22,7 @@ from jaxtyping import PyTree
 from planner_jax.core.arithmetic import float_type
 from planner_jax.core.compiled import QUICK_OPTIONS, Fixed, Options, trace_for
 from planner_jax.core.planner import Planner
-from planner_jax.core.protocol import Attempt, Score, is_unsolved, mark_bad_input
+from planner_jax.core.protocol import BaseAttempt, Score, is_unsolved, mark_bad_input
 from planner_jax.core.rules import require_shapes
 from planner_jax.planning.traced import Layout, Results, Stored, load_or_trace, settings
 
@@ -74,7 +74,7 @@ class Sizes:
             first += size
 
 
-def sizes_of(planner: Planner, attempt: Attempt, chunk: int | None, mesh: Mesh) -> Sizes:
+def sizes_of(planner: Planner, attempt: BaseAttempt, chunk: int | None, mesh: Mesh) -> Sizes:
     """Return how many cases one call may solve: `chunk`, or numbers that suit the device."""
     busy, is_cpu = _GPU_BUSY // attempt.starts, mesh.devices[0].platform == "cpu"
     if chunk is not None:
@@ -192,7 +192,7 @@ def solve_cases(
     return mark_bad_input(plans, cases)
 
 
-def score_of(attempt: Attempt, cases: PyTree, plans: PyTree) -> Score | None:
+def score_of(attempt: BaseAttempt, cases: PyTree, plans: PyTree) -> Score | None:
     """Return the numbers of earlier plans (None: there are none) that an attempt needs, or None."""
     if not attempt.continues:
         return None
@@ -231,7 +231,7 @@ class PerDevice:
 
 def solve_on_devices(
     planner: Planner,
-    attempt: Attempt,
+    attempt: BaseAttempt,
     mesh: Mesh,
     cases: PyTree,
     before: Score | None = None,
@@ -267,7 +267,7 @@ compiled: set[Hashable] = set()
 
 
 def program_key(
-    planner: Planner, attempt: Attempt, num: int, cases: PyTree, compiles_quickly: bool
+    planner: Planner, attempt: BaseAttempt, num: int, cases: PyTree, compiles_quickly: bool
 ) -> Hashable:
     """Return the key of the program that solves `num` cases per device, for the set `compiled`."""
     own = tuple((leaf.shape, leaf.dtype) for leaf in jax.tree.leaves(planner))
@@ -276,7 +276,9 @@ def program_key(
     return tree, own, lanes, num, compiles_quickly, settings()
 
 
-def solve_one(planner: Planner, case: PyTree, attempt: Attempt, before: PyTree = None) -> PyTree:
+def solve_one(
+    planner: Planner, case: PyTree, attempt: BaseAttempt, before: PyTree = None
+) -> PyTree:
     """Return the plan of one case in NumPy arrays; the case is sent to the device as one vector.
 
     `before` is the best plan of earlier attempts, or None.

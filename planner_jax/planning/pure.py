@@ -12,7 +12,7 @@ from jax.custom_batching import custom_vmap
 from jaxtyping import PyTree
 
 from planner_jax.core.planner import Drive, Planner
-from planner_jax.core.protocol import Attempt, is_solved, is_unsolved, select
+from planner_jax.core.protocol import BaseAttempt, is_solved, is_unsolved, select
 from planner_jax.planning.programs import score_of, solve_cases
 
 
@@ -43,7 +43,7 @@ def plan_mapped(drive: Drive, planner: Planner, cases: PyTree) -> PyTree:
     return plan_together(planner, cases)
 
 
-def plan_purely(planner: Planner, attempts: Sequence[Attempt], cases: PyTree) -> PyTree:
+def plan_purely(planner: Planner, attempts: Sequence[BaseAttempt], cases: PyTree) -> PyTree:
     """Return plans as jax arrays; while any case is unsolved, searches are made for all cases."""
     plans: PyTree = None
     pairs = [(attempt, planner.load(attempt, cases)[1]) for attempt in attempts]
@@ -85,7 +85,7 @@ def plan_purely(planner: Planner, attempts: Sequence[Attempt], cases: PyTree) ->
 
 
 def _plan_in_groups(
-    planner: Planner, pairs: Sequence[tuple[Attempt, PyTree]], cases: PyTree
+    planner: Planner, pairs: Sequence[tuple[BaseAttempt, PyTree]], cases: PyTree
 ) -> PyTree:
     (first, loaded), *others = pairs
     plans = solve_cases(planner, cases, loaded, score_of(first, cases, None))

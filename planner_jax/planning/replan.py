@@ -104,7 +104,7 @@ def replan(planner: PyTree, cases: PyTree, previous: PlanT, elapsed: PyTree, **n
 
     Args:
         planner: a planner with a `replanner`, such as `pj.catch.planner("exact")`, or a re-planner
-            with its own settings, such as `planner.replanner()` with other `rounds`.
+            with its own settings, such as `planner.replanner()` with other `attempts`.
         cases: the cases of `previous`, one or a batch; their times count from the plan's start.
         previous: the plan that is being executed.
         elapsed: () or (B,) [s], time since the plan's start, >= 0.

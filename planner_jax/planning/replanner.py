@@ -12,7 +12,7 @@ from jaxtyping import PyTree
 from planner_jax.core.protocol import Plan
 from planner_jax.optimise.around import ProblemAround
 from planner_jax.optimise.planner import Problem, SearchPlanner
-from planner_jax.optimise.settings import Evaluation, Round
+from planner_jax.optimise.settings import Attempt
 from planner_jax.planning.replan import Replanning
 from planner_jax.robot.heading import continue_heading
 
@@ -42,7 +42,7 @@ class Remaining:
     # `start_from(problem, task, context)` returns the point (n,) of the inner problem that is
     # nearest to the previous plan. `context` is what remains, as the inner problem prepares it.
     start_from: Callable[[PyTree, Replanning, PyTree], Array]
-    rounds: tuple[Round, ...]
+    attempts: tuple[Attempt, ...]
     shortest: float = 0.0  # [s], usual value of the field of `Remainder`
     # `time_left(task, context)` returns the time () [s] to the next contact, -inf if there is none.
     # `keep(task, context)` returns what remains of the previous plan. None: always a new plan.
@@ -55,7 +55,7 @@ class Remaining:
         `shortest` is the field of `Remainder`; None: its usual value.
         """
         least = self.shortest if shortest is None else shortest
-        return Replanner(Remainder(problem, self, least), self.rounds)
+        return Replanner(Remainder(problem, self, least), self.attempts)
 
 
 @jax.tree_util.register_static
@@ -91,7 +91,7 @@ class Remainder(ProblemAround):
             return first
         return jnp.concatenate([first, self.problem.guesses(context.inner, num - 1)])
 
-    def objective(self, point: Array, context: RemainderContext) -> Evaluation:
+    def objective(self, point: Array, context: RemainderContext) -> tuple[Array, Array]:
         """Return cost and violation at n variables `point`, or of the previous plan if kept."""
         if context.is_kept is not None:
             point = jnp.where(context.is_kept, context.start, point)
@@ -107,7 +107,7 @@ class Remainder(ProblemAround):
 
     @property
     def weights(self) -> tuple[str, ...]:  # type: ignore[override]
-        """The inner problem's numbers of the cost that rounds may change."""
+        """The inner problem's numbers of the cost that attempts may change."""
         return self.problem.weights
 
     def with_weights(self, weights: dict[str, PyTree]) -> "Remainder":

@@ -17,7 +17,7 @@ from jaxtyping import PyTree
 
 from planner_jax.core.arithmetic import float_type
 from planner_jax.core.protocol import (
-    Attempt,
+    BaseAttempt,
     Score,
     Status,
     is_unsolved,
@@ -41,7 +41,7 @@ from planner_jax.planning.programs import (
 class ResidentBatch(Batch):
     """A planner and the devices that hold batches of cases, and their plans."""
 
-    def plan(self, attempts: Sequence[Attempt], cases: PyTree) -> tuple[PyTree, Array]:
+    def plan(self, attempts: Sequence[BaseAttempt], cases: PyTree) -> tuple[PyTree, Array]:
         """Return plans of cases in jax arrays, and the number of unsolved cases of each device.
 
         Only these numbers are copied to the host.
@@ -76,7 +76,7 @@ class ResidentBatch(Batch):
             plans = _take(jax.device_put(plans, mesh.devices[0]), np.arange(num))
         return plans, unsolved
 
-    def _first_plans(self, attempt: Attempt, cases: PyTree) -> tuple[PyTree, Array]:
+    def _first_plans(self, attempt: BaseAttempt, cases: PyTree) -> tuple[PyTree, Array]:
         mesh, sizes, share = self.mesh, self.sizes(attempt), count_lanes(cases) // self.mesh.size
         if share == sizes.next(share):
             return self._solve(attempt, cases, self._none(attempt, cases))
@@ -99,7 +99,7 @@ class ResidentBatch(Batch):
         parts = [found[begin] if begin in found else solve(begin, size) for begin, size in cuts]
         return _join_locally(mesh, parts, share)
 
-    def _none(self, attempt: Attempt, cases: PyTree) -> Score | None:
+    def _none(self, attempt: BaseAttempt, cases: PyTree) -> Score | None:
         if not attempt.continues:
             return None
         return _place_none(self.mesh, count_lanes(cases), float_type(cases))
@@ -142,7 +142,7 @@ def _cut_unsolved(
 
 
 @functools.partial(jax.jit, static_argnames=("mesh", "attempt"))
-def _mark_due(mesh: Mesh, attempt: Attempt, plans: PyTree) -> tuple[Array, Array]:
+def _mark_due(mesh: Mesh, attempt: BaseAttempt, plans: PyTree) -> tuple[Array, Array]:
     """Return statuses that are unsolved where a search is due, and their number."""
 
     def due(plans: PyTree) -> tuple[Array, Array]:

@@ -11,7 +11,7 @@ from jax import Array
 from planner_jax.core.choices import RECOVERIES, require_one_of
 from planner_jax.optimise.chain import ChainEnds, ChainProblem
 from planner_jax.optimise.planner import pending
-from planner_jax.optimise.settings import LbfgsConfig, Round
+from planner_jax.optimise.settings import Attempt, LbfgsConfig
 from planner_jax.recovery.case import RecoveryCase
 from planner_jax.robot.quadrotor import QuadrotorPlan
 from planner_jax.trajectory.polynomial import PiecewisePolynomial
@@ -47,11 +47,11 @@ class RecoveryProblem(ChainProblem[RecoveryCase, QuadrotorPlan]):
 
     case_type = RecoveryCase
     # The recovery starts where the preceding plan ends, which may be closer to a limit than the
-    # distance at which penalties start. So later rounds (attempts) reduce this distance, `margin`.
-    rounds = (
-        Round(starts=1, solver=LbfgsConfig(max_steps=25)),
-        Round(starts=2, solver=LbfgsConfig(max_steps=80), settings=(("margin", 0.01),)),
-        Round(
+    # distance at which penalties start. So later attempts reduce this distance, `margin`.
+    attempts = (
+        Attempt(starts=1, solver=LbfgsConfig(max_steps=25)),
+        Attempt(starts=2, solver=LbfgsConfig(max_steps=80), settings=(("margin", 0.01),)),
+        Attempt(
             starts=6,
             solver=LbfgsConfig(max_steps=200),
             settings=(("energy_weight", 1e-10), ("margin", 0.005)),

@@ -34,7 +34,7 @@ _MEASURED = {
     "made; overlapping spans counted once",
     "first_seconds": "planning the first chunk, with the compilation in it",
     "warm_seconds": "planning of chunks in which nothing was compiled, from cases to plans on the "
-    "host: decisions, ball tables, guesses and all rounds. If these are less than half a batch, "
+    "host: decisions, ball tables, guesses and all attempts. If these are less than half a batch, "
     "the first chunk is planned again. The seconds of all workers are added",
     "referee_seconds": "judging, while the next chunk is planned",
     "wall_seconds": "all chunks of all sessions that were not killed, with drawing, checking and "

@@ -15,7 +15,7 @@ from planner_jax.ball.flight import BallState
 from planner_jax.ball.target import BallPath
 from planner_jax.core.compiled import QUICK_OPTIONS
 from planner_jax.core.planner import Kind, Planner
-from planner_jax.core.protocol import Attempt, is_solved
+from planner_jax.core.protocol import BaseAttempt, is_solved
 from planner_jax.host.machine import as_here
 from planner_jax.planning.plan import Driver, Watch
 from planner_jax.planning.plan import plan as plan_all
@@ -157,7 +157,7 @@ class _EveryAttempt(Driver):
     watch: Watch = dataclasses.field(default_factory=lambda: Watch(0.0))
 
     def __call__(
-        self, planner: Planner, cases: Any, attempts: Sequence[Attempt] | None = None
+        self, planner: Planner, cases: Any, attempts: Sequence[BaseAttempt] | None = None
     ) -> tuple[Any, Any]:
         if planner.kind is not Kind.COMPILED:
             return super().__call__(planner, cases, attempts)

@@ -11,7 +11,7 @@ from jax import Array
 from planner_jax.ball.flight import BallState
 from planner_jax.ball.prediction import PathTable, predict_path
 from planner_jax.core.protocol import is_better
-from planner_jax.optimise.settings import LbfgsConfig, Round
+from planner_jax.optimise.settings import Attempt, LbfgsConfig
 from planner_jax.planning.replan import Replanning
 from planner_jax.planning.replanner import Replanner
 from planner_jax.robot.heading import continue_heading
@@ -49,7 +49,9 @@ class CatchPilot:
     # neural network. "given" keeps the current order and times, and plans the trajectory anew.
     decide: str = "greedy"
     redecide: float = 100.0  # [Hz], rate of new decisions; divides the replanning rate; 0: never
-    search: Round = Round(starts=1, solver=LbfgsConfig(max_steps=25))  # search after a new decision
+    search: Attempt = Attempt(
+        starts=1, solver=LbfgsConfig(max_steps=25)
+    )  # search after a new decision
     passage = staticmethod(passage)
 
     def times(self, plan: CatchPlan) -> Array:
@@ -85,7 +87,7 @@ class CatchPilot:
 
         The second search, from scratch, is left out if the setting `redecide` is 0.
         """
-        from_last = lambda task: self.planner.solve(task, self.planner.rounds[0])  # noqa: E731
+        from_last = lambda task: self.planner.solve(task, self.planner.attempts[0])  # noqa: E731
         return (from_last, self._decide_again) if self.redecide > 0.0 else (from_last,)
 
     def choose(

@@ -15,7 +15,7 @@ from planner_jax.ball.flight import BallState
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.planner import Planner
 from planner_jax.optimise.planner import SearchPlanner
-from planner_jax.optimise.settings import LbfgsConfig, Round
+from planner_jax.optimise.settings import Attempt, LbfgsConfig
 from planner_jax.planning.plan import plan as plan_all
 from planner_jax.planning.replan import Replanning
 from planner_jax.planning.replanner import Replanner
@@ -106,7 +106,7 @@ def smooth_planner() -> SearchPlanner:
     """
     planner = HitProblem.planner(drag_after_impact=True)
     solver = LbfgsConfig(max_steps=60, tolerance=1e-5, patience=6)
-    return dataclasses.replace(planner, rounds=(Round(1, solver), *planner.rounds[2:]))
+    return dataclasses.replace(planner, attempts=(Attempt(1, solver), *planner.attempts[2:]))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -142,7 +142,7 @@ class HitPilot:
     @property
     def searches(self) -> tuple[Callable[[Replanning[HitCase, HitPlan]], HitPlan], ...]:
         """The only search of replanning: a short search that starts at the current plan."""
-        return (lambda task: self.planner.solve(task, self.planner.rounds[0]),)
+        return (lambda task: self.planner.solve(task, self.planner.attempts[0]),)
 
     def choose(
         self, asked: Replanning[HitCase, HitPlan], outlook: Outlook, found: tuple[HitPlan, ...]

@@ -41,7 +41,7 @@ ARGUMENTS = (
     ("pj.catch.planner(@)", ("decide",), NOT_NAMES),
     ("pj.intercept.planner(@)", ("pieces",), NOT_SIZES[:5]),
     ("pj.block.planner(@)", ("brisk",), NOT_SWITCHES[:2]),
-    ("pj.Round(@)", ("starts",), NOT_SIZES),
+    ("pj.Attempt(@)", ("starts",), NOT_SIZES),
     ("pj.LbfgsConfig(@)", ("step_cap", "tolerance"), ("-1", "nan", "'x'", "None")),
     ("policy(@)", ("stretch",), ("0", "-1", "nan", "inf", "'x'", "None", "1j", "True")),
     ("Best(@)", ("finalists",), NOT_SIZES[:5]),
@@ -90,12 +90,12 @@ pj.hit.draw(2, limit_scale=1e9) | limit_scale must be from 0.001 to 1000
 pj.hit.draw(2, delay=9.0) | delay must be shorter than each serve's flight
 pj.hit.planner('nobody') | planner must be one of exact
 pj.hit.planner('exact:file') | planner must be exact without a file
-pj.hit.planner(round=3) | option of planner exact must be one of
+pj.hit.planner(attempt=3) | option of planner exact must be one of
 pj.block.planner('library:') | planner must name
 pj.block.planner('library:gone') | library must be a file, got 'gone'
 pj.catch.planner(decide='policy:gone') | checkpoint must be
-pj.hit.planner(rounds=(pj.LbfgsConfig(),)) | rounds must
-pj.hit.planner(rounds=()) | rounds must have an entry
+pj.hit.planner(attempts=(pj.LbfgsConfig(),)) | attempts must
+pj.hit.planner(attempts=()) | attempts must have an entry
 pj.group.planner(decide='nobody') | decide must be one of
 pj.plan('exact', hits) | planner must be one, such as
 pj.plan(exact, catches) | cases must be of the class HitCase, which HitProblem plans, got a CatchCase

@@ -146,7 +146,7 @@ def make_valid() -> dict[str, dict[str, object]]:
         valid[f"plan of {task}.sample"] = {"rate": 100.0}
     valid["objects"] = {
         "values": [exact, pj.block.planner(), hits, hit_plans, *draws.values(), ball, ball_path(2)]
-        + [turning(1), square, pj.robot_named("x500"), pj.block.paper_scene(), pj.Round()]
+        + [turning(1), square, pj.robot_named("x500"), pj.block.paper_scene(), pj.Attempt()]
     }
     return valid
 

@@ -57,7 +57,7 @@ class SmoothMeet(pj.Problem):
     """The meeting time, and a penalty on accelerations close to the limit."""
 
     case_type = MeetCase
-    rounds = (pj.Round(1, pj.LbfgsConfig(200, tolerance=1e-7, patience=6)),)
+    attempts = (pj.Attempt(1, pj.LbfgsConfig(200, tolerance=1e-7, patience=6)),)
     weight: float = 30.0
     margin: float = 0.05
 
@@ -68,11 +68,11 @@ class SmoothMeet(pj.Problem):
         away = jnp.sqrt(jnp.sum((case.target_pos - case.pos) ** 2) + 1e-6)
         return jnp.stack([jnp.log(4.0 * jnp.sqrt(away / case.most)), 0.0, 0.0])[None]
 
-    def objective(self, point: Array, case: MeetCase) -> pj.Evaluation:
+    def objective(self, point: Array, case: MeetCase) -> tuple[Array, Array]:
         time, acc = plan_at(point, case)
         over = jnp.maximum(excess(acc, case) + self.margin, 0.0)
         cost = time + self.weight * jnp.sum(over**2) + 1e-4 * jnp.sum(acc**2)
-        return pj.Evaluation(cost=cost, violation=jnp.max(excess(acc, case)))
+        return cost, jnp.max(excess(acc, case))
 
     def decode(self, point: Array, case: MeetCase) -> MeetPlan:
         time, acc = plan_at(point, case)

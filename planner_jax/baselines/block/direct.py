@@ -16,7 +16,7 @@ from jax import Array, lax
 
 from planner_jax.baselines.parts.bang_bang import bang_bang
 from planner_jax.core.planner import Planner
-from planner_jax.core.protocol import Attempt, is_solved, require_settings, select, status_of
+from planner_jax.core.protocol import BaseAttempt, is_solved, require_settings, select, status_of
 from planner_jax.robot.arm_dynamics import measure_torques
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.clearance import least_clearances
@@ -76,7 +76,7 @@ class DirectBlock(Planner):
 
     case_type: ClassVar[type] = BlockCase
     is_sequential: ClassVar[bool] = True
-    attempts: ClassVar[tuple[Attempt, ...]] = (Attempt(),)  # pyright: ignore[reportIncompatibleMethodOverride]
+    attempts: ClassVar[tuple[BaseAttempt, ...]] = (BaseAttempt(),)  # pyright: ignore[reportIncompatibleMethodOverride]
     points: int = 48  # number of points of the ball's trajectory, each with eight end poses
     tries: int = 384  # greatest number of evaluated end poses, earliest arrival first
     samples: int = 96  # number of samples of a motion at which obstacle distances are computed
@@ -85,7 +85,7 @@ class DirectBlock(Planner):
     def __post_init__(self) -> None:
         require_settings(self)
 
-    def solve(self, case: BlockCase, attempt: Attempt) -> BlockPlan:
+    def solve(self, case: BlockCase, attempt: BaseAttempt) -> BlockPlan:
         """Return the plan of one case: the first collision-free motion in time for the ball."""
         poses, times = poses_in_time(case, self.points)
         order = jnp.argsort(times)

@@ -27,7 +27,7 @@ from planner_jax.baselines.block.path_timing import DEGREE, PIECES, import_extra
 from planner_jax.core.arithmetic import host_leaf
 from planner_jax.core.choices import require
 from planner_jax.core.planner import Planner
-from planner_jax.core.protocol import Attempt, Status, require_settings, take
+from planner_jax.core.protocol import BaseAttempt, Status, require_settings, take
 from planner_jax.robot.arm_dynamics import measure_torques
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.plan import BlockPlan, explain_status, mark_blocked
@@ -64,7 +64,7 @@ class PoseByPose(Planner, abc.ABC):
     """
 
     case_type: ClassVar[type] = BlockCase
-    attempts: ClassVar[tuple[Attempt, ...]] = (Attempt(),)  # pyright: ignore[reportIncompatibleMethodOverride]
+    attempts: ClassVar[tuple[BaseAttempt, ...]] = (BaseAttempt(),)  # pyright: ignore[reportIncompatibleMethodOverride]
     pieces: ClassVar[int]
     degree: ClassVar[int]
     points: int = 12  # number of points of the ball's trajectory, each with eight end poses
@@ -88,7 +88,7 @@ class PoseByPose(Planner, abc.ABC):
         `free` checks collisions, and `left` returns the remaining search time [s].
         """
 
-    def solve_on_host(self, cases: BlockCase, attempt: Attempt) -> BlockPlan:
+    def solve_on_host(self, cases: BlockCase, attempt: BaseAttempt) -> BlockPlan:
         """Return the plans of a batch, one case after another."""
         plans = [self.plan_of(take(cases, k)) for k in range(cases.batch_shape[0])]
         return jax.tree.map(lambda *leaves: np.stack(leaves), *plans)

@@ -15,7 +15,7 @@ from planner_jax.baselines.parts.minimum_jerk import minimum_jerk_after_ramp
 from planner_jax.core.choices import require
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.planner import Planner
-from planner_jax.core.protocol import Attempt, outcome, require_settings, take
+from planner_jax.core.protocol import BaseAttempt, outcome, require_settings, take
 from planner_jax.cost.quadrotor import (
     body_rate_excess,
     ground_excess,
@@ -104,7 +104,7 @@ class MppCatch(Planner):
     This planner ignores the additional limits of a case (`extras`); the referee checks them.
     """
 
-    attempts: ClassVar[tuple[Attempt, ...]] = (Attempt(),)  # pyright: ignore[reportIncompatibleMethodOverride]
+    attempts: ClassVar[tuple[BaseAttempt, ...]] = (BaseAttempt(),)  # pyright: ignore[reportIncompatibleMethodOverride]
     case_type: ClassVar[type] = CatchCase
     height: float = 1.2  # [m], height of the targets at the catches
     # [m/s], velocity components of the quadrotor that are tried on each axis at a catch.
@@ -120,7 +120,7 @@ class MppCatch(Planner):
         if not self.speeds or not self.thrusts:
             raise ArgumentError("speeds and thrusts", "an entry", verb="have", shown="none")
 
-    def solve(self, case: CatchCase, attempt: Attempt) -> CatchPlan:
+    def solve(self, case: CatchCase, attempt: BaseAttempt) -> CatchPlan:
         """Return the plan of one case: from catch to catch, the cheapest candidate trajectory.
 
         The plan's cost is the mean squared jerk of the whole trajectory.

@@ -15,7 +15,7 @@ from planner_jax.core.protocol import require_settings
 from planner_jax.cost.along import Along, integrate_along
 from planner_jax.cost.quadrotor import ground_excess, speed_excess
 from planner_jax.optimise.planner import Problem, pending
-from planner_jax.optimise.settings import Evaluation, LbfgsConfig, Round, Stage
+from planner_jax.optimise.settings import Attempt, Evaluation, LbfgsConfig, Stage
 from planner_jax.robot.quadrotor import QuadrotorLimits, body_rate_squared, body_z
 from planner_jax.task.catch.case import CatchCase
 from planner_jax.task.catch.context import (
@@ -120,8 +120,8 @@ class PaperCatch(Problem):
 
     case_type = CatchCase
     # Penalty weights rise in stages: a search that starts with the final weights converges badly.
-    rounds = (
-        Round(
+    attempts = (
+        Attempt(
             starts=1,
             solver=LbfgsConfig(max_steps=150, **_PATIENT),
             stages=(

@@ -20,7 +20,7 @@ from planner_jax.core.choices import require, require_size
 from planner_jax.core.protocol import require_settings
 from planner_jax.cost.penalty import join_trapezoid_weights, smooth_hinge
 from planner_jax.optimise.planner import Problem, SearchPlanner, pending
-from planner_jax.optimise.settings import Evaluation, LbfgsConfig, Round
+from planner_jax.optimise.settings import Attempt, Evaluation, LbfgsConfig
 from planner_jax.task.hit.case import HitCase
 from planner_jax.task.hit.context import HitContext, Impact, is_too_far, prepare_hit
 from planner_jax.task.hit.plan import HitPlan
@@ -134,8 +134,8 @@ class BatHit(Problem):
     """
 
     case_type = HitCase
-    rounds = (
-        Round(
+    attempts = (
+        Attempt(
             starts=1,
             solver=LbfgsConfig(
                 max_steps=80, memory=16, trial_steps=(2.0, 0.7071, 0.25, 0.0884), patience=3

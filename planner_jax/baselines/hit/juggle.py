@@ -12,7 +12,7 @@ from planner_jax.ball.flight_table import FlightTable
 from planner_jax.baselines.hit.common import largest_violation, make_impact, motion_excess
 from planner_jax.baselines.parts.minimum_jerk import minimum_jerk_after_ramp
 from planner_jax.core.planner import Planner
-from planner_jax.core.protocol import Attempt, outcome, require_settings
+from planner_jax.core.protocol import BaseAttempt, outcome, require_settings
 from planner_jax.task.hit.case import HitCase
 from planner_jax.task.hit.context import HitContext, Impact, prepare_hit
 from planner_jax.task.hit.plan import HitPlan
@@ -76,7 +76,7 @@ class JuggleHit(Planner):
     This planner ignores the additional limits of a case (`extras`); the referee checks them.
     """
 
-    attempts: ClassVar[tuple[Attempt, ...]] = (Attempt(),)  # pyright: ignore[reportIncompatibleMethodOverride]
+    attempts: ClassVar[tuple[BaseAttempt, ...]] = (BaseAttempt(),)  # pyright: ignore[reportIncompatibleMethodOverride]
     case_type: ClassVar[type] = HitCase
     height: float = 1.5  # [m], height of the ball at the impact
     apex: float = 2.3  # [m], height to which the returned ball rises
@@ -88,7 +88,7 @@ class JuggleHit(Planner):
     def __post_init__(self) -> None:
         require_settings(self)
 
-    def solve(self, case: HitCase, attempt: Attempt) -> HitPlan:
+    def solve(self, case: HitCase, attempt: BaseAttempt) -> HitPlan:
         """Return the plan that leads to the predetermined hit; nothing is optimised.
 
         The plan's cost is the mean squared jerk [Yu2023bat, eq. 15].

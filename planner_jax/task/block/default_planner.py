@@ -25,7 +25,7 @@ from planner_jax.core.compiled import place_numbers, with_run_time_numbers
 from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import (
     FEASIBILITY_TOLERANCE,
-    Attempt,
+    BaseAttempt,
     Status,
     is_solved,
     require_settings,
@@ -71,7 +71,7 @@ _TURN = 5  # steps of least squares on a GPU before searches that have ended mak
 
 @with_run_time_numbers("straight", "tries", "first", "kept", "in_turn", "detours")
 @dataclasses.dataclass(frozen=True)
-class Search(Attempt):
+class Search(BaseAttempt):
     """An attempt: check some straight joint motions, then run least squares from several starts.
 
     There may be any number of starting points: 15 are stored, and further ones are drawn.

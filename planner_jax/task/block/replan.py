@@ -19,7 +19,7 @@ from planner_jax.core.arithmetic import host_leaf
 from planner_jax.core.checks import require_kind
 from planner_jax.core.paths import require_beginning
 from planner_jax.core.planner import Drive, Planner
-from planner_jax.core.protocol import Attempt, is_unsolved
+from planner_jax.core.protocol import BaseAttempt, is_unsolved
 from planner_jax.optimise.levenberg import LevenbergConfig
 from planner_jax.planning.replan import Replanning, check_elapsed, resolve_argument
 from planner_jax.robot.arm import shield_pose
@@ -34,7 +34,7 @@ _SHORTEST = 0.02  # [s] least duration of a start, for previous motions that hav
 
 
 @dataclasses.dataclass(frozen=True)
-class Warm(Attempt):
+class Warm(BaseAttempt):
     """An attempt of least squares that starts from the remainder of the previous motion."""
 
     solver: LevenbergConfig = LevenbergConfig(*(12, 1e-2, 0.25, 6.0), settled=1, tolerance=1.0)

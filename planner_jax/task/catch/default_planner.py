@@ -15,7 +15,7 @@ from jax import Array
 from planner_jax.core.protocol import FEASIBILITY_TOLERANCE
 from planner_jax.optimise.chain import ChainEnds, ChainProblem
 from planner_jax.optimise.planner import SearchPlanner, pending
-from planner_jax.optimise.settings import LbfgsConfig, Round, Stage
+from planner_jax.optimise.settings import Attempt, Attempts, LbfgsConfig, Stage
 from planner_jax.optimise.shipped import StartNetwork, load_network
 from planner_jax.robot.quadrotor import add_drag, body_z, tangent_basis
 from planner_jax.task.catch.case import CatchCase
@@ -51,14 +51,14 @@ _GUESSES = np.array(
         (1.5, 0.2, 0.2, 0.0, 0.0),
     ]
 )
-_FIRST = Round(starts=1, solver=LbfgsConfig(max_steps=8))
-_ROUNDS = (
+_FIRST = Attempt(starts=1, solver=LbfgsConfig(max_steps=8))
+_ATTEMPTS = (
     _FIRST,
-    Round(starts=1, solver=LbfgsConfig(max_steps=25)),
-    Round(starts=1, solver=LbfgsConfig(max_steps=80)),
-    Round(starts=6, solver=LbfgsConfig(max_steps=200)),
+    Attempt(starts=1, solver=LbfgsConfig(max_steps=25)),
+    Attempt(starts=1, solver=LbfgsConfig(max_steps=80)),
+    Attempt(starts=6, solver=LbfgsConfig(max_steps=200)),
 )
-_FROM_LEARNED = Round(starts=1, solver=LbfgsConfig(max_steps=2))  # from a network's starting point
+_FROM_LEARNED = Attempt(starts=1, solver=LbfgsConfig(max_steps=2))  # from a network's start
 # Settings of L-BFGS, which runs before Newton's method if there are several targets, because the
 # eight iterations for a single target would end too far from the optimum.
 _LONG_CHAIN = Stage(LbfgsConfig(max_steps=200, tolerance=1e-6, patience=5))
@@ -90,7 +90,7 @@ class CatchProblem(ChainProblem[CatchCase, CatchPlan]):
     """
 
     case_type = CatchCase
-    rounds = _ROUNDS
+    attempts = _ATTEMPTS
     package = "planner_jax.task.catch"
     num_end_variables = 12
     guess_table = _GUESSES
@@ -164,15 +164,15 @@ class CatchProblem(ChainProblem[CatchCase, CatchPlan]):
         rows = jnp.asarray(rows, context.times.dtype)
         return jax.vmap(lambda guess: self._guess(context, guess))(rows)
 
-    def starts_long(self, cases: CatchCase, rounds: tuple[Round, ...]) -> bool:
+    def starts_long(self, cases: CatchCase, attempts: Attempts) -> bool:
         """Return whether more than three targets must be caught, which needs more iterations."""
-        return rounds == _ROUNDS and cases.num_targets > _FEW and not cases.optional
+        return attempts == _ATTEMPTS and cases.num_targets > _FEW and not cases.optional
 
-    def fit_attempt(self, attempt: Round, cases: CatchCase, rounds: tuple[Round, ...]) -> Round:
-        """Return an attempt (round) with more iterations for more targets."""
-        if self.starts_long(cases, rounds) and attempt in _ROUNDS[:2]:
+    def fit_attempt(self, attempt: Attempt, cases: CatchCase, attempts: Attempts) -> Attempt:
+        """Return an attempt with more iterations for more targets."""
+        if self.starts_long(cases, attempts) and attempt in _ATTEMPTS[:2]:
             steps = _STEPS_A_TARGET * cases.num_targets if attempt == _FIRST else _OF_MANY.max_steps
-            return Round(starts=1, solver=dataclasses.replace(_OF_MANY, max_steps=steps))
+            return Attempt(starts=1, solver=dataclasses.replace(_OF_MANY, max_steps=steps))
         if attempt.stages == (Stage(_FIRST.solver),) and cases.num_targets > 1:
             # With several targets the search starts far from the optimum, where a small gain in one
             # iteration does not prove convergence: the tolerance must be smaller.

@@ -16,7 +16,7 @@ from planner_jax.ball.target import TargetPath
 from planner_jax.core.arithmetic import numpy_of, to_host
 from planner_jax.core.paths import require_path
 from planner_jax.optimise.chain_remainder import evaluate_pieces, fit_offsets
-from planner_jax.optimise.settings import LbfgsConfig, Round
+from planner_jax.optimise.settings import Attempt, LbfgsConfig
 from planner_jax.planning.replan import Replanning, check_elapsed, planned_state, resolve_argument
 from planner_jax.planning.replanner import TRIALS, Remaining
 from planner_jax.robot.quadrotor import add_drag, body_z
@@ -159,17 +159,17 @@ def keep(task: Replanning, context: CatchContext) -> CatchPlan:
     ).with_heading(task.case)
 
 
-# The first round (attempt) makes one iteration, and the next re-plan continues from its result: the
+# The first attempt makes one iteration, and the next re-plan continues from its result: the
 # real-time iteration of [Diehl2005]. One iteration usually suffices to keep all limits. After the
 # last catch the remainder is empty, and stays at the position of that catch.
 REMAINDER = Remaining(
     plan_type=CatchPlan,
     begin=begin,
     start_from=start_from,
-    rounds=(
-        Round(starts=1, solver=LbfgsConfig(max_steps=1, memory=1, trial_steps=TRIALS)),
-        Round(starts=1, solver=LbfgsConfig(max_steps=40, trial_steps=TRIALS)),
-        Round(starts=3, solver=LbfgsConfig(max_steps=80)),
+    attempts=(
+        Attempt(starts=1, solver=LbfgsConfig(max_steps=1, memory=1, trial_steps=TRIALS)),
+        Attempt(starts=1, solver=LbfgsConfig(max_steps=40, trial_steps=TRIALS)),
+        Attempt(starts=3, solver=LbfgsConfig(max_steps=80)),
     ),
     shortest=0.05,
     time_left=time_left,

@@ -15,7 +15,7 @@ import numpy as np
 from jax import Array, lax
 
 from planner_jax.core.planner import Drive, Planner
-from planner_jax.core.protocol import Attempt, Status, is_solved, is_unsolved
+from planner_jax.core.protocol import BaseAttempt, Status, is_solved, is_unsolved
 from planner_jax.robot.car import pose_at
 from planner_jax.task.group.case import CarState, InterceptGroup
 from planner_jax.task.group.plan import GroupPlan
@@ -37,7 +37,7 @@ class GroupIntercept(Planner):
     """
 
     case_type: ClassVar[type] = InterceptGroup
-    attempts: ClassVar[tuple[Attempt, ...]] = (Attempt(),)  # pyright: ignore[reportIncompatibleMethodOverride]
+    attempts: ClassVar[tuple[BaseAttempt, ...]] = (BaseAttempt(),)  # pyright: ignore[reportIncompatibleMethodOverride]
     # Planner of every leg (drive to one target), with a single search to save time.
     planner: SpacetimeIntercept = SpacetimeIntercept("early", searches=(_EARLY,))
     patient: SpacetimeIntercept = SpacetimeIntercept("least")  # for legs that `planner` fails

@@ -17,7 +17,7 @@ import numpy as np
 from jax import Array, lax
 
 from planner_jax.core.planner import Planner
-from planner_jax.core.protocol import Attempt, Status, is_solved
+from planner_jax.core.protocol import BaseAttempt, Status, is_solved
 from planner_jax.optimise.levenberg import LevenbergConfig
 from planner_jax.plane.obstacles import place
 from planner_jax.robot.car import pose_at
@@ -53,14 +53,14 @@ class DirectGroup(Planner[InterceptGroup, GroupPlan]):
 
     case_type: ClassVar[type] = InterceptGroup
     is_sequential: ClassVar[bool] = True
-    attempts: ClassVar[tuple[Attempt, ...]] = (Attempt(),)  # pyright: ignore[reportIncompatibleMethodOverride]
+    attempts: ClassVar[tuple[BaseAttempt, ...]] = (BaseAttempt(),)  # pyright: ignore[reportIncompatibleMethodOverride]
     moves: int = 3  # moves of the local search of the order after every leg; 0: the order is kept
     trials: int = 150  # greatest number of least-squares problems of a case
     movers: int = 8  # number of moving obstacles in least squares; every plan is checked with all
     turn: float = 0.3  # [rad], greatest deviation from the prescribed heading at a meeting
     early: float = 100.0  # weight of a leg's duration, divided by the time up to which it may last
 
-    def solve(self, case: InterceptGroup, attempt: Attempt, /) -> GroupPlan:
+    def solve(self, case: InterceptGroup, attempt: BaseAttempt, /) -> GroupPlan:
         """Plan one case leg by leg; if a leg has no plan, plan the leg before it again."""
         shared, num = case.shared, case.num_targets
         table, count = make_table(case), jnp.sum(case.present)

@@ -83,7 +83,7 @@ def planner(
         recovery: trajectory after the impact, which keeps all limits: "brake" ends at standstill
             wherever this costs least, "home" at the start position. None: no such trajectory.
         effort: "feasible" stops as soon as every limit holds; "good" and "best" lower the cost.
-        **options: `rounds`, the attempts, and fields of the problem's dataclass, such as `margin`.
+        **options: `attempts`, and fields of the problem's dataclass, such as `margin`.
 
     Returns:
         A planner for `pj.plan`: a `JuggleHit`, or a `SearchPlanner` of a `HitProblem` or `BatHit`

@@ -19,7 +19,7 @@ from planner_jax.ball.flight import BallState, drag_free_apex, gravity_vector, s
 from planner_jax.cost.quadrotor import Measure
 from planner_jax.optimise.chain import ChainEnds, ChainProblem
 from planner_jax.optimise.planner import SearchPlanner, pending
-from planner_jax.optimise.settings import LbfgsConfig, Round, Stage
+from planner_jax.optimise.settings import Attempt, LbfgsConfig, Stage
 from planner_jax.optimise.shipped import StartNetwork, load_network
 from planner_jax.robot.quadrotor import tangent_basis, velocity_in_air
 from planner_jax.task.hit.case import HitCase
@@ -85,19 +85,19 @@ def _smooth(steps: int, keep: int) -> Stage:
     return Stage(_hard(steps), WITH_VELOCITIES, keep, frozen=True)
 
 
-# A round is an attempt to solve the cases that are unsolved so far. The first two rounds solve easy
-# cases. Later rounds search for any plan that keeps the limits: the energy has hardly any weight.
+# An attempt takes the cases that are unsolved so far. The first two attempts solve easy
+# cases. Later attempts search for any plan that keeps the limits: the energy has hardly any weight.
 # Rounds 3 and 4 start at a point that a network predicts. Rounds 5 and 6 start at all rows of
 # `_GUESSES` after the first one. They hold the velocities at waypoints constant at first, and then
 # continue only the searches of least cost. Rounds 4 and 6 take only cases whose greatest relative
-# excess over a limit is below the round's field `within`.
-_ROUNDS = (
-    Round(1, LbfgsConfig(max_steps=3)),
-    Round(1, LbfgsConfig(max_steps=60)),
-    Round(1, _hard(150), WITH_VELOCITIES),
-    Round(1, _hard(500), _SMALL_MARGIN, (Stage(_hard(800), WITH_VELOCITIES),), within=0.1),
-    Round(12, _hard(240), WITH_VELOCITIES, (_smooth(50, keep=2),), first=1),
-    Round(
+# excess over a limit is below the attempt's field `within`.
+_ATTEMPTS = (
+    Attempt(1, LbfgsConfig(max_steps=3)),
+    Attempt(1, LbfgsConfig(max_steps=60)),
+    Attempt(1, _hard(150), WITH_VELOCITIES),
+    Attempt(1, _hard(500), _SMALL_MARGIN, (Stage(_hard(800), WITH_VELOCITIES),), within=0.1),
+    Attempt(12, _hard(240), WITH_VELOCITIES, (_smooth(50, keep=2),), first=1),
+    Attempt(
         starts=12,
         solver=_hard(300),
         settings=_SMALL_MARGIN,
@@ -133,7 +133,7 @@ class HitProblem(ChainProblem[HitCase, HitPlan]):
     """
 
     case_type = HitCase
-    rounds = _ROUNDS
+    attempts = _ATTEMPTS
     package = "planner_jax.task.hit"
     num_end_variables = 8
     guess_table = _GUESSES

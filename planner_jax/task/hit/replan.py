@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from planner_jax.ball.flight import BallState
 from planner_jax.core.checks import require_kind
 from planner_jax.core.paths import require_beginning
-from planner_jax.optimise.settings import LbfgsConfig, Round
+from planner_jax.optimise.settings import Attempt, LbfgsConfig
 from planner_jax.planning.replan import Replanning, check_elapsed, planned_state, resolve_argument
 from planner_jax.planning.replanner import TRIALS, Remaining
 from planner_jax.robot.quadrotor import add_drag, net_thrust, tangent_basis
@@ -71,8 +71,8 @@ REMAINDER = Remaining(
     plan_type=HitPlan,
     begin=begin,
     start_from=start_from,
-    rounds=(
-        Round(starts=1, solver=LbfgsConfig(max_steps=2, memory=2, trial_steps=TRIALS)),
-        Round(starts=1, solver=LbfgsConfig(max_steps=40, trial_steps=TRIALS)),
+    attempts=(
+        Attempt(starts=1, solver=LbfgsConfig(max_steps=2, memory=2, trial_steps=TRIALS)),
+        Attempt(starts=1, solver=LbfgsConfig(max_steps=40, trial_steps=TRIALS)),
     ),
 )

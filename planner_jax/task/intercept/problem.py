@@ -23,7 +23,7 @@ from jax import Array, lax
 from planner_jax.core.protocol import is_solved, select
 from planner_jax.optimise.levenberg import LevenbergConfig, LevenbergState, Model, least_squares
 from planner_jax.optimise.planner import Problem
-from planner_jax.optimise.settings import Evaluation, LbfgsConfig, Round
+from planner_jax.optimise.settings import Attempt, Evaluation, LbfgsConfig
 from planner_jax.plane.cell_paths import CellPath
 from planner_jax.plane.distance_field import DistanceField
 from planner_jax.plane.obstacles import join_obstacles
@@ -421,8 +421,8 @@ class SmoothIntercept(Problem):
     case_type: ClassVar[type] = StartedCase
     adjoint: ClassVar[str] = "whole"
     guesses_minima: ClassVar[bool] = True
-    # A single attempt (round) without steps of L-BFGS: `guesses` already returns the minimum.
-    rounds: ClassVar[tuple[Round, ...]] = (Round(solver=LbfgsConfig(max_steps=0)),)
+    # A single attempt without steps of L-BFGS: `guesses` already returns the minimum.
+    attempts: ClassVar[tuple[Attempt, ...]] = (Attempt(solver=LbfgsConfig(max_steps=0)),)
     problem: MotionProblem = MotionProblem()
     solver: LevenbergConfig = LevenbergConfig(2000, settled=12, tolerance=0.0)
 

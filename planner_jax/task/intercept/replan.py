@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from planner_jax.core.errors import ArgumentTypeError
 from planner_jax.core.paths import require_beginning, require_path
 from planner_jax.core.planner import Planner
-from planner_jax.core.protocol import Attempt
+from planner_jax.core.protocol import BaseAttempt
 from planner_jax.plane.obstacles import Obstacles, move_on
 from planner_jax.plane.target import LaterPath, PlanePath
 from planner_jax.planning.replan import Replanning, check_elapsed, resolve_argument
@@ -48,7 +48,7 @@ class ReplanIntercept(Planner[Replanning, InterceptPlan]):
     shortest: float = 0.1  # [s] least time to the meeting for which a new plan is made
 
     @property
-    def attempts(self) -> tuple[Attempt, ...]:
+    def attempts(self) -> tuple[BaseAttempt, ...]:
         """The attempts at a new plan: from the previous plan, then by one search from scratch."""
         return (self.warm, self.search)
 

@@ -16,7 +16,7 @@ from jax.core import Tracer
 
 from planner_jax.core.choices import require
 from planner_jax.core.compiled import cached_by_precision, with_run_time_numbers
-from planner_jax.core.protocol import Attempt
+from planner_jax.core.protocol import BaseAttempt
 from planner_jax.optimise.levenberg import LevenbergConfig
 from planner_jax.plane import cell_paths, reach
 from planner_jax.plane.distance_field import DistanceField, distance_field
@@ -33,7 +33,7 @@ _NODES = 2  # nodes of the grid of distances from walls for each cell, along bot
 
 
 @dataclasses.dataclass(frozen=True)
-class Search(Attempt):
+class Search(BaseAttempt):
     """An attempt to plan a case by least squares from random paths of reachable grid cells."""
 
     starts: int = dataclasses.field(init=False, default=1)
@@ -128,7 +128,7 @@ def load_search(
 
 
 @dataclasses.dataclass(frozen=True)
-class Warm(Attempt):
+class Warm(BaseAttempt):
     """Settings of re-planning, in which least squares start from the previous plan's remainder."""
 
     solver: LevenbergConfig = LevenbergConfig(8)

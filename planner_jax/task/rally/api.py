@@ -17,7 +17,7 @@ def planner(
         name: `exact`, which plans all hits together and meets every contact and place exactly, or
             the name of a planner of another package.
         effort: "feasible" stops as soon as every limit holds; "good" and "best" lower the cost.
-        **options: `rounds`, the attempts, and fields of the problem's dataclass, such as `margin`.
+        **options: `attempts`, and fields of the problem's dataclass, such as `margin`.
 
     Returns:
         A `SearchPlanner` of a `RallyProblem`, for `pj.plan` and `pj.replan`.

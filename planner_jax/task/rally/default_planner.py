@@ -22,7 +22,7 @@ from planner_jax.core.arithmetic import reciprocal
 from planner_jax.cost.quadrotor import Measure
 from planner_jax.optimise.chain import ChainEnds, ChainProblem
 from planner_jax.optimise.planner import SearchPlanner, pending
-from planner_jax.optimise.settings import Curvature, LbfgsConfig, Round
+from planner_jax.optimise.settings import Attempt, Curvature, LbfgsConfig
 from planner_jax.optimise.shipped import load_scale
 from planner_jax.robot.quadrotor import tangent_basis
 from planner_jax.task.hit.context import (
@@ -67,15 +67,15 @@ _ANY_FEASIBLE = (
     ("margin", 0.02),
 )
 _HARD = LbfgsConfig(max_steps=200, memory=12, tolerance=1e-6, patience=5)
-# A round is an attempt to solve the cases that are unsolved so far.
-ROUNDS = (
-    Round(1, LbfgsConfig(max_steps=12)),
-    Round(1, LbfgsConfig(max_steps=60)),
-    Round(1, _HARD, _ANY_FEASIBLE),
-    Round(5, _HARD, _ANY_FEASIBLE, first=1),
+# An attempt takes the cases that are unsolved so far.
+ATTEMPTS = (
+    Attempt(1, LbfgsConfig(max_steps=12)),
+    Attempt(1, LbfgsConfig(max_steps=60)),
+    Attempt(1, _HARD, _ANY_FEASIBLE),
+    Attempt(5, _HARD, _ANY_FEASIBLE, first=1),
 )
-# The first round in the measured metric. A re-plan, whose start is no guess, uses `ROUNDS[0]`.
-_SHORT = Round(1, LbfgsConfig(max_steps=5))
+# The first attempt in the measured metric. A re-plan, whose start is no guess, uses `ATTEMPTS[0]`.
+_SHORT = Attempt(1, LbfgsConfig(max_steps=5))
 
 
 @struct.dataclass
@@ -110,7 +110,7 @@ class RallyProblem(ChainProblem[RallyCase, RallyPlan]):
     """
 
     case_type = RallyCase
-    rounds = ROUNDS
+    attempts = ATTEMPTS
     package = "planner_jax.task.rally"
     num_end_variables = 11
     guess_table = _GUESSES
@@ -167,13 +167,13 @@ class RallyProblem(ChainProblem[RallyCase, RallyPlan]):
 
     def fit_attempt(
         self,
-        attempt: Round,
+        attempt: Attempt,
         cases: RallyCase,
-        rounds: tuple[Round, ...],  # noqa: ARG002
-    ) -> Round:
-        """Return an attempt (round), with fewer iterations if there is a metric."""
+        attempts: tuple[Attempt, ...],  # noqa: ARG002
+    ) -> Attempt:
+        """Return an attempt, with fewer iterations if there is a metric."""
         size = cases.places.shape[-2] * len(self.scale)
-        is_short = attempt == ROUNDS[0] and self._metric(size) is not None
+        is_short = attempt == ATTEMPTS[0] and self._metric(size) is not None
         return _SHORT if is_short else attempt
 
     def curvature_at(self, point: Array, context: RallyContext) -> Curvature:

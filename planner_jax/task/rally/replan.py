@@ -122,5 +122,5 @@ def count_done(plan: RallyPlan, elapsed: Array | np.ndarray):
 
 
 REMAINDER = Remaining(
-    plan_type=RallyPlan, begin=begin, start_from=start_from, rounds=RallyProblem.rounds
+    plan_type=RallyPlan, begin=begin, start_from=start_from, attempts=RallyProblem.attempts
 )

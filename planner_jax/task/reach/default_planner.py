@@ -18,7 +18,7 @@ from planner_jax.core.compiled import place_numbers, with_run_time_numbers
 from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import (
     FEASIBILITY_TOLERANCE,
-    Attempt,
+    BaseAttempt,
     Plan,
     Status,
     is_solved,
@@ -49,7 +49,7 @@ class ReachPlan(ArmPlan):
 
 
 @dataclasses.dataclass(frozen=True)
-class Search(Attempt):
+class Search(BaseAttempt):
     """An attempt: check the fastest and the straight motion to each goal."""
 
     def is_due(self, plans: Plan) -> Array:

@@ -97,7 +97,7 @@ def hasten(
     start: Array,
     knots: tuple[Array, Array],
     limits: ArmLimits,
-    rounds: Array | int,
+    attempts: Array | int,
     seed: Array | int,
 ) -> tuple[Array, Array]:
     """Return a faster motion from the same start to the same end, after a number of shortcuts.
@@ -108,7 +108,7 @@ def hasten(
         knots: durations (M,) [s] of the pieces, where pieces without duration are last, and rates
             (M + 1, n) [rad/s] at the ends of the pieces.
         limits: greatest rates and accelerations.
-        rounds: number of shortcuts that are tried.
+        attempts: number of shortcuts that are tried.
         seed: of the random times.
     """
     slots = knots[1].shape[0]
@@ -146,7 +146,7 @@ def hasten(
         return k + 1, jnp.where(is_good, 0, failures + 1), knots
 
     def is_open(state: tuple[Array, Array, tuple[Array, Array]]) -> Array:
-        return (state[0] < rounds) & (state[1] < _PATIENCE)
+        return (state[0] < attempts) & (state[1] < _PATIENCE)
 
     none = jnp.zeros((), jnp.int32)
     return drop_knots(*lax.while_loop(is_open, cut, (none, none, knots))[2])

@@ -150,7 +150,7 @@ def find_path(
 
 
 def shorten(
-    is_free: Callable[[Array], Array], points: Array, rounds: int, seed: Array | int
+    is_free: Callable[[Array], Array], points: Array, attempts: int, seed: Array | int
 ) -> Array:
     """Shorten a free path (N, n) [rad] by straight lines between random points of the path.
 
@@ -184,4 +184,4 @@ def shorten(
             inside[:, None], jnp.where((position <= middle)[:, None], a[None], b[None]), points
         )
 
-    return lax.fori_loop(0, rounds, cut, points)
+    return lax.fori_loop(0, attempts, cut, points)

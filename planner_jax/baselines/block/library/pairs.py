@@ -23,7 +23,7 @@ from planner_jax.core import GRAVITY
 from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import (
     FEASIBILITY_TOLERANCE,
-    Attempt,
+    BaseAttempt,
     Plan,
     Status,
     is_solved,
@@ -232,11 +232,11 @@ class StraightPair(PairPlanner):
     """
 
     @property
-    def attempts(self) -> tuple[Attempt, ...]:
+    def attempts(self) -> tuple[BaseAttempt, ...]:
         """The only attempt, which checks all straight motions in turn."""
-        return (Attempt(),)
+        return (BaseAttempt(),)
 
-    def solve(self, pair: PairCase, attempt: Attempt) -> PairPlan:
+    def solve(self, pair: PairCase, attempt: BaseAttempt) -> PairPlan:
         """Return the plan of a pair of cells: the best straight motion that keeps all limits."""
         poses = self.poses(pair)
         order = jnp.argsort(poses.effort)
@@ -279,7 +279,7 @@ def _entry(effort: Array) -> Array:
 
 
 @dataclasses.dataclass(frozen=True)
-class Bends(Attempt):
+class Bends(BaseAttempt):
     """Settings of a bisection of the ball's entry time; least squares plans for each time."""
 
     rounds: int = 4

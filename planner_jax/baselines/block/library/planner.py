@@ -20,7 +20,7 @@ from planner_jax.baselines.block.library.table import (
 )
 from planner_jax.core.choices import require
 from planner_jax.core.planner import Planner
-from planner_jax.core.protocol import FEASIBILITY_TOLERANCE, Attempt, Status, status_of
+from planner_jax.core.protocol import FEASIBILITY_TOLERANCE, BaseAttempt, Status, status_of
 from planner_jax.robot.arm import product, shield_sides
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.motion import polynomial
@@ -51,9 +51,9 @@ class LibraryBlock(Planner):
     case_type: ClassVar[type] = BlockCase
 
     @property
-    def attempts(self) -> tuple[Attempt, ...]:
+    def attempts(self) -> tuple[BaseAttempt, ...]:
         """The only attempt, since a second lookup would find the same motion."""
-        return (Attempt(),)
+        return (BaseAttempt(),)
 
     def check(self, cases: BlockCase) -> None:
         """Raise `ArgumentError` unless arm, limits, scene and start of case 0 fit the library.
@@ -73,7 +73,7 @@ class LibraryBlock(Planner):
         rule, shown = f"a home of the library to {_SAME_START} rad", f"{off:.3g} rad off"
         require(bool(off <= _SAME_START), "angles", rule, shown=shown)
 
-    def solve(self, case: BlockCase, attempt: Attempt) -> BlockPlan:
+    def solve(self, case: BlockCase, attempt: BaseAttempt) -> BlockPlan:
         """Return the plan of one case, with the motion stored for its ball."""
         home, fits = self.home_of(case)
         plan = _plan_from_answer(self.library.table, case, home)
