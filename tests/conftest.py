@@ -101,7 +101,7 @@ SLOW = (
     *("b_spline", "baselines", "bezier", "block_library", "block_peers"),
     *("catch_peer", "hybrid_astar", "minimum_jerk", "mpp", "paper_catch", "path_smoothing"),
     *("path_then_speed", "qp", "speed", "station_time"),
-    *("block_eye", "block_receding", "catch_replan", "sims_camera", "trip_peers"),
+    *("block_eye", "block_receding", "catch_replan", "trip_peers"),
     *("policy", "training", "learned_start"),
     *("cluster", "devices", "gpu", "wheel"),
     *("bench", "benchmark_ipopt", "intercept_gradient", "intercept_oracle"),

@@ -1,4 +1,3 @@
-import csv
 import dataclasses
 import importlib
 import json
@@ -13,8 +12,6 @@ from flax import struct
 
 import planner_jax as pj
 from planner_jax import benchmarks
-from planner_jax.benchmarks.block_home import from_home
-from planner_jax.benchmarks.block_rows import METHODS, ROWS
 from planner_jax.benchmarks.cost_gap import cost_gaps, gap_figures
 from planner_jax.benchmarks.first_plan import ROWS as FIRST_PLANS
 from planner_jax.benchmarks.first_plan import plan_in_new_process
@@ -66,35 +63,6 @@ def test_a_robot_of_rotorpy_has_the_thrusts_of_its_plan_and_turns_to_the_feedbac
     sine = np.cross(up, force)[1] / np.linalg.norm(force)  # of the turn about y to the force
     expected = [0.5 * force @ up, 0.009, 0.004 * (4.0 + 300.0 * sine), 0.03]
     np.testing.assert_allclose(low, expected, rtol=1e-9)
-
-
-def test_the_throws_that_are_kept_are_those_of_the_seed():
-    path = Path(benchmarks.__path__[0]) / "block_throws.csv"
-    lines = path.read_text().splitlines()
-    heads = [line for line in lines if line.startswith("#")]
-    table = list(csv.DictReader(lines[len(heads) :]))
-    for head in heads:
-        suite, _, names = head.lstrip("# ").partition(": a digit each for ")
-        rows = [row for row in table if row["suite"] == suite]
-        assert len(rows) == 2000 and set(names.split(", ")) <= set(ROWS)
-        balls = pj.block.draw(2, suite, 7).ball
-        kept = [[float(row[f"{axis} [m]"]) for axis in "xyz"] for row in rows[:2]]
-        np.testing.assert_allclose(kept, balls.pos, rtol=1e-5)
-        digits = {name: [list(row[name]) for row in rows] for name in METHODS}
-        marks = {name: np.array(each) == "1" for name, each in digits.items()}
-        assert marks["union"].shape == (2000, len(names.split(", ")))
-        known = marks["straight"] | marks["planner"]
-        np.testing.assert_array_equal(marks["union"], known | marks["long"])
-        assert not (marks["long"] & known).any()
-        assert (marks["planner"].sum(axis=0) >= 0.96 * marks["union"].sum(axis=0)).all()
-
-
-def test_every_throw_is_repeated_for_every_home():
-    cases, homes = pj.block.draw(2), np.linspace(0.1, 0.3, 3)[:, None] * np.ones(6)
-    many = from_home(cases, homes)
-    assert many.batch_shape == (6,)
-    np.testing.assert_array_equal(many.ball.pos, np.tile(cases.ball.pos, (3, 1)))
-    np.testing.assert_allclose(many.angles[:, 0], [0.1, 0.1, 0.2, 0.2, 0.3, 0.3], rtol=1e-6)
 
 
 def read(folder, name="manifest.json"):

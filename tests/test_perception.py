@@ -1,6 +1,4 @@
-"""Observation of balls: camera, stereo noise, colour masks, fitted paths, hand-eye calibration."""
-
-import colorsys
+"""Observation of balls: camera, stereo noise and fitted paths."""
 
 import jax
 import jax.numpy as jnp
@@ -10,8 +8,6 @@ from scipy.spatial.transform import Rotation
 
 from planner_jax.ball.estimation import EkfModel, ekf_init, ekf_predict, ekf_update
 from planner_jax.ball.flight import BallState, drag_free_flight
-from planner_jax.benchmarks.rendered_balls import segment
-from planner_jax.benchmarks.rendered_balls.calibrate import calibrate, hand_eye, pose, rigid_motion
 from planner_jax.sims.perception import flight_fit
 from planner_jax.sims.perception.camera import back_project, in_view, looking_at, project
 from planner_jax.sims.perception.noise import IsotropicNoise, information, sightings, stereo_noise
@@ -29,7 +25,6 @@ paths = jax.jit(jax.vmap(drag_free_flight, (None, 0, None)))
 fit_one = jax.jit(flight_fit.fit_flight)
 fit_many = jax.jit(jax.vmap(flight_fit.fit_flight, (0, 0, 0, None)))
 believed = jax.jit(flight_fit.belief_at)
-sighting_one = jax.jit(segment.sighting)
 
 
 @jax.jit
@@ -220,145 +215,3 @@ def test_what_is_lost_or_out_of_view_is_not_seen():
     assert lost.mean() == pytest.approx(0.3, abs=0.04)
     behind = inside * jnp.array([[-1.0, 1.0, 1.0]])
     assert np.isnan(see(key, CAMERA, stereo_noise(), behind)).all()
-
-
-def test_hue_saturation_and_value_are_those_of_the_standard_library():
-    rng = np.random.default_rng(0)
-    greys, pure = np.repeat([[0], [7], [255]], 3, 1), np.eye(3) * 255
-    colours = np.concatenate([rng.integers(0, 256, (300, 3)), greys, pure]).astype(np.float32) / 255
-    found = jax.jit(segment.hue_saturation_value)(colours)
-    expected = [colorsys.rgb_to_hsv(*map(float, colour)) for colour in colours]
-    np.testing.assert_allclose(found, expected, atol=1e-5)
-
-
-@pytest.mark.parametrize("hues", [(0.02, 0.13), (0.9, 0.1)])
-def test_the_mask_compares_hue_saturation_and_value(hues):
-    rng = np.random.default_rng(1)
-    image = rng.integers(0, 256, (40, 50, 3)).astype(np.uint8)
-    look = segment.ball_thresholds((hues[0], 0.4, 0.3), (hues[1], 0.9, 0.95))
-    hsv = np.asarray(segment.hue_saturation_value(image.astype(np.float32) / 255.0), float)
-    edges = np.stack([look.lower, look.upper])
-    near = (np.abs(hsv[:, :, None] - edges) < 1e-5).any(axis=(2, 3))  # rounding decides there
-    combine = np.logical_or if hues[0] > hues[1] else np.logical_and
-    hue = combine(hsv[..., 0] >= hues[0], hsv[..., 0] <= hues[1])
-    others = [(hsv[..., k] >= look.lower[k]) & (hsv[..., k] <= look.upper[k]) for k in (1, 2)]
-    expected = hue & others[0] & others[1]
-    found = np.asarray(segment.colour_mask(image, look))
-    np.testing.assert_array_equal(found[~near], expected[~near])
-    assert 20 < expected.sum() < 1000
-
-
-def ball_frame(place, radius=0.05):
-    """Render image and depth of an orange ball at a position (3,) [m] before a grey wall."""
-    column, row = np.meshgrid(*(np.arange(size) for size in CAMERA.size))
-    across = (np.stack([column, row], axis=-1) - CAMERA.centre[None, None]) / CAMERA.focal
-    ray = np.concatenate([across, np.ones((*across.shape[:2], 1))], axis=-1)
-    ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
-    middle = np.asarray(CAMERA.rotation).T @ (place - np.asarray(CAMERA.position))
-    along = ray @ middle
-    gap = radius**2 - (middle @ middle - along**2)
-    hit = gap > 0.0
-    distance = along - np.sqrt(np.where(hit, gap, 0.0))
-    depth = np.where(hit, distance * ray[..., 2], 13.0).astype(np.float32)
-    image = np.full((*depth.shape, 3), 128, np.uint8)
-    image[hit] = (240, 110, 10)
-    return image, depth
-
-
-@pytest.mark.parametrize("place", [(1.5, 0.4, 1.2), (4.0, 1.0, 1.5), (3.0, -2.0, 2.0)])
-def test_a_ball_is_seen_where_it_is(place):
-    image, depth = ball_frame(np.array(place))
-    found = sighting_one(image, depth, np.ones_like(depth), CAMERA, segment.ball_thresholds())
-    pixel, distance = project(CAMERA, jnp.array(place))
-    np.testing.assert_allclose(found.pixel, pixel, atol=0.35)
-    assert found.depth == pytest.approx(float(distance), abs=0.02)
-
-
-def test_pixels_of_little_confidence_or_another_depth_are_dropped():
-    place = np.array([2.0, 0.3, 1.3])
-    image, depth = ball_frame(place)
-    clean = sighting_one(image, depth, np.ones_like(depth), CAMERA, segment.ball_thresholds())
-    ball = np.argwhere(depth < 12.0)
-    wrong = ball[:: len(ball) // 6]
-    spoiled, trust = depth.copy(), np.ones_like(depth)
-    spoiled[tuple(wrong[::2].T)] *= 1.8  # confident, but elsewhere
-    spoiled[tuple(wrong[1::2].T)] *= 1.02
-    trust[tuple(wrong[1::2].T)] = 0.1
-    image[:3, :2] = image[tuple(ball[0])]  # as if something far away had the colour
-    found = sighting_one(image, spoiled, trust, CAMERA, segment.ball_thresholds())
-    assert found.pixels == clean.pixels - len(wrong)
-    np.testing.assert_allclose(found.place, clean.place, atol=0.02)
-
-
-def test_a_frame_without_the_ball_shows_nothing():
-    image, depth = ball_frame(np.array([2.0, 0.3, 1.3]))
-    trust, grey, unknown = np.ones_like(depth), np.full_like(image, 90), np.full_like(depth, np.nan)
-    frames = [(grey, depth, trust), (image, unknown, trust), (image, depth, 0.0 * trust)]
-    for frame in (*frames, (image, 20.0 * depth, trust)):
-        found = sighting_one(*frame, CAMERA, segment.ball_thresholds())
-        assert found.pixels == 0 and np.isnan(found.place).all() and np.isnan(found.depth)
-
-
-def test_noisy_depth_images_have_the_noise_that_is_asked_for():
-    noise = stereo_noise(disparity_std=0.0, speckle_std=0.05, mismatch=0.02, dropout=0.1)
-    depth = jnp.full((192, 320), 3.0)
-    found, trust = jax.jit(segment.noisy_depth)(jax.random.key(0), CAMERA, noise, depth)
-    assert np.isnan(found).mean() == pytest.approx(0.1, abs=0.01)
-    believed_in = np.asarray(found)[(np.asarray(trust) > 0.6) & np.isfinite(found)]
-    expected = 9.0 * 0.05 / (CAMERA.focal * 0.12)
-    assert believed_in.std() == pytest.approx(float(expected), rel=0.05)
-    common = stereo_noise(speckle_std=0.0, mismatch=0.0, dropout=0.0)
-    found, _ = jax.jit(segment.noisy_depth)(jax.random.key(0), CAMERA, common, depth)
-    assert found.std() < 1e-5 and abs(found[0, 0] - 3.0) > 1e-3
-
-
-def views(rng, std, num=12):
-    facing = Rotation.from_matrix(np.asarray(CAMERA.rotation, float)).as_matrix()
-    camera = pose(facing, np.asarray(CAMERA.position, float))
-    board = pose(Rotation.from_rotvec([0.2, -0.4, 1.0]).as_matrix(), np.array([0.02, 0.05, 0.1]))
-    turns = Rotation.from_rotvec(rng.uniform(-0.8, 0.8, (num, 3))).as_matrix()
-    places = rng.uniform([0.4, -0.5, 0.5], [1.2, 0.5, 1.2], (num, 3))
-    flange = pose(turns, places)
-    grid = np.arange(4) * 0.08
-    points = np.stack([*np.meshgrid(grid, grid), np.zeros((4, 4))], axis=-1).reshape(-1, 3)
-    to_camera = np.linalg.inv(camera) @ flange @ board
-    where = points @ np.swapaxes(to_camera[:, :3, :3], 1, 2) + to_camera[:, None, :3, 3]
-    return camera, board, flange, points, where + std * rng.normal(size=where.shape)
-
-
-def test_calibration_finds_camera_and_board_exactly():
-    camera, board, flange, points, where = views(np.random.default_rng(0), 0.0)
-    found = calibrate(flange, points, where)
-    np.testing.assert_allclose(found.camera, camera, atol=1e-9)
-    np.testing.assert_allclose(found.board, board, atol=1e-9)
-    boards = np.stack([rigid_motion(points, each) for each in where])
-    np.testing.assert_allclose(hand_eye(flange, boards), camera, atol=1e-9)
-
-
-def test_refinement_is_nearer_than_the_closed_form_and_knows_its_noise():
-    rng = np.random.default_rng(1)
-    std = np.array([0.001, 0.001, 0.006])  # [m], along the camera's axes
-    off = []
-    for _ in range(10):
-        camera, _, flange, points, where = views(rng, std)
-        found = calibrate(flange, points, where, std)
-        closed = hand_eye(flange, np.stack([rigid_motion(points, each) for each in where]))
-        turns = [each[:3, :3].T @ camera[:3, :3] for each in (found.camera, closed)]
-        moved = [np.linalg.norm((each - camera)[:3, 3]) for each in (found.camera, closed)]
-        off.append([Rotation.from_matrix(turns).magnitude(), moved])
-        assert found.residual == pytest.approx(1.0, abs=0.15)
-    (turned, moved) = np.median(off, axis=0)
-    assert turned[0] < 0.5 * turned[1] and moved[0] < 0.5 * moved[1]
-    assert turned[0] < 2e-3 and moved[0] < 2e-3
-
-
-def test_too_little_to_calibrate_from_is_refused_in_a_line():
-    camera, _, flange, points, where = views(np.random.default_rng(2), 0.0)
-    with pytest.raises(ValueError, match="turn about different axes, got 2"):
-        calibrate(flange[:2], points, where[:2])
-    with pytest.raises(ValueError, match="must not lie on one line"):
-        rigid_motion(points[:4], where[0, :4])
-    turns = Rotation.from_rotvec(np.outer(np.linspace(0.0, 1.0, 8), [0.0, 0.0, 1.0])).as_matrix()
-    about_z = pose(turns, np.zeros((8, 3)))
-    with pytest.raises(ValueError, match="turn about different axes, got 8"):
-        hand_eye(about_z, np.linalg.inv(camera) @ about_z)

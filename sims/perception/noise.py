@@ -30,11 +30,7 @@ class StereoNoise:
     baseline: Array  # () [m], distance between the two lenses
     pixel_std: Array  # () [px], standard deviation of the ball's centre along each image axis
     disparity_std: Array  # () [px], standard deviation of the disparity, averaged over the ball
-    speckle_std: Array  # () [px], additional standard deviation of the disparity of one pixel
-    # () Probability that a pixel of a depth image has no depth. Where no images are rendered
-    # (`sightings`), it is the probability that the ball has no depth in a frame.
-    dropout: Array
-    mismatch: Array  # () probability that a pixel has the depth of another object
+    dropout: Array  # () probability that the ball has no depth in a frame
 
 
 @struct.dataclass
@@ -52,9 +48,7 @@ def stereo_noise(
     baseline: float = 0.12,
     pixel_std: float = 0.1,
     disparity_std: float = 0.1,
-    speckle_std: float = 0.2,
     dropout: float = 0.05,
-    mismatch: float = 0.05,
 ) -> StereoNoise:
     """Create the error parameters of a stereo camera, with NumPy float32 leaves.
 
@@ -63,9 +57,7 @@ def stereo_noise(
             camera of [Natarajan2024]. Most other defaults are assumptions.
         pixel_std: [px], standard deviation of the ball's centre along each image axis.
         disparity_std: [px], standard deviation of the disparity, averaged over the ball.
-        speckle_std: [px], further standard deviation of one pixel's disparity; usually 0.2 px.
-        dropout: probability that a pixel, or a ball in a frame, has no depth.
-        mismatch: probability that a pixel has the depth of another object.
+        dropout: probability that the ball has no depth in a frame.
 
     Raises:
         ArgumentError: a number is out of its range.
@@ -74,8 +66,7 @@ def stereo_noise(
     for name, value in given.items():
         require(bool(value >= 0.0), name, ">= 0", value)
     require(bool(baseline > 0.0), "baseline", "> 0", baseline)
-    for name in ("dropout", "mismatch"):
-        require(bool(given[name] < 1.0), name, "< 1", given[name])
+    require(bool(dropout < 1.0), "dropout", "< 1", dropout)
     return from_numbers(StereoNoise, **given)
 
 
