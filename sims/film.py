@@ -54,8 +54,6 @@ class Scene:
         task: FlightTask,
         recording: Recording,
         flight: int,
-        title: str | None = None,
-        view: tuple[float, float] | None = None,
     ):
         """Draw all parts that do not move.
 
@@ -64,8 +62,6 @@ class Scene:
             task: the task of the run.
             recording: the recorded flights of the run.
             flight: index of the flight in the recording.
-            title: title of the picture; by default the title that the task composes.
-            view: elevation and azimuth of the view [degree]; by default the task's view.
         """
         world = task.world()
         self.world, self.recording, self.flight = world, recording, flight
@@ -119,7 +115,7 @@ class Scene:
             balls = self._within(low, high)
         self.axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
         self.axes.set_box_aspect(high - low, zoom=1.15)
-        title = title or task.title(recording, flight)
+        title = task.title(recording, flight)
         self.axes.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]", title=title)
         ticks = np.ceil(5.0 * (high - low) / (high - low).max()).astype(int)
         for axis, most in zip(
@@ -140,7 +136,7 @@ class Scene:
         for part in solid:
             if part.opacity < 1.0:
                 self._add_solid(part_solid(part), part.colour, part.opacity)
-        self.axes.view_init(*(view or task.VIEW))
+        self.axes.view_init(*task.VIEW)
         figure.legend(loc="upper left", fontsize=9, frameon=False)
 
     def _within(self, low: np.ndarray, high: np.ndarray) -> np.ndarray:
@@ -252,15 +248,7 @@ class Scene:
             line.set_data_3d(*self.recording.expected[self.flight, at].T)
 
 
-def draw_flight(
-    path: Path,
-    task: FlightTask,
-    recording: Recording,
-    flight: int,
-    *,
-    title: str | None = None,
-    view: tuple[float, float] | None = None,
-) -> None:
+def draw_flight(path: Path, task: FlightTask, recording: Recording, flight: int) -> None:
     """Write a picture of one flight, in which robot and balls also appear at earlier times.
 
     Args:
@@ -268,12 +256,10 @@ def draw_flight(
         task: the task of the run.
         recording: the recorded flights of the run.
         flight: index of the flight in the recording.
-        title: title of the picture; by default the title that the task composes.
-        view: elevation and azimuth of the view [degree]; by default the task's view.
     """
     figure = Figure(figsize=(7.6, 6.0))
     FigureCanvasAgg(figure)
-    scene = Scene(figure, task, recording, flight, title, view)
+    scene = Scene(figure, task, recording, flight)
     figure.subplots_adjust(left=0.0, right=0.96, bottom=0.04, top=0.95)
     scene.ghosts(scene.find_last_contact())
     scene.show(scene.find_last_contact(), scene.num_samples - 1)
