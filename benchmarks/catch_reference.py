@@ -14,9 +14,7 @@ the C++ program, and `exact`, the default. It prints
 * for `catch`, the cost at the initial guess and at the optimum, relative to the published costs;
 * for `exact`, the mean catching time, and the success rate by the referee, an independent check in
   float64;
-* the speed of both planners, one throw at a time and in a batch;
-* the speed of this project's own C++ program (`benchmarks.catch_peer`), which is faster than the
-  published program.
+* the speed of both planners in a batch, and of `exact` one throw at a time.
 
 The run's summary has the success and cost of `exact`. Run this benchmark on an idle machine. The
 command `taskset -c 0` binds it to one core.
@@ -25,7 +23,6 @@ command `taskset -c 0` binds it to one core.
 import csv
 import dataclasses
 import os
-import tempfile
 import time
 from pathlib import Path
 
@@ -35,7 +32,6 @@ import numpy as np
 
 import planner_jax as pj
 from planner_jax.baselines.catch.paper import COST_UNIT, PaperCatch
-from planner_jax.benchmarks.catch_peer import peer
 from planner_jax.benchmarks.cost_gap import cost_gaps, gap_figures
 from planner_jax.benchmarks.run import Bench, argument_parser, begin
 from planner_jax.optimise.settings import Attempt, Stage
@@ -183,22 +179,6 @@ def report_set(bench: Bench, data: Path, name: str, repeats: int) -> None:
     bench.row(set=name, num=success.size, success=success.mean(), **gap_figures(gaps))
 
 
-def report_peer(bench: Bench, data: Path) -> None:
-    """Print speed and cost of this project's C++ program on both published sets of throws.
-
-    The sets "paper" (easy) and "hard" are files in the folder `data`.
-    """
-    with tempfile.TemporaryDirectory(prefix="catch-peer-") as folder:
-        program = peer.build(Path(folder))
-        if program is None:
-            bench.say(peer.NO_COMPILER)
-            return
-        for name in SETS:
-            for search, settings in peer.SEARCHES.items():
-                found = peer.measure(program, data / f"catch_{name}.csv", settings)
-                bench.say(f"{name}: {search}: {found}")
-
-
 def main() -> None:
     parser = argument_parser("catch_reference", __doc__, repeats=5)
     parser.add_argument("--data", type=Path, default=Path("tests/data"), help="folder of the sets")
@@ -210,7 +190,6 @@ def main() -> None:
         report_paper_planner(bench, options.data)
         for name in SETS:
             report_set(bench, options.data, name, options.repeats)
-        report_peer(bench, options.data)
 
 
 if __name__ == "__main__":

@@ -99,7 +99,7 @@ def finished(request, tmp_path_factory):
 # clusters, devices, wheels and benchmarks, which only `make test-slow` runs, or the mark `gpu`.
 SLOW = (
     *("b_spline", "baselines", "bezier", "block_library", "block_peers"),
-    *("catch_peer", "hybrid_astar", "minimum_jerk", "mpp", "paper_catch", "path_smoothing"),
+    *("hybrid_astar", "minimum_jerk", "mpp", "paper_catch", "path_smoothing"),
     *("path_then_speed", "qp", "speed", "station_time"),
     *("block_eye", "block_receding", "catch_replan", "trip_peers"),
     *("policy", "training", "learned_start"),
