@@ -59,41 +59,17 @@ class Scene:
 
 
 @dataclasses.dataclass(frozen=True)
-class Rules:
-    """Settings of a lattice: how turns are rounded, and which discs replace the car's body."""
-
-    # Number of discs that replace the car's body. 1: one disc inside of the body, whose radius is
-    # half the body's width. 2: two discs that cover the body.
-    discs: int
-    # A car's heading is one of 64. Its greatest change in a time step is a fractional number of
-    # headings. True: this number is rounded up. False: fractions add up over time steps until they
-    # permit a whole heading.
-    turns_up: bool
-
-
-MINIMAL = Rules(discs=1, turns_up=True)
-STRICT = Rules(discs=2, turns_up=False)
-
-
-@dataclasses.dataclass(frozen=True)
 class Reach:
     """Result of a search on the grid of states: whether and when a car can meet the target."""
 
     at_end: bool  # whether the target can be met at the time that the case prescribes
     earliest: float  # [s], time of the first layer at which the target can be met, or infinity
-    # Path to the earliest meeting, (2 n + 1, 5), if it was requested and exists, else None: time,
-    # x, y, heading and speed after each half of n time steps, in SI units.
-    path: np.ndarray | None
 
 
-def footprint(scene: Scene, rules: Rules) -> tuple[list[float], float]:
-    """Return the discs that replace the body: distances ahead of the rear axle, and radius [m]."""
-    half = 0.5 * scene.width
-    if rules.discs == 1:
-        return [scene.middle], half
-    part = 0.5 * scene.length / rules.discs
-    ahead = part * (2 * np.arange(rules.discs) + 1 - rules.discs)
-    return (scene.middle + ahead).tolist(), float(np.hypot(part, half))
+def footprint(scene: Scene) -> tuple[list[float], float]:
+    """Return two discs that cover the body: distances ahead of the rear axle, and radius [m]."""
+    part = 0.25 * scene.length
+    return [scene.middle - part, scene.middle + part], float(np.hypot(part, 0.5 * scene.width))
 
 
 def near(x: np.ndarray, y: np.ndarray, corners: np.ndarray, radius: float) -> np.ndarray:
@@ -126,16 +102,17 @@ def _round(value: np.ndarray) -> np.ndarray:
 class Lattice:
     """Search of all states (position, heading and speed) that a car can reach in one scene.
 
-    `rules` states how turns are rounded, and which discs replace the car's body. Methods represent
-    a set of cells as an integer, with one bit for each cell.
+    Two discs that cover the car's body replace it. Its heading changes by a fractional number of
+    headings in a time step; fractions add up until they permit a whole heading. Methods represent a
+    set of cells as an integer, with one bit for each cell.
     """
 
-    def __init__(self, scene: Scene, rules: Rules):
+    def __init__(self, scene: Scene):
         if not np.isfinite([*scene.lower, *scene.upper, scene.speed, scene.acceleration]).all():
             raise ValueError("the map, the speed and the acceleration must be finite")
-        self.scene, self.rules = scene, rules
+        self.scene = scene
         self.layers = len(scene.target) - 1
-        self.ahead, self.radius = footprint(scene, rules)
+        self.ahead, self.radius = footprint(scene)
         angle = scene.start[2] + 2.0 * np.pi * np.arange(HEADINGS) / HEADINGS
         self.direction = np.stack([np.cos(angle), np.sin(angle)], axis=1)  # (HEADINGS, 2)
         self._lay_grid()
@@ -227,10 +204,7 @@ class Lattice:
         )
         turn = rate * scene.dt * HEADINGS / (2.0 * np.pi)
         added = np.floor(turn * np.arange(self.layers + 1)[:, None] + 1e-6)
-        turns = np.diff(added, axis=0)
-        if self.rules.turns_up:
-            turns = np.broadcast_to(np.ceil(turn - 0.1), turns.shape)
-        return levels, shifts, turns.astype(int).tolist()
+        return levels, shifts, np.diff(added, axis=0).astype(int).tolist()
 
     def _place_movers(self) -> list:
         scene, num = self.scene, 2 * self.layers + 1
@@ -312,73 +286,19 @@ class Lattice:
             for row, shifts in zip(planes, self.shifts[half], strict=True)
         ]
 
-    def meets(self, planes: list[list[int]], layer: int) -> list[tuple[int, int, int]]:
-        """Return reached states that meet the target after `layer` time steps.
-
-        A state is (bit of the cell, index of the speed level, index of the heading). At most one
-        state is returned for each speed level and heading.
-        """
+    def meets(self, planes: list[list[int]], layer: int) -> bool:
+        """Return whether a reached state meets the target after `layer` time steps."""
         goal = self.goal(layer)
-        found = [
-            (plane & goal[heading], level, heading)
-            for level, row in enumerate(planes)
-            for heading, plane in enumerate(row)
-        ]
-        return [(bits.bit_length() - 1, level, h) for bits, level, h in found if bits]
+        return any(plane & goal[heading] for row in planes for heading, plane in enumerate(row))
 
-    def reach(self, keep_path: bool = False) -> Reach:
-        """Search for meetings with the target at all time steps.
-
-        With `keep_path` the result has the path to the earliest meeting, too.
-        """
-        earliest, at_end, kept, path = np.inf, False, [], None
+    def reach(self) -> Reach:
+        """Search for meetings with the target at all time steps."""
+        earliest, at_end = np.inf, False
         for layer, planes in enumerate(self.sets()):
-            if keep_path and path is None:
-                kept.append(planes)
-            found = self.meets(planes, layer) if layer else []
-            at_end = bool(found)
-            if found and np.isinf(earliest):
-                earliest = layer * self.scene.dt
-                path = self._trace_back(kept, found[0]) if keep_path else None
-        return Reach(at_end=at_end, earliest=earliest, path=path)
-
-    def _trace_back(self, kept: list, state: tuple[int, int, int]) -> np.ndarray:
-        """Return a path to a state, found backwards through the reached cells of n time steps.
-
-        `kept` has the reached cells after each time step, an item of `sets` each. A state is (bit
-        of the cell, index of the speed level, index of the heading). The rows of the path, (2 n +
-        1, 5), have time, x, y, heading and speed in SI units, after each half of a time step.
-        """
-        rows = [self._row(2 * len(kept) - 2, state)]
-        for layer in range(len(kept) - 2, -1, -1):
-            bit, level, heading = state
-            bit -= self.shifts[2 * layer + 1][level][heading]
-            turn = self.turns[layer][level]
-            before = [
-                (bit - self.shifts[2 * layer][slower][(heading + by) % HEADINGS], slower, by)
-                for slower in range(max(level - 1, 0), min(level + 2, len(self.levels)))
-                for by in range(-turn, turn + 1)
-            ]
-            options = [
-                (abs(by) + abs(slower - level), at, slower, (heading + by) % HEADINGS)
-                for at, slower, by in before
-                if at >= 0
-                and kept[layer][slower][(heading + by) % HEADINGS] >> at & 1
-                and self.free(2 * layer + 1, (heading + by) % HEADINGS) >> bit & 1
-            ]
-            _, at, slower, turned = min(options)
-            rows.append(self._row(2 * layer + 1, (bit, slower, turned)))
-            state = (at, slower, turned)
-            rows.append(self._row(2 * layer, state))
-        return np.array(rows[::-1])
-
-    def _row(self, half: int, state: tuple[int, int, int]) -> list[float]:
-        """Return time, x, y, heading and speed of a state after `half` half steps, in SI units."""
-        bit, level, heading = state
-        row, column = divmod(bit, self.stride)
-        x, y = self.origin + CELL * np.array([column, row])
-        angle = self.scene.start[2] + 2.0 * np.pi * heading / HEADINGS
-        return [0.5 * half * self.scene.dt, x, y, angle, self.levels[level]]
+            at_end = layer > 0 and self.meets(planes, layer)
+            if at_end:
+                earliest = min(earliest, layer * self.scene.dt)
+        return Reach(at_end=at_end, earliest=earliest)
 
 
 def as_integer(cells: np.ndarray, stride: int) -> int:

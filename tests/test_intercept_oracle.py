@@ -6,16 +6,12 @@ import numpy as np
 import pytest
 
 import planner_jax as pj
-from planner_jax.benchmarks.intercept_bound import earliest_bound
 from planner_jax.benchmarks.intercept_departure import departs
-from planner_jax.benchmarks.intercept_lattice import CELL, HEADINGS, LAYER, MINIMAL, STRICT, Lattice
+from planner_jax.benchmarks.intercept_lattice import CELL, HEADINGS, LAYER, Lattice
 from planner_jax.benchmarks.intercept_oracle import scenes, search
-from planner_jax.benchmarks.intercept_steering import STEP, find_plan
 from planner_jax.referee.clearance import clearances
 
 START, SPEED, TOP, ACCELERATION, MIDDLE, TOLERANCE = (0.8, 4.0, 0.0), 0.5, 1.5, 1.0, 0.15, 0.05
-
-both = pytest.mark.parametrize("rules", [MINIMAL, STRICT], ids=["minimal", "strict"])
 
 
 @pytest.fixture(scope="module")
@@ -57,59 +53,49 @@ def distance(scene, points, times):
     return clearances(group, np.zeros((len(points), 2)), times[:, None], poses)[0]
 
 
-@both
 @pytest.mark.parametrize("away", [0.1, 0.45])
-def test_on_an_open_map_a_chase_takes_the_time_of_its_closed_form(rules, away):
+def test_on_an_open_map_a_chase_takes_the_time_of_its_closed_form(away):
     ahead, times = 1.0, np.linspace(0.0, 6.0, 60001)
     rising = np.minimum(times, (TOP - SPEED) / ACCELERATION)
     driven = SPEED * rising + 0.5 * ACCELERATION * rising**2 + TOP * (times - rising)
     exact = times[np.argmax(ahead + away * times - MIDDLE - driven <= TOLERANCE)]
     chase = scene((START[0] + ahead, START[1]), (away, 0.0))
     cell = CELL * (1.0 + np.sqrt(0.5)) / (TOP - away)
-    assert exact - cell <= Lattice(chase, rules).reach().earliest <= exact + cell + LAYER
-    assert exact - 0.1 * exact <= earliest_bound(chase)[1] <= exact + LAYER
+    assert exact - cell <= Lattice(chase).reach().earliest <= exact + cell + LAYER
 
 
-@both
-def test_no_path_leads_through_a_wall_across_the_map(rules):
+def test_no_path_leads_through_a_wall_across_the_map():
     parted = scene((6.0, 4.0), walls=[box(3.0, -0.5, 3.1, 8.5)])
-    found = Lattice(parted, rules).reach()
+    found = Lattice(parted).reach()
     assert not found.at_end and found.earliest == np.inf
-    assert earliest_bound(parted) == (False, np.inf)
 
 
-@both
-def test_a_gate_is_passed_before_it_closes_and_not_after(rules):
-    slow, fast = (Lattice(gate(closing), rules).reach() for closing in (0.1, 1.0))
+def test_a_gate_is_passed_before_it_closes_and_not_after():
+    slow, fast = (Lattice(gate(closing)).reach() for closing in (0.1, 1.0))
     assert slow.at_end and not fast.at_end and fast.earliest == np.inf
-    assert slow.earliest == Lattice(gate(0.0), rules).reach().earliest
-    assert earliest_bound(gate(0.1))[0] and not earliest_bound(gate(1.0))[0]
+    assert slow.earliest == Lattice(gate(0.0)).reach().earliest
 
 
 @pytest.mark.slow
-def test_no_body_passes_a_narrow_gap_and_only_the_inner_disc_passes_a_tight_gap():
+def test_a_car_passes_a_wide_gap_and_no_tight_one():
     def gap(width):
         walls = [box(3.0, 0.0, 3.2, 4.0 - width / 2), box(3.0, 4.0 + width / 2, 3.2, 8.0)]
         return search(scene((6.0, 4.0), walls=walls))[0]
 
-    assert gap(0.2) == [False, False, False]
-    assert gap(0.3) == [True, True, False]
-    assert gap(0.45) == [True, True, True]
+    assert not gap(0.3) and gap(0.45)
 
 
 def test_a_target_that_is_near_too_early_is_not_met_at_the_end():
     passing = scene((1.8, 4.0), (1.6, 0.0), time=3.5)
-    for rules in (MINIMAL, STRICT):
-        assert not Lattice(passing, rules).reach().at_end
+    assert not Lattice(passing).reach().at_end
     waiting = scene((1.8, 4.0), time=3.5)
-    found = Lattice(waiting, STRICT).reach()
+    found = Lattice(waiting).reach()
     assert found.at_end and found.earliest < 1.1
 
 
-@both
-def test_free_cells_are_free_by_the_referee(drawn, rules):
+def test_free_cells_are_free_by_the_referee(drawn):
     random, one = np.random.default_rng(0), drawn[0]
-    lattice = Lattice(one, rules)
+    lattice = Lattice(one)
     half = random.integers(0, 2 * lattice.layers + 1, 300)
     heading = random.integers(0, HEADINGS, 300)
     cells = random.integers(0, lattice.count, (300, 2))
@@ -128,33 +114,6 @@ def test_free_cells_are_free_by_the_referee(drawn, rules):
     np.testing.assert_array_equal(np.array(free, bool)[clear], (margin > 0.0)[clear])
 
 
-def test_a_path_leads_from_start_to_target_within_the_limits_and_touches_nothing(drawn):
-    for one in (*drawn[:2], gate(0.1)):
-        found = Lattice(one, STRICT).reach(keep_path=True)
-        assert found.path is not None
-        time, x, y, heading, speed = found.path.T
-        np.testing.assert_allclose([x[0], y[0], heading[0]], one.start, atol=1e-9)
-        assert time[-1] == found.earliest
-        pos = np.stack([x, y], axis=1)
-        middle = pos + MIDDLE * np.stack([np.cos(heading), np.sin(heading)], axis=1)
-        layer = round(found.earliest / one.dt)
-        assert np.linalg.norm(middle[-1] - one.target[layer]) <= TOLERANCE + CELL
-        assert np.abs(np.diff(speed[::2])).max() <= ACCELERATION * one.dt + 1e-9
-        turned = np.abs(np.angle(np.exp(1j * np.diff(heading[::2]))))
-        slack = 2.0 * np.pi / HEADINGS
-        assert (turned <= 2.0 * speed[2::2] * one.dt + slack).all()
-        assert (turned * speed[2::2] <= 0.8 * one.dt + slack * speed[2::2]).all()
-        steps = np.linalg.norm(np.diff(pos, axis=0), axis=1)
-        assert (np.abs(steps - 0.5 * one.dt * speed[1:]) <= np.sqrt(2.0) * CELL).all()
-        assert distance(one, middle, time).min() > 0.125 - CELL / 4
-
-
-@pytest.mark.slow
-def test_bound_inner_disc_and_whole_body_are_in_order_of_time(drawn):
-    at_end, earliest = search(drawn[2])
-    assert earliest == sorted(earliest) and at_end == [True] * 3
-
-
 @pytest.mark.parametrize(("ahead", "gets_away"), [(0.1, False), (1.2, True)])
 def test_a_car_escapes_a_wall_ahead_if_it_can_still_turn(ahead, gets_away):
     # The car cannot reverse. It turns with a radius of at least 0.5 m, so it needs space ahead.
@@ -171,23 +130,3 @@ def test_near_a_target_it_suffices_to_touch_nothing(ahead, lives):
     front = START[0] + MIDDLE + 0.2
     near = scene((1.5, 4.0), time=2.0, walls=[box(front + ahead, 2.0, front + ahead + 0.2, 6.0)])
     assert departs(replace(near, initial_speed=0.5)) == lives
-
-
-@pytest.mark.parametrize(("rate", "is_feasible"), [(2.0, True), (0.1, False)])
-def test_a_car_with_quick_steering_turns_in_time_and_with_slow_steering_does_not(rate, is_feasible):
-    # In 2 s the car must turn by about 55 degrees. At 0.1 rad/s it turns by 25 degrees.
-    case = pj.intercept.case(
-        pj.TurningPath(jnp.array([1.75, 4.55]), jnp.zeros(2), jnp.zeros(())),
-        2.0,
-        start=START,
-        initial_speed=SPEED,
-        speed=0.6,
-        steering_rate=rate,
-    )
-    cases = jax.tree.map(lambda leaf: np.asarray(leaf)[None], case)
-    assert Lattice(scenes(cases)[0], STRICT).reach().at_end
-    plan = find_plan(jax.tree.map(np.asarray, case), scenes(cases, STEP)[0])
-    assert (plan is not None) == is_feasible
-    if plan is not None:
-        assert pj.intercept.judge(case, plan).success
-        assert np.diff(plan.curvature).max() > 0.0
