@@ -27,11 +27,11 @@ import numpy as np
 
 import planner_jax as pj
 from planner_jax.benchmarks.run import argument_parser, begin
+from planner_jax.robot.arm_clearance import clearances, num_of_obstacles
 from planner_jax.robot.arm_file import irb1600
+from planner_jax.robot.arm_scene import paper_scene
 from planner_jax.sweep.block.settings import REGIMES
-from planner_jax.task.block.clearance import clearances, num_of_obstacles
 from planner_jax.task.block.default_planner import OnlineBlock, Search
-from planner_jax.task.block.scene import paper_scene
 
 # [rad] Bounds between which the first round draws the six joint angles of a pose.
 LOWEST = np.array([-0.8, -1.05, -2.0, -0.5, -1.9, -0.8])

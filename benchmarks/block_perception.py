@@ -70,7 +70,7 @@ from planner_jax.sims.perception.observation import (
 )
 from planner_jax.sims.perception.receding import AIMS, decide
 from planner_jax.task.block.case import ANYWHERE
-from planner_jax.task.block.end_poses import flight_of
+from planner_jax.task.block.problem.flight import flight_of
 from planner_jax.task.block.replan import ReplanBlock
 
 RATES = (30.0, 60.0, 120.0)  # [Hz] Frame rates of the camera.

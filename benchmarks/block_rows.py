@@ -35,10 +35,11 @@ from jax import Array
 import planner_jax as pj
 from planner_jax.benchmarks.block_starts import follow, random_starts
 from planner_jax.benchmarks.run import Bench, argument_parser, at_least, begin, parse_names
+from planner_jax.robot.arm_clearance import least_clearances
 from planner_jax.runs.summary import wilson_interval
-from planner_jax.task.block.clearance import least_clearances
 from planner_jax.task.block.default_planner import OnlineBlock, Search
-from planner_jax.task.block.end_poses import end_poses, flight_of
+from planner_jax.task.block.problem.end_poses import end_poses
+from planner_jax.task.block.problem.flight import flight_of
 
 # [s] In rows named "late" the arm may start only this long after the ball is first seen.
 LATE = 0.133

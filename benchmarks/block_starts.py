@@ -37,10 +37,11 @@ import planner_jax as pj
 from planner_jax.benchmarks.run import Bench, argument_parser, at_least, begin
 from planner_jax.core.protocol import is_solved
 from planner_jax.optimise.levenberg import least_squares
+from planner_jax.robot.arm_motion import angles_at, bump_steps
 from planner_jax.task.block import default_planner as online
-from planner_jax.task.block.end_poses import all_profiles, end_poses, flight_of
-from planner_jax.task.block.motion import angles_at, bump_steps
 from planner_jax.task.block.plan import BlockPlan
+from planner_jax.task.block.problem.end_poses import all_profiles, end_poses
+from planner_jax.task.block.problem.flight import flight_of
 
 SEED, DELAY = 1001, 0.05  # Seed of the throws, and time [s] after which the arm may start.
 STRAIGHT = 32  # Number of straight motions that are tried for each throw.

@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 
 import planner_jax as pj
 from planner_jax.robot.arm import shield_pose
+from planner_jax.robot.arm_clearance import clearances, clearances_and_slopes
 from planner_jax.robot.arm_file import irb1600
-from planner_jax.task.block.clearance import clearances, clearances_and_slopes
 from planner_jax.task.reach import shortcut, tree
 from planner_jax.task.reach.default_planner import ReachPlan, Search, TreeSearch
 from planner_jax.task.reach.motion import join_knots, pad_knots, straight_knots

@@ -28,10 +28,10 @@ from planner_jax.benchmarks.rendered_balls.segment import (
     sighting,
 )
 from planner_jax.core.errors import PlannerJaxError
+from planner_jax.robot.arm_scene import Scene
 from planner_jax.sims.perception.camera import Camera
 from planner_jax.sims.perception.noise import StereoNoise
 from planner_jax.sims.scenery import GROUND_COLOUR, xml_colour, xml_numbers
-from planner_jax.task.block.scene import Scene
 
 _ARM = importlib.resources.files("planner_jax.robot") / "models" / "irb1600.xml"
 _WALLS, _HIGH = 13.0, 6.0  # [m], distance of the walls from the arm, and height of the walls

@@ -13,6 +13,7 @@ import numpy as np
 from planner_jax.baselines.protocols import BY_ROW
 from planner_jax.core.planner import Planner
 from planner_jax.referee.arm_clearance import links_of, shield_pose
+from planner_jax.robot.arm_scene import Scene
 from planner_jax.runs.columns import BOOL, LIST, NUMBER, TEXT, Column, leaves_of
 from planner_jax.runs.style import draw
 from planner_jax.runs.summary import percent
@@ -48,8 +49,7 @@ from planner_jax.sims.tasks.block_shown import (
 )
 from planner_jax.task.block.api import planner as block_planner
 from planner_jax.task.block.case import BlockCase
-from planner_jax.task.block.end_poses import flight_of
-from planner_jax.task.block.scene import Scene
+from planner_jax.task.block.problem.flight import flight_of
 from planner_jax.task.block.spec import SUITES
 from planner_jax.task.block.suites import BALL_RADIUS, scene_for
 

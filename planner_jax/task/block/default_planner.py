@@ -34,26 +34,24 @@ from planner_jax.core.protocol import (
 )
 from planner_jax.optimise import levenberg
 from planner_jax.optimise.levenberg import LevenbergConfig, LevenbergState, Model, continue_search
-from planner_jax.robot import arm_dynamics
-from planner_jax.task.block import motion
-from planner_jax.task.block.case import BlockCase
-from planner_jax.task.block.clearance import (
+from planner_jax.robot import arm_dynamics, arm_motion
+from planner_jax.robot.arm_clearance import (
     clearances_and_slopes,
     least_clearances,
     num_of_obstacles,
 )
-from planner_jax.task.block.end_poses import (
+from planner_jax.task.block.case import BlockCase
+from planner_jax.task.block.plan import BlockPlan, explain_status, make_empty_plan
+from planner_jax.task.block.problem import terms
+from planner_jax.task.block.problem.end_poses import (
     EndPoses,
-    Flight,
     all_profiles,
     coast,
-    contact_terms,
     end_poses,
-    flight_of,
     rank_straight,
     thin_points,
 )
-from planner_jax.task.block.plan import BlockPlan, explain_status, make_empty_plan
+from planner_jax.task.block.problem.flight import Flight, flight_of
 from planner_jax.trajectory.polynomial import PiecewisePolynomial
 
 if TYPE_CHECKING:
@@ -190,7 +188,7 @@ class OnlineBlock(Planner):
     # Number of steps of least squares that lower the cost of a solved plan, unless `brisk` is true.
     # If the number is not 0, all straight motions and starting points of a search are compared.
     settling: int = 0
-    weights: motion.Weights = motion.Weights()
+    weights: terms.Weights = terms.Weights()
     searches: tuple[Search, ...] = _SEARCHES
 
     def __post_init__(self) -> None:
@@ -403,7 +401,7 @@ class OnlineBlock(Planner):
         def sample(k: Array, at: tuple[float, ...]) -> Array:
             index = order[jnp.minimum(k, len(order) - 1)]
             moves, initial, _ = self.decode(case, self.encode_straight(case, poses, index))
-            return motion.angles_at(case.angles, initial, moves, at)
+            return arm_motion.angles_at(case.angles, initial, moves, at)
 
         def take_turn(state: tuple[Array, Array, BlockPlan]) -> tuple[Array, Array, BlockPlan]:
             turn, free, best = state
@@ -483,7 +481,7 @@ class OnlineBlock(Planner):
 
     def _encode_bump(self, case: BlockCase, k: Array) -> Array:
         bumps = jnp.asarray(self._starts(case)[1], case.angles.dtype)
-        bump = motion.bump_steps(bumps[jnp.minimum(k, len(bumps) - 1)], self.pieces)
+        bump = arm_motion.bump_steps(bumps[jnp.minimum(k, len(bumps) - 1)], self.pieces)
         return jnp.append(bump.reshape(-1), jnp.zeros((), bump.dtype))
 
     def refine(
@@ -529,9 +527,9 @@ class OnlineBlock(Planner):
         """
         steps, first, duration = self.decode(case, point)
         pieces, dtype = self.pieces, point.dtype
-        joints = motion.joint_terms(case, steps, first, duration, self.weights, 1.0 - self.slack)
+        joints = terms.joint_terms(case, steps, first, duration, self.weights, 1.0 - self.slack)
         shares = tuple(np.arange(1, self.samples + 1) / self.samples)
-        angles = motion.angles_at(case.angles, first, steps, shares)
+        angles = arm_motion.angles_at(case.angles, first, steps, shares)
         gaps, slopes_at = clearances_and_slopes(case.arm, case.scene, angles)
         gaps = lax.optimization_barrier(gaps)  # (R, S)
         is_of_scene = np.arange(gaps.shape[0]) < num_of_obstacles(case.arm, case.scene)
@@ -544,18 +542,18 @@ class OnlineBlock(Planner):
         grams = jnp.einsum("riw,rjw->wij", lifts, lifts, precision=_HIGHEST)
         pushes = jnp.einsum("riw,rw->wi", lifts, short, precision=_HIGHEST)
         grams, pushes = jnp.pad(grams, ((0, 0), (0, 1), (0, 1))), jnp.pad(pushes, ((0, 0), (0, 1)))
-        contact = contact_terms(case, flight, angles[-1], point[-1], self.weights)
+        contact = terms.contact_terms(case, flight, angles[-1], point[-1], self.weights)
         rows, row_slopes, contact_excess = contact
         gram = jnp.matmul(row_slopes.T, row_slopes, precision=_HIGHEST)
         push = jnp.matmul(row_slopes.T, rows, precision=_HIGHEST)
         grams = jnp.concatenate([grams, gram[None]])
         pushes = jnp.concatenate([pushes, push[None]])
-        weights = motion.step_weights(pieces, shares)
+        weights = arm_motion.step_weights(pieces, shares)
         of_first, of_steps = (jnp.asarray(each, dtype) for each in weights)
         chosen = jnp.append(worst, self.samples - 1)
         lift = of_steps[chosen]  # (W + 1, K)
         drift = of_first[chosen][:, None] * case.rates[None]  # (W + 1, n)
-        gradient, curvature = motion.lift_to_unknowns(lift, drift, grams, pushes, joints)
+        gradient, curvature = terms.lift_to_unknowns(lift, drift, grams, pushes, joints)
         size = case.arm.num * pieces
         ends_free = jnp.where(case.ends_at_rest, 0.0, 1.0)
         free = jnp.ones(size + 1, dtype).at[size - case.arm.num : size].set(ends_free)
@@ -575,7 +573,7 @@ class OnlineBlock(Planner):
 
     def _motion_of(self, case: BlockCase, point: Array) -> PiecewisePolynomial:
         steps, first, duration = self.decode(case, point)
-        return motion.polynomial(case.angles, first, steps, duration)
+        return arm_motion.polynomial(case.angles, first, steps, duration)
 
     def torque_excess(self, case: BlockCase, point: Array) -> Array:
         """Return the greatest relative excess () of a torque over its limit, less a reserve."""
@@ -617,7 +615,7 @@ class OnlineBlock(Planner):
         Limits are checked at `checked` samples. The plan reports `steps` as its iterations.
         """
         moves, first, _ = self.decode(case, point)
-        angles = motion.angles_at(case.angles, first, moves, self._shares())
+        angles = arm_motion.angles_at(case.angles, first, moves, self._shares())
         gaps = least_clearances(case.arm, case.scene, angles)
         return self._plan_of(case, flight, point, steps, angles, gaps)
 
@@ -631,12 +629,12 @@ class OnlineBlock(Planner):
         gaps: Array,
     ) -> BlockPlan:
         moves, first, duration = self.decode(case, point)
-        joints = motion.joint_terms(case, moves, first, duration, self.weights, 1.0 - self.slack)
+        joints = terms.joint_terms(case, moves, first, duration, self.weights, 1.0 - self.slack)
         # A joint may exceed its position limit between two knots and turn back: check all samples.
         middle = 0.5 * (case.arm.upper + case.arm.lower)
         half = 0.5 * (case.arm.upper - case.arm.lower)
         beyond = jnp.max(jnp.abs(angles - middle[None]) / half[None]) - 1.0
-        contact = contact_terms(case, flight, angles[-1], point[-1], self.weights)[2]
+        contact = terms.contact_terms(case, flight, angles[-1], point[-1], self.weights)[2]
         joint_excess = jnp.maximum(joints.excess, beyond)
         if case.limits.torque is not None:
             joint_excess = jnp.maximum(joint_excess, self.torque_excess(case, point))
@@ -646,7 +644,7 @@ class OnlineBlock(Planner):
         status = status_of(joints.load, violation, violation > FEASIBILITY_TOLERANCE)
         is_blocked = (gaps[0] < 0.0) & ~is_solved(status)  # the arm touches something at the start
         plan = BlockPlan(
-            motion=motion.polynomial(case.angles, first, moves, duration),
+            motion=arm_motion.polynomial(case.angles, first, moves, duration),
             contact_time=point[-1],
             cost=joints.load,
             violation=violation,
@@ -657,7 +655,7 @@ class OnlineBlock(Planner):
             return plan
         most = 1.0 - self.slack
         rate, rise = most * case.limits.velocity, most * case.limits.acceleration
-        path, pace = motion.speed_up(plan.motion, rate, rise)
+        path, pace = arm_motion.speed_up(plan.motion, rate, rise)
         if case.limits.torque is not None:
             of_case = case.arm, case.limits, case.gravity
             slower = arm_dynamics.measure_torques(*of_case, path, _TORQUES)[1]

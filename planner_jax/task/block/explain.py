@@ -11,10 +11,11 @@ from planner_jax.core.checks import require_kind
 from planner_jax.core.choices import require
 from planner_jax.robot.arm import shield_inradius
 from planner_jax.robot.arm_dynamics import USED
+from planner_jax.robot.arm_motion import least_times
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.default_planner import OnlineBlock
-from planner_jax.task.block.end_poses import Flight, flight_of, poses_at
-from planner_jax.task.block.motion import least_times
+from planner_jax.task.block.problem.end_poses import poses_at
+from planner_jax.task.block.problem.flight import Flight, flight_of
 
 _PIECES = 10  # see `poses_at`
 # Contacts are sampled in rounds: first evenly, then near the best contacts, ever closer to them.

@@ -27,8 +27,8 @@ from planner_jax.core.protocol import (
     status_of,
 )
 from planner_jax.robot.arm import Arm, ArmPlan
+from planner_jax.robot.arm_clearance import clearances
 from planner_jax.robot.arm_dynamics import measure_torques, stretch
-from planner_jax.task.block.clearance import clearances
 from planner_jax.task.reach import motion, shortcut, tree
 from planner_jax.task.reach.case import ReachCase
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate

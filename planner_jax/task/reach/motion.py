@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from planner_jax.robot.arm import ArmLimits
-from planner_jax.task.block.motion import least_times
+from planner_jax.robot.arm_motion import least_times
 from planner_jax.trajectory.polynomial import PiecewisePolynomial
 
 
