@@ -31,7 +31,8 @@ from planner_jax.robot.arm_clearance import clearances, num_of_obstacles
 from planner_jax.robot.arm_file import irb1600
 from planner_jax.robot.arm_scene import paper_scene
 from planner_jax.sweep.block.settings import REGIMES
-from planner_jax.task.block.default_planner import OnlineBlock, Search
+from planner_jax.task.block.default_planner import OnlineBlock
+from planner_jax.task.block.search.attempts import Search
 
 # [rad] Bounds between which the first round draws the six joint angles of a pose.
 LOWEST = np.array([-0.8, -1.05, -2.0, -0.5, -1.9, -0.8])

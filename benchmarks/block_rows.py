@@ -37,9 +37,10 @@ from planner_jax.benchmarks.block_starts import follow, random_starts
 from planner_jax.benchmarks.run import Bench, argument_parser, at_least, begin, parse_names
 from planner_jax.robot.arm_clearance import least_clearances
 from planner_jax.runs.summary import wilson_interval
-from planner_jax.task.block.default_planner import OnlineBlock, Search
+from planner_jax.task.block.default_planner import OnlineBlock
 from planner_jax.task.block.problem.end_poses import end_poses
 from planner_jax.task.block.problem.flight import flight_of
+from planner_jax.task.block.search.attempts import Search
 
 # [s] In rows named "late" the arm may start only this long after the ball is first seen.
 LATE = 0.133

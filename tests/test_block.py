@@ -25,15 +25,12 @@ from planner_jax.robot.arm_motion import angles_at, polynomial, profiles, step_w
 from planner_jax.robot.arm_scene import make_scene, paper_scene
 from planner_jax.runs.timing import CompileClock
 from planner_jax.sweep.block.settings import REGIMES as SWEPT
-from planner_jax.task.block.default_planner import (
-    OnlineBlock,
-    Search,
-    rank_poses,
-    read_learned_starts,
-)
+from planner_jax.task.block.default_planner import OnlineBlock
 from planner_jax.task.block.problem.end_poses import end_poses
 from planner_jax.task.block.problem.flight import entry_time, flight_of
 from planner_jax.task.block.problem.terms import contact_terms
+from planner_jax.task.block.search.attempts import Search, read_learned_starts
+from planner_jax.task.block.search.least_squares import rank_poses
 from planner_jax.trajectory.polynomial import evaluate
 from tests.derivatives import double
 from tests.trees import as_numpy
