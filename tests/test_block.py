@@ -12,7 +12,7 @@ from planner_jax.core.plan_files import leaves_by_name
 from planner_jax.optimise.levenberg import LevenbergConfig
 from planner_jax.referee.arm_clearance import KINDS
 from planner_jax.referee.arm_clearance import clearances as referee_clearances
-from planner_jax.referee.block import entry_time as body_entry_time
+from planner_jax.referee.ball_in_box import entry_time as body_entry_time
 from planner_jax.robot.arm import REGIMES, reach_of
 from planner_jax.robot.arm_clearance import (
     clearances,

@@ -20,7 +20,7 @@ from planner_jax.core.errors import ArgumentError
 from planner_jax.core.plan_files import leaves_by_name
 from planner_jax.core.protocol import is_solved
 from planner_jax.referee.arm_clearance import clearances, links_of, shield_pose
-from planner_jax.referee.block import entry_time
+from planner_jax.referee.ball_in_box import entry_time
 from planner_jax.referee.solids import from_segment, rotate, rotate_back
 from planner_jax.robot.arm import Arm
 from planner_jax.robot.arm_scene import FLOOR

@@ -18,13 +18,13 @@ from planner_jax.core.rules import Field, Table, require_sound
 from planner_jax.robot import arm_scene
 from planner_jax.robot.arm import REGIMES, Arm, ArmLimits
 from planner_jax.robot.arm_clearance import least_clearances
-from planner_jax.robot.arm_file import Shield as Shield
 from planner_jax.robot.arm_file import describe_arm as describe_arm
 from planner_jax.robot.arm_file import irb1600
 from planner_jax.robot.arm_file import read_arm as read_arm
 from planner_jax.robot.arm_scene import Scene, paper_scene
 from planner_jax.robot.arm_scene import make_scene as make_scene
 from planner_jax.robot.arm_scene_file import read_scene as read_scene
+from planner_jax.robot.arm_shield import Shield as Shield
 from planner_jax.task.arguments import array_of, batch_of, repeat_leaves
 
 _TOLERANCE = 1e-3  # [rad], by which a joint may start beyond its range; as in the referee
