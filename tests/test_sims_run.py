@@ -70,7 +70,7 @@ def test_blocks_with_a_camera_have_defaults_of_their_own():
 def test_settings_that_break_a_rule_are_refused_in_one_line(row):
     call, message = row.split(" | ")
     with pytest.raises(pj.ArgumentError, match=f"^{re.escape(message)}") as caught:
-        eval(call, dict(vars(settings)))
+        eval(call, vars(settings) | {"BlockFly": BlockFly})
     assert "\n" not in str(caught.value)
 
 
