@@ -19,7 +19,7 @@ import numpy as np
 
 import planner_jax as pj
 from planner_jax.robot.arm_file import irb1600
-from planner_jax.task.block.default_planner import Search
+from planner_jax.task.block.search.attempts import Search
 
 _STARTS = 192
 

@@ -50,8 +50,8 @@ from planner_jax.benchmarks.run import Bench, argument_parser, begin, parse_name
 from planner_jax.core import GRAVITY
 from planner_jax.robot.arm import REGIMES
 from planner_jax.robot.arm_file import irb1600
+from planner_jax.robot.arm_scene import paper_scene
 from planner_jax.runs.timing import CompileClock
-from planner_jax.task.block.scene import paper_scene
 
 SEED = 20260
 ROUNDS = 20  # The time of a batch lookup is measured over this number of calls.

@@ -37,10 +37,13 @@ import planner_jax as pj
 from planner_jax.benchmarks.run import Bench, argument_parser, at_least, begin
 from planner_jax.core.protocol import is_solved
 from planner_jax.optimise.levenberg import least_squares
-from planner_jax.task.block import default_planner as online
-from planner_jax.task.block.end_poses import all_profiles, end_poses, flight_of
-from planner_jax.task.block.motion import angles_at, bump_steps
+from planner_jax.robot.arm_motion import angles_at, bump_steps
+from planner_jax.task.block.default_planner import OnlineBlock
 from planner_jax.task.block.plan import BlockPlan
+from planner_jax.task.block.problem.end_poses import all_profiles, end_poses
+from planner_jax.task.block.problem.flight import flight_of
+from planner_jax.task.block.search import attempts
+from planner_jax.task.block.search.least_squares import rank_poses
 
 SEED, DELAY = 1001, 0.05  # Seed of the throws, and time [s] after which the arm may start.
 STRAIGHT = 32  # Number of straight motions that are tried for each throw.
@@ -73,7 +76,7 @@ class Followed:
 
 
 def follow(
-    planner: online.OnlineBlock,
+    planner: OnlineBlock,
     case: pj.block.BlockCase,
     bump: Array,
     rank: Array,
@@ -93,7 +96,7 @@ def follow(
     """
     flight = flight_of(case)
     poses = end_poses(case, flight, planner.points, planner.pieces)
-    place = online.rank_poses(poses, LATER_RANKS, 1.0 - planner.slack)[rank]
+    place = rank_poses(poses, LATER_RANKS, 1.0 - planner.slack)[rank]
     start = planner.encode_straight(case, poses, place)
     start = start.at[:-1].add(bump_steps(bump, planner.pieces).reshape(-1))
     solver = dataclasses.replace(planner.attempts[0].solver, max_steps=steps, hope=None)
@@ -104,7 +107,7 @@ def follow(
 
 @jax.jit
 def try_starts(
-    planner: online.OnlineBlock, cases: pj.block.BlockCase, bumps: Array, ranks: Array, steps: Array
+    planner: OnlineBlock, cases: pj.block.BlockCase, bumps: Array, ranks: Array, steps: Array
 ) -> tuple[Array, Array]:
     """Search block motions by least squares for B cases, each from one initial motion.
 
@@ -164,7 +167,7 @@ def try_in_parts(
             full = np.resize(here, lanes)
             given = (jnp.asarray(bumps[full], jnp.float32), jnp.asarray(ranks[full]))
             some = pj.take(cases, index[full])
-            good, beside = try_starts(online.OnlineBlock(), some, *given, jnp.asarray(steps))
+            good, beside = try_starts(OnlineBlock(), some, *given, jnp.asarray(steps))
             yield np.asarray(good)[: len(here)], np.asarray(beside)[: len(here)]
 
     good, beside = zip(*parts(), strict=True)
@@ -257,7 +260,7 @@ def main() -> None:
     with begin(parser, options) as bench:
         starts = learn(bench, options.num, options.tries, options.lanes)
         if starts and options.write:
-            path = Path(online.__file__).parent / "learned_starts.json"
+            path = Path(attempts.__file__).parent / "learned_starts.json"
             path.write_text(json.dumps(starts, indent=1) + "\n")
             bench.say(f"Written: {path.name}, {len(starts)} starts.")
 

@@ -45,9 +45,9 @@ from planner_jax.core.errors import install_line
 from planner_jax.optimise.levenberg import LevenbergConfig
 from planner_jax.referee.clearance import edges
 from planner_jax.runs.table import rate_cells
+from planner_jax.task.intercept.problem.terms import JERK, STEERING
 from planner_jax.task.intercept.searches import SEARCHES
 from planner_jax.task.intercept.spec import SUITES
-from planner_jax.task.intercept.terms import JERK, STEERING
 from planner_jax.task.intercept.units import enter_units, units_of
 
 SAMPLES = 8  # times of each piece at which IPOPT's obstacles are constraints

@@ -6,9 +6,9 @@
     plans = pj.plan(pj.hit.planner("exact"), cases)
     verdict = pj.hit.judge(cases, plans)
 
-The tasks are `hit`, `catch`, `intercept`, `group` and `block`. `task_named` also returns tasks that
-other installed packages register. Every task has the functions `case`, `draw`, `planner` and
-`judge`. These functions apply to every task:
+The tasks are `hit`, `rally`, `catch`, `team`, `intercept`, `group`, `block` and `reach`.
+`task_named` also returns tasks that other installed packages register. Every task has the functions
+`case`, `draw`, `planner` and `judge`. These functions apply to every task:
 
 * `plan`: plans one case or a batch, on all devices; `solve`: plans inside `jax.jit` or `jax.vmap`
 * `keep_compiled_programs`: stores on disk programs that are compiled before the first plan;

@@ -20,13 +20,11 @@ import math
 
 import jax
 import jax.numpy as jnp
-from flax import struct
 from jax import Array, lax
 from jax.typing import DTypeLike
 from jaxtyping import PyTree
 
-from planner_jax.ball.estimation import EkfState, congruence
-from planner_jax.ball.flight import BallState, fly
+from planner_jax.ball.flight import BallState
 from planner_jax.core.compiled import QUICK_OPTIONS
 from planner_jax.planning.replan import Replanning
 from planner_jax.planning.replanner import Replanner
@@ -36,9 +34,11 @@ from planner_jax.sims.launch import watch_ball
 from planner_jax.sims.loop import track
 from planner_jax.sims.loop_state import Loop
 from planner_jax.sims.model import at_rest, ball_states, place_balls
+from planner_jax.sims.rally_ball import observe, predict
+from planner_jax.sims.rally_state import Bounce, Frames, Passage, Trial, pick
 from planner_jax.sims.robot import Physics
 from planner_jax.sims.scoring import Contact, Moment, moment, passage, racket_impact
-from planner_jax.sims.sensing import Estimate, RlsState, rls_update
+from planner_jax.sims.sensing import RlsState
 from planner_jax.task.rally.case import RallyCase
 from planner_jax.task.rally.default_planner import RallyProblem
 from planner_jax.task.rally.plan import RallyPlan
@@ -46,71 +46,7 @@ from planner_jax.task.rally.replan import REMAINDER, count_done
 from planner_jax.task.rally.suites import Course
 
 LOWEST = 0.3  # [m], height below which a ball is lost
-_LEARNING = 0.25  # [s], after an impact, when the restitution is estimated from the new flight
 _RESTITUTION_SPREAD = 0.1  # standard deviation of the first estimate of the restitution
-# Standard deviation [m/s] of the difference of the ball's velocities before and after an impact, by
-# errors of the estimates and of the racket's velocity.
-_JUMP_STD = 0.15
-_IMPACT_STD = (0.01, 0.1)  # [m], [m/s], additional deviations of a ball's estimate by an impact
-_FLIGHT_STEPS = 4  # number of integration steps of a prediction
-
-
-@struct.dataclass
-class Bounce:
-    """The last impact as the robot felt it."""
-
-    time: Array  # () [s]; -inf before the first impact
-    tool_vel: Array  # (3,) [m/s], velocity of the racket at the ball
-    normal: Array  # (3,), unit normal of the racket
-    ball_vel: Array  # (3,) [m/s], estimated velocity of the ball before the impact
-    is_due: Array  # () bool, whether the estimate of the ball belongs to a time before the impact
-    is_learned: Array  # () bool, whether the restitution was estimated from this impact
-
-
-@struct.dataclass
-class Passage:
-    """The ball's last passage through the racket's plane, which was a hit or a miss."""
-
-    offset: Array  # () [m], distance of the ball from the racket's centre in the racket's plane
-    tracking: Array  # () [m], distance of the robot from its plan then
-    late: Array  # () [s], time of that passage after the planned time
-    violation: Array  # (), greatest relative excess of the plan over a limit
-    restitution: Array  # (), error of the estimated restitution
-    drag: Array  # (), relative error of the estimated drag
-
-
-@struct.dataclass
-class Trial:
-    """The variables of one trial of N robots: physics, estimates, plans and scores."""
-
-    physics: Physics  # leaves (N, ...), of each robot's world
-    shown: Array  # (L, 3) [m], true positions of the ball that are still to be observed
-    estimate: Estimate  # of the ball, one latency ago
-    bounce: Bounce
-    restitution: RlsState  # estimate of 1 + (coefficient of restitution)
-    plan: RallyPlan  # leaves (N, ...), of each robot
-    began: Array  # (N,) [s], start times of the plans
-    planned: Array  # (N,) int32, number of each robot's hits before its plan's start
-    hits: Array  # () int32, number of hits of all robots so far
-    lost: Array  # () bool, whether the trial has ended by a rule of `RallyPilot.course`
-    aimed: Array  # () int32, number of hits so far whose ball had to come to the circle
-    inside: Array  # () int32, number of these balls that were met in the circle
-    last: Passage
-    worst_offset: Array  # () [m], greatest offset of a hit so far
-    sum_offset: Array  # () [m], sum of the offsets of all hits
-    worst_tracking: Array  # () [m], greatest distance from the plan so far
-    squared_tracking: Array  # () [m^2 s], integral of the squared distance
-    tracked: Array  # () [s], duration over which the squared distance is integrated
-    time: Array  # () [s]
-    key: Array
-
-
-@struct.dataclass
-class Frames:
-    """The states of B trials at O observations in each of P planning periods."""
-
-    qpos: Array  # (P, B, O, N, R + 3), joint positions of each robot and the ball
-    wanted: Array  # (P, B, O, N, 3) [m], planned positions of the robots
 
 
 @dataclasses.dataclass(frozen=True)
@@ -130,12 +66,6 @@ class RallyPilot:
     desperate: float = 1.0
 
 
-def _pick(condition: Array, new: PyTree, old: PyTree) -> PyTree:
-    """Return `new` where a condition () or (N,) holds, else `old`, for leaves (...) or (N, ...)."""
-    shaped = lambda leaf: condition.reshape(condition.shape + (1,) * (leaf.ndim - condition.ndim))  # noqa: E731
-    return jax.tree.map(lambda a, b: jnp.where(shaped(a), a, b), new, old)
-
-
 def _at(tree: PyTree, index: Array | int) -> PyTree:
     return jax.tree.map(lambda leaf: leaf[index], tree)
 
@@ -148,77 +78,6 @@ def _own_hits(trial: Trial, robots: Array) -> Array:
 def _sides(num: int, dtype: DTypeLike) -> Array:
     """Return factors (N, 3) that convert the first robot's positions to those of each robot."""
     return jnp.ones((num, 3), dtype).at[1:, 0].set(-1.0)
-
-
-def _predict(trial: Trial, loop: Loop, ahead: float) -> BallState:
-    """Return the ball `ahead` [s] from now, across an impact that it has not been seen to pass."""
-    gravity = jnp.asarray(loop.world.gravity, trial.time.dtype)
-    span = jnp.asarray(loop.sensing.latency + ahead, trial.time.dtype)
-    since = trial.time - loop.sensing.latency
-    is_due = trial.bounce.is_due
-    first = jnp.where(is_due, jnp.clip(trial.bounce.time - since, 0.0, span), 0.0)
-    go = functools.partial(fly, drag=trial.estimate.drag, gravity=gravity, num_steps=_FLIGHT_STEPS)
-    ball = go(trial.estimate.belief.ball, first)[0]
-    vel = jnp.where(is_due, _reflect(trial, ball.vel), ball.vel)
-    return go(BallState(ball.pos, vel), span - first)[0]
-
-
-def _reflect(trial: Trial, vel: Array) -> Array:
-    bounce, restitution = trial.bounce, trial.restitution.estimate - 1.0
-    return racket_impact(vel, bounce.tool_vel, bounce.normal, restitution)
-
-
-def _reflect_belief(trial: Trial, belief: EkfState) -> EkfState:
-    """Return the belief about a ball just after the impact that the robot has felt."""
-    bounce, restitution = trial.bounce, trial.restitution
-    normal = bounce.normal
-    turn = jnp.eye(3) - restitution.estimate * normal[:, None] * normal[None]
-    P = congruence(jnp.eye(6).at[3:, 3:].set(turn), belief.covariance)
-    approach = jnp.sum((belief.mean[3:] - bounce.tool_vel) * normal)
-    along = restitution.variance * approach**2 * normal[:, None] * normal[None]
-    stds = jnp.repeat(jnp.asarray(_IMPACT_STD, P.dtype), 3)
-    P = P + jnp.diag(stds**2) + jnp.zeros_like(P).at[3:, 3:].set(along)
-    mean = jnp.concatenate([belief.mean[:3], _reflect(trial, belief.mean[3:])])
-    return EkfState(mean=mean, covariance=P)
-
-
-def _observe(trial: Trial, loop: Loop, seen: Array) -> Trial:
-    """Return a trial after one observation (3,) [m], which may be missing (NaN)."""
-    sensing, dtype = loop.sensing, trial.time.dtype
-    gravity = jnp.asarray(loop.world.gravity, dtype)
-    period = jnp.asarray(1.0 / sensing.rate, dtype)
-    until = trial.time - sensing.latency  # time of the estimate after the observation
-    bounce, estimate = trial.bounce, trial.estimate
-    crosses = bounce.is_due & (bounce.time <= until)
-    first = jnp.where(crosses, jnp.clip(bounce.time - until + period, 0.0, period), 0.0)
-
-    before = sight.advance_belief(estimate, first, sensing, gravity)
-    after = _reflect_belief(trial, before)
-    settled = dataclasses.replace(sight.settle_drag(estimate, gravity), belief=after)
-    started = dataclasses.replace(estimate, belief=before)
-    estimate = _pick(crosses, settled, started)
-    bounce = dataclasses.replace(
-        bounce,
-        ball_vel=jnp.where(crosses, before.mean[3:], bounce.ball_vel),
-        is_due=bounce.is_due & ~crosses,
-    )
-    estimate = sight.update_estimate(estimate, seen, sensing, gravity, period - first)
-
-    age = until - bounce.time
-    learns = (age >= _LEARNING) & ~bounce.is_learned
-    ago = jnp.where(learns, -age, 0.0)
-    then = fly(estimate.belief.ball, ago, estimate.drag, gravity, num_steps=_FLIGHT_STEPS)[0]
-    jump = jnp.sum((then.vel - bounce.ball_vel) * bounce.normal)
-    approach = jnp.sum((bounce.tool_vel - bounce.ball_vel) * bounce.normal)
-    learned = rls_update(trial.restitution, approach / _JUMP_STD, jump / _JUMP_STD)
-    known = bounce.is_learned | learns
-    anchored, usual = sight.anchor_energy(estimate, gravity), sight.with_drag(estimate, gravity)
-    return dataclasses.replace(
-        trial,
-        estimate=_pick(learns, anchored, _pick(known, usual, estimate)),
-        restitution=_pick(learns, learned, trial.restitution),
-        bounce=dataclasses.replace(bounce, is_learned=known),
-    )
 
 
 def _fly_to_observation(loop: Loop, pilot: RallyPilot, trial: Trial, case: RallyCase) -> Trial:
@@ -269,7 +128,7 @@ def _fly_to_observation(loop: Loop, pilot: RallyPilot, trial: Trial, case: Rally
         trial = dataclasses.replace(
             trial,
             physics=physics,
-            bounce=_pick(hit, feel, trial.bounce),
+            bounce=pick(hit, feel, trial.bounce),
             worst_tracking=jnp.maximum(trial.worst_tracking, away),
             squared_tracking=trial.squared_tracking + lasts * jnp.mean(squared),
             tracked=trial.tracked + lasts,
@@ -289,7 +148,7 @@ def _fly_to_observation(loop: Loop, pilot: RallyPilot, trial: Trial, case: Rally
         time=trial.time + 1.0 / loop.sensing.rate,
         key=key,
     )
-    return _observe(trial, loop, sight.observe(look_key, shown[:1], loop.sensing)[0])
+    return observe(trial, loop, sight.observe(look_key, shown[:1], loop.sensing)[0])
 
 
 def _breaks_rule(course: Course, before: Moment, after: Moment) -> Array:
@@ -323,7 +182,7 @@ def _score(trial: Trial, case: RallyCase, course: Course, passes: Array, contact
     return dataclasses.replace(
         trial,
         hits=trial.hits + hit,
-        last=_pick(counts, last, trial.last),
+        last=pick(counts, last, trial.last),
         worst_offset=jnp.maximum(trial.worst_offset, offset),
         sum_offset=trial.sum_offset + offset,
         aimed=trial.aimed + comes,
@@ -343,14 +202,14 @@ def _plan(
     robots, now = jnp.arange(num), trial.time + loop.period
     ahead = trial.plan.strokes.time.shape[-1]
     turn, own = trial.hits % num, _own_hits(trial, robots)
-    balls: PyTree = (_predict(trial, loop, loop.period), jnp.zeros_like(now))
+    balls: PyTree = (predict(trial, loop, loop.period), jnp.zeros_like(now))
     balls = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (num, *leaf.shape)), balls)
     if num > 1:
         index = jnp.clip(own[turn] - trial.planned[turn], 0, ahead - 1)
         stroke = _at(_at(trial.plan.strokes, turn), index)
         struck = BallState(stroke.ball_pos, stroke.ball_vel_after)
         returned = struck, trial.began[turn] + stroke.time - now
-        balls = _pick(robots == turn, balls, jax.tree.map(lambda leaf: leaf[None], returned))
+        balls = pick(robots == turn, balls, jax.tree.map(lambda leaf: leaf[None], returned))
     tell = dataclasses.replace(
         case, drag=trial.estimate.drag, restitution=trial.restitution.estimate - 1.0
     )
@@ -415,7 +274,7 @@ def fly_on(
         trial, frames = lax.scan(body, trial, None, length=loop.observations_per_plan)
         began = jnp.broadcast_to(trial.time, planned.shape)
         old = trial.plan, trial.began, trial.planned
-        plan, began, planned = _pick(good, (plan, began, planned), old)
+        plan, began, planned = pick(good, (plan, began, planned), old)
         violation = plan.violation[trial.hits % began.size]
         last = dataclasses.replace(trial.last, violation=violation)
         trial = dataclasses.replace(trial, plan=plan, began=began, planned=planned, last=last)
@@ -490,7 +349,7 @@ def begin_trials(
 
 def first_cases(loop: Loop, trials: Trial, cases: RallyCase, ahead: int) -> RallyCase:
     """Return the first planning problems, of `ahead` hits, of first robots, as they know them."""
-    balls = jax.jit(jax.vmap(lambda trial: _predict(trial, loop, 0.0)))(trials)
+    balls = jax.jit(jax.vmap(lambda trial: predict(trial, loop, 0.0)))(trials)
     return dataclasses.replace(
         cases,
         ball=balls,

@@ -21,7 +21,7 @@ OUTSIDE = ("sims", "policies", "benchmarks")
 # All packages. A module may import its own package, and packages that precede it in this list.
 LAYERS = (
     *("host", "core", "lanes", "referee"),
-    *("ball", "trajectory", "robot", "space", "plane"),
+    *("ball", "trajectory", "space", "robot", "plane"),
     *("cost", "optimise", "planning", "recovery"),
     *("runs", "task", "baselines"),
     *("export", "sweep", "live", "__init__"),

@@ -20,8 +20,8 @@ from planner_jax.core.protocol import BaseAttempt, Plan, outcome
 from planner_jax.optimise.levenberg import LevenbergConfig
 from planner_jax.optimise.settings import Attempt, LbfgsConfig
 from planner_jax.plane.reach import Lattice
-from planner_jax.task.block.default_planner import Search as BlockSearch
-from planner_jax.task.intercept.problem import MotionProblem
+from planner_jax.task.block.search.attempts import Search as BlockSearch
+from planner_jax.task.intercept.problem.motion_problem import MotionProblem
 from planner_jax.task.intercept.searches import Search
 
 NUM = 6  # Number of cases in a batch, which fits into the smallest padded batch size.

@@ -14,7 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from planner_jax.core.errors import ArgumentError
 from planner_jax.referee.arm_torque import Dynamics
-from planner_jax.robot.arm_file import Shield, describe_arm, irb1600, read_arm
+from planner_jax.robot.arm_file import describe_arm, irb1600, read_arm
+from planner_jax.robot.arm_shield import Shield
 from planner_jax.robot.capsule_fit import cover, measure_excess
 
 mujoco = pytest.importorskip("mujoco")

@@ -19,10 +19,12 @@ from planner_jax.robot.arm_dynamics import (
     stretch,
 )
 from planner_jax.robot.arm_file import irb1600
-from planner_jax.task.block.default_planner import OnlineBlock, Search
-from planner_jax.task.block.end_poses import end_poses, flight_of
-from planner_jax.task.block.motion import polynomial
-from planner_jax.task.block.scene import paper_scene
+from planner_jax.robot.arm_motion import polynomial
+from planner_jax.robot.arm_scene import paper_scene
+from planner_jax.task.block.default_planner import OnlineBlock
+from planner_jax.task.block.problem.end_poses import end_poses
+from planner_jax.task.block.problem.flight import flight_of
+from planner_jax.task.block.search.attempts import Search
 from planner_jax.task.reach.default_planner import ReachPlan
 from planner_jax.task.reach.default_planner import Search as Direct
 

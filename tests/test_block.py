@@ -12,26 +12,25 @@ from planner_jax.core.plan_files import leaves_by_name
 from planner_jax.optimise.levenberg import LevenbergConfig
 from planner_jax.referee.arm_clearance import KINDS
 from planner_jax.referee.arm_clearance import clearances as referee_clearances
-from planner_jax.referee.block import entry_time as body_entry_time
+from planner_jax.referee.ball_in_box import entry_time as body_entry_time
 from planner_jax.robot.arm import REGIMES, reach_of
-from planner_jax.robot.arm_file import irb1600
-from planner_jax.runs.timing import CompileClock
-from planner_jax.sweep.block.settings import REGIMES as SWEPT
-from planner_jax.task.block.clearance import (
+from planner_jax.robot.arm_clearance import (
     clearances,
     clearances_and_slopes,
     least_clearances,
     num_of_obstacles,
 )
-from planner_jax.task.block.default_planner import (
-    OnlineBlock,
-    Search,
-    rank_poses,
-    read_learned_starts,
-)
-from planner_jax.task.block.end_poses import contact_terms, end_poses, flight_of
-from planner_jax.task.block.motion import angles_at, polynomial, profiles, step_weights
-from planner_jax.task.block.scene import entry_time, make_scene, paper_scene
+from planner_jax.robot.arm_file import irb1600
+from planner_jax.robot.arm_motion import angles_at, polynomial, profiles, step_weights
+from planner_jax.robot.arm_scene import make_scene, paper_scene
+from planner_jax.runs.timing import CompileClock
+from planner_jax.sweep.block.settings import REGIMES as SWEPT
+from planner_jax.task.block.default_planner import OnlineBlock
+from planner_jax.task.block.problem.end_poses import end_poses
+from planner_jax.task.block.problem.flight import entry_time, flight_of
+from planner_jax.task.block.problem.terms import contact_terms
+from planner_jax.task.block.search.attempts import Search, read_learned_starts
+from planner_jax.task.block.search.least_squares import rank_poses
 from planner_jax.trajectory.polynomial import evaluate
 from tests.derivatives import double
 from tests.trees import as_numpy

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import planner_jax as pj
-from planner_jax.task.block.motion import least_times
-from planner_jax.task.block.scene import paper_scene
+from planner_jax.robot.arm_motion import least_times
+from planner_jax.robot.arm_scene import paper_scene
 
 OPEN = paper_scene(has_pole=False)
 BALL = (9.0, 0.5, 0.3), (-8.0, -0.4, 5.4)

@@ -14,7 +14,7 @@ from planner_jax.sims.perception.camera import in_view, looking_at
 from planner_jax.sims.perception.contact_check import end_at_contact
 from planner_jax.sims.perception.flight_fit import Sight, belief_at, error_across
 from planner_jax.sims.perception.observation import cautious, eye, frame_times, mast_camera, see
-from planner_jax.task.block.end_poses import flight_of
+from planner_jax.task.block.problem.flight import flight_of
 
 
 @pytest.mark.parametrize("suite", ["pole", "short"])

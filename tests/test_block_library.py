@@ -23,8 +23,8 @@ from planner_jax.core import GRAVITY
 from planner_jax.core.errors import ArgumentError
 from planner_jax.robot.arm import REGIMES
 from planner_jax.robot.arm_file import irb1600
-from planner_jax.task.block.motion import profiles
-from planner_jax.task.block.scene import Box, paper_scene
+from planner_jax.robot.arm_motion import profiles
+from planner_jax.robot.arm_scene import Box, paper_scene
 from tests.trees import assert_same
 
 TINY = Layout((Face(0, 1, (2, 2)), Face(2, 1, (1, 2))), (Face(0, 1, (2, 2)),))

@@ -22,9 +22,9 @@ from planner_jax.core.errors import MissingExtra, install_line
 from planner_jax.robot.arm import REGIMES
 from planner_jax.robot.arm_dynamics import inverse_dynamics
 from planner_jax.robot.arm_file import irb1600
+from planner_jax.robot.arm_motion import least_times
 from planner_jax.sweep.block.settings import BlockSettings
 from planner_jax.sweep.block.sweep import BlockSweep
-from planner_jax.task.block.motion import least_times
 from planner_jax.task.block.spec import TASK
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
 

@@ -4,13 +4,14 @@ import os
 
 import numpy as np
 import pytest
+import typecheck
 
 from planner_jax.core.errors import ArgumentError
 from planner_jax.referee import solids
 from planner_jax.robot.arm_file import irb1600
+from planner_jax.robot.arm_scene import make_scene
+from planner_jax.robot.arm_scene_file import read_scene, read_shield, shield_arm
 from planner_jax.robot.capsule_fit import directions, measure_excess
-from planner_jax.task.block.scene import make_scene
-from planner_jax.task.block.scene_file import read_scene, read_shield, shield_arm
 
 SCENE = """
 boxes: [{middle: [0.7, -0.8, 1.0], size: [0.2, 0.1, 0.3]}]
@@ -106,6 +107,7 @@ def test_a_scene_file_lists_obstacles_and_the_protected_body(tmp_path):
     ],
 )
 def test_a_wrong_element_of_a_scene_file_is_named(tmp_path, monkeypatch, text, message):
+    monkeypatch.setattr(typecheck, "is_on", False)  # for the library's own checks
     monkeypatch.chdir(tmp_path)
     (tmp_path / "a.yaml").write_text(text)
     (tmp_path / "flat.obj").write_text(SQUARE.format(0))
@@ -141,7 +143,8 @@ ZERO, UNIT, TURN = (0, 0, 0), (1, 1, 1), (1, 0, 0, 0)
         ({"meshes": [(np.eye(4, 3), 0, ZERO, TURN)]}, r"meshes\[0\].scale must be > 0, got 0"),
     ],
 )
-def test_a_wrong_entry_of_a_scene_is_named(solids, message):
+def test_a_wrong_entry_of_a_scene_is_named(monkeypatch, solids, message):
+    monkeypatch.setattr(typecheck, "is_on", False)  # for the library's own checks
     with pytest.raises(ArgumentError, match=f"^{message}") as error:
         make_scene(**solids)
     assert "\n" not in str(error.value)

@@ -12,9 +12,9 @@ from planner_jax.benchmarks.latency import begin_replans
 from planner_jax.optimise.levenberg import LevenbergConfig
 from planner_jax.robot.car import pose_at
 from planner_jax.robot.car_motion import Quadratic, by_unknowns, motion
-from planner_jax.task.intercept.problem import MotionProblem
+from planner_jax.task.intercept.problem.motion_problem import MotionProblem
+from planner_jax.task.intercept.problem.terms import Weights
 from planner_jax.task.intercept.searches import make_field, make_grid
-from planner_jax.task.intercept.terms import Weights
 from tests.planners import ONE_SEARCH, with_room
 from tests.trees import as_numpy
 

@@ -11,7 +11,7 @@ import pytest
 import planner_jax as pj
 from planner_jax.plane.target import LaterPath
 from planner_jax.robot.car import pose_at
-from planner_jax.task.intercept import terms
+from planner_jax.task.intercept.problem import bounds
 
 NUM, KNOTS, SPEED = 1000, 9, 1.5
 
@@ -47,7 +47,7 @@ def driven():
 
 @pytest.mark.parametrize("is_time_free", [False, True])
 def test_a_target_that_a_drive_meets_is_never_too_far(driven, is_time_free):
-    is_too_far = jax.jit(jax.vmap(partial(terms.is_too_far, is_time_free=is_time_free)))
+    is_too_far = jax.jit(jax.vmap(partial(bounds.is_too_far, is_time_free=is_time_free)))
     assert not is_too_far(driven).any()
     other = dataclasses.replace(driven, target=pj.take(driven.target, np.arange(NUM)[::-1]))
     assert 0.3 < is_too_far(other).mean() < 0.6
@@ -56,7 +56,7 @@ def test_a_target_that_a_drive_meets_is_never_too_far(driven, is_time_free):
 def shortest(goal, **numbers):
     target = pj.TurningPath(jnp.array([0.0, 0.0]), jnp.zeros(2), jnp.array(0.0))
     case = pj.intercept.case(target, start=(0.0, 0.0, 0.0), **{"tolerance": 1e-6, **numbers})
-    return float(terms.shortest_drive(case, jnp.asarray(goal), jnp.zeros(())))
+    return float(bounds.shortest_drive(case, jnp.asarray(goal), jnp.zeros(())))
 
 
 def test_a_drive_straight_ahead_or_back_is_as_long_as_its_distance():

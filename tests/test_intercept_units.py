@@ -9,7 +9,7 @@ from flax import struct
 import planner_jax as pj
 from planner_jax.plane.obstacles import place
 from planner_jax.task.intercept.plan import make_plan
-from planner_jax.task.intercept.terms import least_between, nearest_in_region
+from planner_jax.task.intercept.problem.clearance import least_between, nearest_in_region
 
 BOX = np.array([[-1.0, -0.5], [1.0, -0.5], [1.0, 0.5], [-1.0, 0.5]])
 

@@ -19,8 +19,8 @@ from planner_jax.plane.make_obstacles import obstacles
 from planner_jax.plane.obstacles import separation
 from planner_jax.plane.reach import Lattice
 from planner_jax.robot.car import pose_at
+from planner_jax.task.intercept.problem.clearance import ends_of
 from planner_jax.task.intercept.searches import Search
-from planner_jax.task.intercept.terms import ends_of
 
 SQUARE = np.array([[-0.2, -0.2], [0.2, -0.2], [0.2, 0.2], [-0.2, 0.2]])
 

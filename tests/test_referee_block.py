@@ -14,11 +14,12 @@ from scipy.spatial.transform import Rotation
 
 from planner_jax.referee import block, solids
 from planner_jax.referee.arm_clearance import KINDS, clearances
-from planner_jax.referee.block import LIMITS, BlockVerdict, referee_blocks, times_inside
+from planner_jax.referee.ball_in_box import times_inside
+from planner_jax.referee.block import LIMITS, BlockVerdict, referee_blocks
 from planner_jax.robot.arm import REGIMES, shield_pose
 from planner_jax.robot.arm_file import irb1600
+from planner_jax.robot.arm_scene import ABSENT, make_scene
 from planner_jax.task.block.case import case
-from planner_jax.task.block.scene import ABSENT, make_scene
 
 GRAVITY, DELAY, SPAN = 9.81, 0.1, 0.9
 CONTACT_TIME = DELAY + SPAN

@@ -73,7 +73,7 @@ def assert_one_line(call, rule, kind=UnknownName):
     assert "\n" not in str(caught.value)
 
 
-TASKS = ["hit", "rally", "catch", "team", "intercept", "group", "block"]
+TASKS = ["hit", "rally", "catch", "team", "intercept", "group", "block", "reach"]
 
 
 @pytest.mark.parametrize("name", TASKS)

@@ -20,7 +20,11 @@ from planner_jax.core import GRAVITY
 from planner_jax.core.errors import ArgumentError
 from planner_jax.referee.arm_clearance import KINDS
 from planner_jax.robot.arm import shield_pose
-from planner_jax.robot.arm_file import Shield, irb1600
+from planner_jax.robot.arm_file import irb1600
+from planner_jax.robot.arm_motion import polynomial, profiles
+from planner_jax.robot.arm_scene import FLOOR
+from planner_jax.robot.arm_shield import Shield
+from planner_jax.sims.block_settings import BlockFly
 from planner_jax.sims.execution import FRAME, TIMESTEP, Executed, execute
 from planner_jax.sims.film import draw_flight
 from planner_jax.sims.launch import flight_keys
@@ -32,7 +36,6 @@ from planner_jax.sims.robots.arm.control import Course, reference_at
 from planner_jax.sims.robots.arm.drives import IDEAL, TORQUES, Drives
 from planner_jax.sims.robots.arm.robot import ShieldArm
 from planner_jax.sims.scenery import box_solid, capsule_solid
-from planner_jax.sims.settings import BlockFly
 from planner_jax.sims.tasks.block_flights import (
     BLOCK_ARM,
     BLOCK_WORLD,
@@ -47,8 +50,6 @@ from planner_jax.sims.tasks.block_flights import (
 from planner_jax.sims.tasks.block_shown import ground_of, scenery
 from planner_jax.sims.tasks.intercept import CAR_WORLD
 from planner_jax.sims.view import Viewer
-from planner_jax.task.block.motion import polynomial, profiles
-from planner_jax.task.block.scene import FLOOR
 
 HOME, LANES = np.asarray(irb1600().home), 4  # all batches are of one size: one program
 TURN = np.array([-0.4, -0.5, 0.4, 0.6, -0.5, 0.8])  # [rad], of a motion without collisions

@@ -11,7 +11,7 @@ import pytest
 from planner_jax.ball.estimation import EkfState
 from planner_jax.ball.flight import BallState, fly
 from planner_jax.core.errors import ArgumentError
-from planner_jax.sims import rally_loop
+from planner_jax.sims import rally_ball, rally_loop, rally_state
 from planner_jax.sims.scoring import racket_impact
 from planner_jax.sims.sensing import RlsState
 from planner_jax.sims.settings import RallyFly
@@ -28,7 +28,7 @@ BALL = BallState(jnp.asarray([0.1, 0.2, 1.6]), jnp.asarray([0.3, -0.2, -4.0]))
 def trial(time, bounce_time, is_due):
     """Return the part of a trial that belongs to the estimate of its ball."""
     belief = EkfState(jnp.concatenate([BALL.pos, BALL.vel]), jnp.diag(jnp.full(6, 1e-4)))
-    bounce = rally_loop.Bounce(
+    bounce = rally_state.Bounce(
         jnp.asarray(bounce_time), TOOL_VEL, NORMAL, jnp.zeros(3), jnp.asarray(is_due), jnp.ones(())
     )
     return types.SimpleNamespace(
@@ -39,14 +39,14 @@ def trial(time, bounce_time, is_due):
     )
 
 
-FIELDS = [field.name for field in dataclasses.fields(rally_loop.Trial)]
+FIELDS = [field.name for field in dataclasses.fields(rally_state.Trial)]
 LOOP = types.SimpleNamespace(
     world=types.SimpleNamespace(gravity=9.8), sensing=types.SimpleNamespace(latency=0.02)
 )
 
 
 def test_a_ball_is_predicted_across_an_impact_that_is_felt_but_not_yet_seen():
-    ball = rally_loop._predict(trial(1.0, 0.99, True), LOOP, 0.1)
+    ball = rally_ball.predict(trial(1.0, 0.99, True), LOOP, 0.1)
     there = fly(BALL, jnp.asarray(0.01), DRAG, GRAVITY, num_steps=4)[0]
     vel = racket_impact(there.vel, TOOL_VEL, NORMAL, jnp.asarray(0.7))
     after = fly(BallState(there.pos, vel), jnp.asarray(0.11), DRAG, GRAVITY, num_steps=4)[0]
@@ -55,7 +55,7 @@ def test_a_ball_is_predicted_across_an_impact_that_is_felt_but_not_yet_seen():
 
 
 def test_an_impact_that_was_seen_does_not_change_the_prediction():
-    ball = rally_loop._predict(trial(1.0, 0.5, False), LOOP, 0.1)
+    ball = rally_ball.predict(trial(1.0, 0.5, False), LOOP, 0.1)
     after = fly(BALL, jnp.asarray(0.12), DRAG, GRAVITY, num_steps=4)[0]
     np.testing.assert_allclose(ball.pos, after.pos, atol=1e-5)
 
@@ -63,7 +63,7 @@ def test_an_impact_that_was_seen_does_not_change_the_prediction():
 def test_the_covariance_across_an_impact_has_the_jacobian_of_the_impact_map():
     state = trial(1.0, 0.99, True)
     belief = state.estimate.belief
-    after = rally_loop._reflect_belief(state, belief)
+    after = rally_ball.reflect_belief(state, belief)
     slope = np.eye(6)
     of = lambda vel: racket_impact(vel, TOOL_VEL, NORMAL, jnp.asarray(0.7))  # noqa: E731
     slope[3:, 3:] = jax.jacfwd(of)(BALL.vel)
@@ -118,12 +118,12 @@ def test_balls_of_every_third_hit_count_in_the_circle(aside, inside):
     )
     counts = []
     for hits in range(7):
-        state = rally_loop.Trial(**dict.fromkeys(FIELDS, zero)).replace(
+        state = rally_state.Trial(**dict.fromkeys(FIELDS, zero)).replace(
             restitution=RlsState(zero, zero),
             estimate=types.SimpleNamespace(drag=zero),
             hits=jnp.asarray(hits),
             lost=jnp.zeros((), bool),
-            last=rally_loop.Passage(*[zero] * 6),
+            last=rally_state.Passage(*[zero] * 6),
         )
         after = rally_loop._score(state, case, COURSES["target"], jnp.ones((), bool), contact)
         assert int(after.hits) == hits + 1

@@ -11,8 +11,8 @@ import planner_jax as pj
 from planner_jax.cli.main import main
 from planner_jax.cli.plan.settings import SingleBlockSettings
 from planner_jax.sims import view
-from planner_jax.task.block.default_planner import StraightSearch
 from planner_jax.task.block.plan import make_empty_plan
+from planner_jax.task.block.search.attempts import StraightSearch
 from planner_jax.task.block.suites import scene_for
 
 BALL = ["--pos", "9", "0.5", "0.3", "--vel", "-8", "-0.4", "5.4"]

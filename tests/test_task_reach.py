@@ -11,14 +11,14 @@ from scipy.spatial.transform import Rotation
 
 import planner_jax as pj
 from planner_jax.robot.arm import shield_pose
+from planner_jax.robot.arm_clearance import clearances, clearances_and_slopes
 from planner_jax.robot.arm_file import irb1600
-from planner_jax.task.block.clearance import clearances, clearances_and_slopes
 from planner_jax.task.reach import shortcut, tree
 from planner_jax.task.reach.default_planner import ReachPlan, Search, TreeSearch
 from planner_jax.task.reach.motion import join_knots, pad_knots, straight_knots
 from planner_jax.trajectory.polynomial import PiecewisePolynomial
 from tests.derivatives import double
-from tests.trees import as_numpy
+from tests.trees import as_numpy, assert_same
 
 ARM = irb1600()
 START, GOAL = (np.array([side, 0.3, -0.3, 0.0, 0.6, 0.0], np.float32) for side in (-0.8, 0.8))
@@ -332,3 +332,13 @@ def test_trees_find_a_path_through_a_gap():
     steps = np.linspace(points[:-1], points[1:], 50).reshape(-1, 2)
     assert np.mean(jax.jit(free)(steps)) > 0.99
     assert not find(1)[1]
+
+
+def test_drawn_motions_start_and_end_free_on_both_sides_of_the_box():
+    cases = pj.reach.draw(200, seed=3)
+    states = np.concatenate([cases.angles[:, None], cases.goals], axis=1)
+    apart = jax.jit(jax.vmap(lambda case, at: clearances(case.arm, case.scene, at)))
+    assert (np.asarray(apart(cases, states)) > 0.0).all()
+    assert (states[:, 0, 0] < -1.0).all() and (states[:, 1, 0] > 1.0).all()
+    later = pj.reach.draw(2, "pillar", 3, first=5)
+    assert_same(later, pj.take(cases, slice(5, 7)))

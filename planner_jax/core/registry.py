@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 _GROUP = "planner_jax"
 _OWN = {
     name: f"planner_jax.task.{name}.spec:TASK"
-    for name in ("hit", "rally", "catch", "team", "intercept", "group", "block")
+    for name in ("hit", "rally", "catch", "team", "intercept", "group", "block", "reach")
 }
 
 

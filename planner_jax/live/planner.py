@@ -11,7 +11,7 @@ import dataclasses
 import math
 import time
 from collections.abc import Callable, Hashable
-from typing import Any, Generic
+from typing import Generic
 
 import numpy as np
 
@@ -20,16 +20,14 @@ from planner_jax.core.choices import require
 from planner_jax.core.protocol import Status, is_solved
 from planner_jax.live import packets
 from planner_jax.live.arrivals import Arrivals
-from planner_jax.live.course import (
-    Course,
-    Query,
-    hold_heading,
-    recovery_from,
-    setpoints_of,
-    state_of,
-    with_recovery,
-    without_recovery,
-    yaw_of,
+from planner_jax.live.course import hold_heading, recovery_from, state_of, with_recovery
+from planner_jax.live.flights import (
+    Flight,
+    flight_of,
+    heading_at,
+    is_absurd,
+    joins,
+    sample_setpoints,
 )
 from planner_jax.live.packets import (
     BALL,
@@ -45,37 +43,19 @@ from planner_jax.live.packets import (
 from planner_jax.live.report import Report
 from planner_jax.live.sight import Sight
 from planner_jax.live.strokes import CaseT, PlanT, Stroke
-from planner_jax.planning.programs import call_packed
 
 _PATIENCE = 0.2  # fraction of the deadline for which an answer waits for a new plan
 _ASTRAY = 0.5  # [m], distance from the planned position above which the robot is stopped
-# Greatest jump of position [m] and velocity [m/s] from the current trajectory to a new plan, if the
-# plan is found only after its own starting time.
-_JOIN = (0.02, 0.2)
 _KNOWN = 0.3  # [m/s], standard deviation of a ball's velocity below which planning starts
-# States of the robot below this height [m], or with a greater acceleration [m/s^2], are absurd, and
-# so are states with a speed above this multiple of the speed limit.
-_LOWEST, _ABRUPT, _FASTEST = -1.0, 100.0, 3.0
 _FORGOTTEN = 1.0  # [s], after which the number of a ball that was hit or caught is another ball
 _NOTHING = np.zeros((0, WIDTH), np.float32)
-
-
-@dataclasses.dataclass(frozen=True)
-class _Flight(Generic[PlanT]):
-    """A trajectory of the robot to standstill, and the plan that is its first part, if any."""
-
-    course: Course
-    start: float  # [s], time at which the trajectory starts, by the senders' clock
-    plan: PlanT | None = None  # None if the trajectory only leads to standstill
-    contact: float = math.nan  # [s], time at which the plan meets the ball, same clock
-    ball: int = -1  # number of the ball that the plan meets
 
 
 @dataclasses.dataclass(frozen=True)
 class _Job(Generic[PlanT]):
     """A search for a plan, which runs in the planning thread."""
 
-    found: concurrent.futures.Future[_Flight[PlanT] | None]
+    found: concurrent.futures.Future[Flight[PlanT] | None]
     start: float  # [s], time at which the plan starts, by the senders' clock
     ball: int  # number of the ball that the plan meets
 
@@ -116,14 +96,14 @@ class LivePlanner(Generic[CaseT, PlanT]):
         self._forget()
 
     def _forget(self) -> None:
-        self._flight: _Flight[PlanT] | None = None
+        self._flight: Flight[PlanT] | None = None
         # Trajectory before the current plan. The robot returns to it if no trajectory from the
         # end of the plan to standstill keeps the limits.
-        self._before: _Flight[PlanT] | None = None
+        self._before: Flight[PlanT] | None = None
         self._job: _Job[PlanT] | None = None
         # For each ball that the robot has hit or caught, the time [s] of its last observation.
         self._done: dict[int, float] = {}
-        self._met: _Flight[PlanT] | None = None  # the flight that has hit or caught its ball
+        self._met: Flight[PlanT] | None = None  # the flight that has hit or caught its ball
         self._reason = Reason.NO_BALL
         self._sight.forget()
 
@@ -138,14 +118,16 @@ class LivePlanner(Generic[CaseT, PlanT]):
         `say` receives a line of text after every part.
         """
         state = np.asarray(self.stroke.case.head_state)
-        self._setpoints(self._recover(state, 0.0), 0.0)
+        sample_setpoints(self._recover(state, 0.0), 0.0, self._period, self._num)
         say("Compiled recoveries and setpoints, part 1 of 3.")
         ball = None
         for k in range(3):  # three observations of a ball that flies towards the robot
             pos = tuple(state[0] + (4.0 - 0.1 * k, 0.0, 0.1 * k))
             ball, _ = self._sight.see(0, pos, 0.01 * k, 0.01 * k)
         assert ball is not None
-        plan = self._worker.submit(self.stroke.first, ball, state, self._yaw(None, 0.0)).result()
+        plan = self._worker.submit(
+            self.stroke.first, ball, state, heading_at(self.stroke, None, 0.0)
+        ).result()
         say("Compiled the estimate of a ball and plans from scratch, part 2 of 3.")
         self._worker.submit(self.stroke.again, plan, 0.01, ball).result()
         say("Compiled plans that continue earlier ones, part 3 of 3.")
@@ -168,13 +150,13 @@ class LivePlanner(Generic[CaseT, PlanT]):
             self.fault = packet
             report.faults[packet] += 1
             return None
-        if not packet.fault and self._is_absurd(packet):
+        if not packet.fault and is_absurd(packet, float(self._limits.speed)):
             packet = dataclasses.replace(packet, fault=Fault.ABSURD)
         self.fault, is_anew = self._arrivals.check(packet, sender, received)
         if self.fault:
             report.faults[self.fault] += 1
             is_answered = self._arrivals.begin_refusal(sender, received)
-            return self._encode(packet, packet.sent) if is_answered else None
+            return self._pack(packet, packet.sent) if is_answered else None
         if is_anew:
             report.counts["clocks"] += 1
             self._forget()
@@ -191,7 +173,7 @@ class LivePlanner(Generic[CaseT, PlanT]):
             report.counts["used"] += 1
             report.counts["late"] += self._arrivals.was_late
         with report.stages["setpoints"].measure():
-            return self._pack(packet, due)
+            return self._pack(packet, due, self._flight)
 
     def record_sent(self, data: bytes, received: float) -> None:
         """Record a sent answer's delay; only then compute the stop after a new plan."""
@@ -202,13 +184,6 @@ class LivePlanner(Generic[CaseT, PlanT]):
         if data[5] == BALL and (not self.fault or self.fault in USUAL):
             self.report.stages["ball"].add(taken)
         self._complete()
-
-    def _is_absurd(self, packet: Packet) -> bool:
-        if packet.kind == BALL:
-            return False
-        speed, rise = (math.hypot(*packet.values[k : k + 3]) for k in (3, 6))
-        is_slow = speed <= _FASTEST * float(self._limits.speed) and rise <= _ABRUPT
-        return not is_slow or packet.values[2] < _LOWEST
 
     def _use_robot(self, packet: Packet, due: float, _: float) -> Fault:
         self._collect(due)
@@ -226,19 +201,12 @@ class LivePlanner(Generic[CaseT, PlanT]):
         self._before = self._job = None
         return Fault.NONE
 
-    def _recover(self, state: np.ndarray, start: float) -> _Flight[PlanT]:
+    def _recover(self, state: np.ndarray, start: float) -> Flight[PlanT]:
         course, is_within = recovery_from(state, self.stroke.pieces, self._gravity, self._limits)
         self.report.counts["hard_rests"] += not is_within
-        if (yaw := self._yaw(self._flight, start)) is not None:
+        if (yaw := heading_at(self.stroke, self._flight, start)) is not None:
             course = dataclasses.replace(course, heading=hold_heading(yaw[0]))
-        return _Flight(course, start)
-
-    def _yaw(self, flight: _Flight[PlanT] | None, due: float) -> np.ndarray | None:
-        """Return the heading and its derivative (2,) at the time `due`; None without a request."""
-        if flight is not None:
-            return yaw_of(flight.course, due - flight.start)
-        request = self.stroke.case.heading
-        return None if request is None else np.asarray(request.start)
+        return Flight(course, start)
 
     def _use_ball(self, packet: Packet, due: float, received: float) -> Fault:
         begun, number = self._sight.begun, packet.ball
@@ -265,7 +233,7 @@ class LivePlanner(Generic[CaseT, PlanT]):
             self.report.counts["busy"] += self._job is not None
         return fault
 
-    def _is_worth_planning(self, flight: _Flight[PlanT], ball: int, due: float) -> bool:
+    def _is_worth_planning(self, flight: Flight[PlanT], ball: int, due: float) -> bool:
         if not self._sight.is_known(ball, _KNOWN):
             if ball not in self._done:
                 self._reason = Reason.UNCERTAIN
@@ -276,29 +244,24 @@ class LivePlanner(Generic[CaseT, PlanT]):
         return ball not in self._done and not (is_busy and self._sight.is_seen(flight.ball))
 
     def _search(
-        self, ball: BallState, flight: _Flight[PlanT], number: int, due: float
-    ) -> _Flight[PlanT] | None:
+        self, ball: BallState, flight: Flight[PlanT], number: int, due: float
+    ) -> Flight[PlanT] | None:
         elapsed, stages = due - flight.start, self.report.stages
         if flight.plan is not None and flight.ball == number:
             with stages["again"].measure():
                 plan = self.stroke.again(flight.plan, elapsed, ball)
             if is_solved(plan.status):
-                return self._flight_of(plan, number, due)
+                return flight_of(self.stroke, plan, number, due)
             self.report.counts["refused"] += 1
         with stages["first"].measure():
-            yaw = self._yaw(flight, due)
+            yaw = heading_at(self.stroke, flight, due)
             plan = self.stroke.first(ball, state_of(flight.course, elapsed), yaw)
         if is_solved(plan.status):
-            return self._flight_of(plan, number, due)
+            return flight_of(self.stroke, plan, number, due)
         self.report.counts["refused"] += 1
         is_too_far = plan.status in (Status.TOO_FAR, Status.OUT_OF_REACH)
         self._reason = Reason.TOO_FAR if is_too_far else Reason.NO_PLAN
         return None
-
-    def _flight_of(self, plan: PlanT, ball: int, due: float) -> _Flight[PlanT]:
-        course = without_recovery(plan.trajectory, self._gravity, self._limits.air)
-        course = dataclasses.replace(course, heading=plan.heading)
-        return _Flight(course, due, plan, due + self.stroke.contact(plan), ball)
 
     def _collect(self, due: float) -> None:
         flight, job = self._flight, self._job
@@ -311,7 +274,7 @@ class LivePlanner(Generic[CaseT, PlanT]):
         found = job.found.result()
         if found is None or flight is None or job.ball in self._done:
             return
-        if due > job.start and not self._joins(flight, found, due):
+        if due > job.start and not joins(flight, found, due):
             self.report.counts["unjoined"] += 1
             self._reason = Reason.TOO_LATE
             return
@@ -333,31 +296,14 @@ class LivePlanner(Generic[CaseT, PlanT]):
         self._reason = self._reason if is_within else Reason.NO_RECOVERY
         self._before = None
 
-    def _joins(self, flight: _Flight[PlanT], found: _Flight[PlanT], due: float) -> bool:
-        old, new = (state_of(each.course, due - each.start) for each in (flight, found))
-        return all(math.dist(old[k], new[k]) <= _JOIN[k] for k in range(2))
-
-    def _pack(self, packet: Packet, due: float) -> bytes:
-        flight = self._flight
-        if flight is None:
-            return self._encode(packet, due)
-        due = max(due, flight.start)
-        motion = Motion.PLAN if due < flight.contact else Motion.SAFE
-        contact = flight.contact if motion is Motion.PLAN else math.nan
-        return self._encode(packet, due, motion, contact, self._setpoints(flight, due))
-
-    def _encode(
-        self,
-        packet: Packet,
-        begin: float,
-        motion: Motion = Motion.NONE,
-        contact: float = math.nan,
-        setpoints: np.ndarray = _NOTHING,
-    ) -> bytes:
+    def _pack(self, packet: Packet, begin: float, flight: Flight[PlanT] | None = None) -> bytes:
+        """Return an answer, with the setpoints of a trajectory if there is one."""
+        motion, contact, setpoints = Motion.NONE, math.nan, _NOTHING
+        if flight is not None:
+            begin = max(begin, flight.start)
+            motion = Motion.PLAN if begin < flight.contact else Motion.SAFE
+            contact = flight.contact if motion is Motion.PLAN else math.nan
+            setpoints = sample_setpoints(flight, begin, self._period, self._num)
         reason = Reason.NONE if motion is Motion.PLAN else self._reason
         times = begin, self._period, contact
         return packets.answer(packet, self.fault, motion, reason, times, setpoints)
-
-    def _setpoints(self, flight: _Flight[PlanT], due: float) -> np.ndarray:
-        times: Any = np.float32(due - flight.start), np.float32(self._period)
-        return call_packed(setpoints_of, self._num, None, Query(flight.course, *times))

@@ -32,7 +32,8 @@ class ArmModel:
         """Read the file, or the text of a file, which begins with "<"."""
         self.source = ArmText(path)
         self.path, self.name, self.error = self.source.path, self.source.name, self.source.error
-        self.mujoco, self.model = self._compile()
+        # `weighed` has the bodies whose masses the file does not state.
+        self.mujoco, self.model, self.weighed = _compile(self.source)
         model = self.model
         bodies = self._follow(tip)
         joints = [j for body in bodies for j in self._joints_of(body)]
@@ -57,7 +58,7 @@ class ArmModel:
         self.tip = self.pose_of(
             *(self._find_tip(tip)[:2] if tip else ("body", moving[-1])), self.num - 1
         )
-        self._require_open()
+        _require_open(self)
 
     def pose_of(self, kind: str, index: int, link: int) -> tuple[np.ndarray, np.ndarray]:
         """Return position (3,) [m] and rotation (3, 3) of an element in the frame of a link."""
@@ -164,49 +165,6 @@ class ArmModel:
         torques = [min(-least, most) for least, most in map(sorted, ranges) if least or most]
         return max(min(torques, default=math.inf), 0.0)
 
-    def _compile(self) -> tuple[Any, Any]:
-        mujoco: Any = importlib.import_module("mujoco")  # slow to import
-        try:
-            spec = mujoco.MjSpec.from_string(self.source.text, include=self.source.includes)
-            spec.modelfiledir = "" if self.path is None else str(self.path.absolute().parent)
-            spec.compiler.fusestatic = False  # `tip` may name a body without a joint
-            for mesh in spec.meshes:
-                self._locate(spec, mesh)
-            model = spec.compile()
-            # Bodies whose masses MuJoCo computes by its own density, since the file states none.
-            self.weighed = {
-                body.id
-                for body in spec.bodies
-                if not body.explicitinertial and any(map(_has_default_mass, body.geoms))
-            }
-            return mujoco, model
-        except ArgumentError:
-            raise
-        except ValueError as error:
-            reason = " ".join(str(error).split())
-            raise self.error("the model", f"accepted by MuJoCo: {reason}", "be") from None
-
-    def _locate(self, spec: Any, mesh: Any) -> None:
-        """Find the file of a mesh, also if it is named by a package of ROS; raise without one."""
-        _, is_packaged, path = mesh.file.rpartition("://")
-        if not mesh.file or self.path is None:
-            return
-        base = Path(spec.modelfiledir)
-        if is_packaged:  # the package is a folder around the file, or beside one of them
-            around = [base, *base.parents]
-            names = (path, path.partition("/")[2])
-            places = [folder / name for folder in around for name in names if name]
-        else:
-            path = Path(path).name if spec.strippath else path
-            places = [base / (spec.meshdir or "") / path]
-        found = next(filter(os.path.isfile, places), None)
-        element = f'mesh "{mesh.name or Path(path).stem}"'
-        if found is None:
-            raise self.error(element, f"the file {mesh.file}; put it at {places[0]}")
-        if is_packaged:
-            self.source.check(element, found)
-            mesh.file = str(found)
-
     def _joints_of(self, body: int) -> list[int]:
         first, count = int(self.model.body_jntadr[body]), int(self.model.body_jntnum[body])
         return list(range(first, first + count))
@@ -269,26 +227,75 @@ class ArmModel:
             )
         return "body", names.index(tip), names.index(tip)
 
-    def _require_open(self) -> None:
-        """Raise if a constraint closes the chain, or couples its joints."""
-        model, kinds = self.model, self.mujoco.mjtEq
-        for k in range(model.neq):
-            both, kind = [int(model.eq_obj1id[k]), int(model.eq_obj2id[k])], kinds(model.eq_type[k])
-            element = f'equality "{model.eq(k).name or k}"'
-            if not model.eq_active0[k]:
-                continue
-            if kind == kinds.mjEQ_JOINT and set(both) & set(self.joints):
-                rule = "independent joints of the arm; remove it"
-                raise self.error(element, rule, "leave")
-            if kind in (kinds.mjEQ_CONNECT, kinds.mjEQ_WELD):
-                if model.eq_objtype[k] == self.mujoco.mjtObj.mjOBJ_SITE:
-                    both = [int(model.site_bodyid[site]) for site in both]
-                links = {BASE if body == 0 else int(self.link[body]) for body in both}
-                if len(links) > 1 and OUTSIDE not in links:
-                    names = " and ".join(model.body(body).name for body in both)
-                    rule = f"the chain open, but connects {names}; remove it"
-                    raise self.error(element, rule, "leave")
-
 
 def _has_default_mass(geom: Any) -> bool:
     return math.isnan(geom.mass) and geom.density == DENSITY
+
+
+def _compile(source: ArmText) -> tuple[Any, Any, set[int]]:
+    """Return the module mujoco, the model of a file, and the bodies without masses in the file.
+
+    MuJoCo computes the masses of these bodies by its own density.
+    """
+    mujoco: Any = importlib.import_module("mujoco")  # slow to import
+    try:
+        spec = mujoco.MjSpec.from_string(source.text, include=source.includes)
+        spec.modelfiledir = "" if source.path is None else str(source.path.absolute().parent)
+        spec.compiler.fusestatic = False  # `tip` may name a body without a joint
+        for mesh in spec.meshes:
+            _locate(source, spec, mesh)
+        model = spec.compile()
+        weighed = {
+            body.id
+            for body in spec.bodies
+            if not body.explicitinertial and any(map(_has_default_mass, body.geoms))
+        }
+        return mujoco, model, weighed
+    except ArgumentError:
+        raise
+    except ValueError as error:
+        reason = " ".join(str(error).split())
+        raise source.error("the model", f"accepted by MuJoCo: {reason}", "be") from None
+
+
+def _locate(source: ArmText, spec: Any, mesh: Any) -> None:
+    """Find the file of a mesh, also if it is named by a package of ROS; raise without one."""
+    _, is_packaged, path = mesh.file.rpartition("://")
+    if not mesh.file or source.path is None:
+        return
+    base = Path(spec.modelfiledir)
+    if is_packaged:  # the package is a folder around the file, or beside one of them
+        around = [base, *base.parents]
+        names = (path, path.partition("/")[2])
+        places = [folder / name for folder in around for name in names if name]
+    else:
+        path = Path(path).name if spec.strippath else path
+        places = [base / (spec.meshdir or "") / path]
+    found = next(filter(os.path.isfile, places), None)
+    element = f'mesh "{mesh.name or Path(path).stem}"'
+    if found is None:
+        raise source.error(element, f"the file {mesh.file}; put it at {places[0]}")
+    if is_packaged:
+        source.check(element, found)
+        mesh.file = str(found)
+
+
+def _require_open(arm: ArmModel) -> None:
+    """Raise an error if a constraint closes the chain of an arm, or couples its joints."""
+    model, kinds = arm.model, arm.mujoco.mjtEq
+    for k in range(model.neq):
+        both, kind = [int(model.eq_obj1id[k]), int(model.eq_obj2id[k])], kinds(model.eq_type[k])
+        element = f'equality "{model.eq(k).name or k}"'
+        if not model.eq_active0[k]:
+            continue
+        if kind == kinds.mjEQ_JOINT and set(both) & set(arm.joints):
+            rule = "independent joints of the arm; remove it"
+            raise arm.error(element, rule, "leave")
+        if kind in (kinds.mjEQ_CONNECT, kinds.mjEQ_WELD):
+            if model.eq_objtype[k] == arm.mujoco.mjtObj.mjOBJ_SITE:
+                both = [int(model.site_bodyid[site]) for site in both]
+            links = {BASE if body == 0 else int(arm.link[body]) for body in both}
+            if len(links) > 1 and OUTSIDE not in links:
+                names = " and ".join(model.body(body).name for body in both)
+                rule = f"the chain open, but connects {names}; remove it"
+                raise arm.error(element, rule, "leave")

@@ -14,9 +14,8 @@ from jax import Array, lax
 from planner_jax.ball.flight import drag_free_flight
 from planner_jax.robot.arm import shield_pose
 from planner_jax.task.block.case import BlockCase
-from planner_jax.task.block.end_poses import flight_of
-from planner_jax.task.block.motion import append_braking
-from planner_jax.task.block.plan import BlockPlan
+from planner_jax.task.block.plan import BlockPlan, append_braking
+from planner_jax.task.block.problem.flight import flight_of
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
 
 _SAMPLES = 256  # number of times at which the positions of ball and shield are compared

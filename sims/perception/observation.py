@@ -17,6 +17,7 @@ from jax import Array
 from planner_jax.ball.flight import BallState, drag_free_flight
 from planner_jax.core.arithmetic import host_leaf
 from planner_jax.core.choices import require
+from planner_jax.robot.arm_scene import RIG_HALF, Box
 from planner_jax.sims.perception.camera import Camera, looking_at
 from planner_jax.sims.perception.flight_fit import (
     FlightFit,
@@ -33,8 +34,7 @@ from planner_jax.sims.perception.noise import (
     stereo_noise,
 )
 from planner_jax.task.block.case import BlockCase
-from planner_jax.task.block.end_poses import flight_of
-from planner_jax.task.block.scene import RIG_HALF, Box
+from planner_jax.task.block.problem.flight import flight_of
 
 
 @struct.dataclass

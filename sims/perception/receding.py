@@ -37,9 +37,9 @@ from planner_jax.sims.perception.observation import (
 )
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.default_planner import OnlineBlock
-from planner_jax.task.block.end_poses import contact_terms, flight_of
-from planner_jax.task.block.motion import Weights, append_braking
-from planner_jax.task.block.plan import BlockPlan
+from planner_jax.task.block.plan import BlockPlan, append_braking
+from planner_jax.task.block.problem.flight import flight_of
+from planner_jax.task.block.problem.terms import Weights, contact_terms
 from planner_jax.task.block.replan import ReplanBlock, WarmBlock
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
 

@@ -13,11 +13,13 @@ import numpy as np
 from planner_jax.baselines.protocols import BY_ROW
 from planner_jax.core.planner import Planner
 from planner_jax.referee.arm_clearance import links_of, shield_pose
+from planner_jax.robot.arm_scene import Scene
 from planner_jax.runs.columns import BOOL, LIST, NUMBER, TEXT, Column, leaves_of
 from planner_jax.runs.style import draw
 from planner_jax.runs.summary import percent
 from planner_jax.runs.table import RateTable
 from planner_jax.runs.timing import measure
+from planner_jax.sims.block_settings import BlockFly
 from planner_jax.sims.execution import FRAME
 from planner_jax.sims.model import World
 from planner_jax.sims.perception.observation import eye
@@ -25,7 +27,6 @@ from planner_jax.sims.perception.receding import Decided, decide
 from planner_jax.sims.recording import Recording
 from planner_jax.sims.robots.arm.drives import Drives
 from planner_jax.sims.robots.arm.robot import ShieldArm
-from planner_jax.sims.settings import BlockFly
 from planner_jax.sims.task import FlightTask
 from planner_jax.sims.tasks.block_flights import (
     BLOCK_WORLD,
@@ -48,8 +49,7 @@ from planner_jax.sims.tasks.block_shown import (
 )
 from planner_jax.task.block.api import planner as block_planner
 from planner_jax.task.block.case import BlockCase
-from planner_jax.task.block.end_poses import flight_of
-from planner_jax.task.block.scene import Scene
+from planner_jax.task.block.problem.flight import flight_of
 from planner_jax.task.block.spec import SUITES
 from planner_jax.task.block.suites import BALL_RADIUS, scene_for
 
@@ -149,7 +149,7 @@ class BlockFlight(FlightTask):
         settings, planner = self.settings, block_planner(self.settings.planner)
         decided, seconds = None, 0.0
         if settings.perception:
-            decided, seconds, _ = measure(lambda: self._observe_and_plan(planner, cases.cases))
+            decided, seconds, _ = measure(lambda: _observe_and_plan(settings, planner, cases.cases))
         flights = fly_blocks(
             dataclasses.replace(BLOCK_WORLD, robot=self.robot),
             cases,
@@ -160,27 +160,6 @@ class BlockFlight(FlightTask):
             decided=decided,
         )
         return dataclasses.replace(flights, planning_seconds=flights.planning_seconds + seconds)
-
-    def _observe_and_plan(self, planner: Planner, cases: BlockCase) -> Decided:
-        """Return the motions of arms that observe their balls, not yet cut at the contacts."""
-        settings = self.settings
-        moments, overhead = [settings.until_known], settings.until_set
-        if settings.rate:
-            latest = float(np.max(jax.jit(jax.vmap(flight_of))(cases).latest))
-            step = 1.0 / settings.rate
-            moments += list(np.arange(moments[0] + step, latest - overhead, step))
-        # The noise of a ball depends on the ball alone, and not on the other balls.
-        balls = np.concatenate([cases.ball.pos, cases.ball.vel], axis=1).astype(np.float32)
-        seeds = [zlib.crc32(ball.tobytes(), settings.seed) for ball in balls]
-        return decide(
-            planner,
-            cases,
-            eye(rate=settings.frame_rate, std=settings.noise or None),
-            moments,
-            overhead=overhead,
-            seed=np.array(seeds, np.uint32),
-            again=settings.rate > 0.0,
-        )
 
     def recording(
         self, cases: Throws, flights: BlockFlights, lanes: Sequence[int] | np.ndarray
@@ -315,6 +294,27 @@ class BlockFlight(FlightTask):
         """Draw the times for sensing, planning and motion of up to 32 balls; return file names."""
         draw(folder / "budget.png", budget_figure, (8.0, 5.0), rows)
         return ["budget.png"]
+
+
+def _observe_and_plan(settings: BlockFly, planner: Planner, cases: BlockCase) -> Decided:
+    """Return the motions of arms that observe their balls, not yet cut at the contacts."""
+    moments, overhead = [settings.until_known], settings.until_set
+    if settings.rate:
+        latest = float(np.max(jax.jit(jax.vmap(flight_of))(cases).latest))
+        step = 1.0 / settings.rate
+        moments += list(np.arange(moments[0] + step, latest - overhead, step))
+    # The noise of a ball depends on the ball alone, and not on the other balls.
+    balls = np.concatenate([cases.ball.pos, cases.ball.vel], axis=1).astype(np.float32)
+    seeds = [zlib.crc32(ball.tobytes(), settings.seed) for ball in balls]
+    return decide(
+        planner,
+        cases,
+        eye(rate=settings.frame_rate, std=settings.noise or None),
+        moments,
+        overhead=overhead,
+        seed=np.array(seeds, np.uint32),
+        again=settings.rate > 0.0,
+    )
 
 
 def _part(batch: Any, name: str) -> np.ndarray:

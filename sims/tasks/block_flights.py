@@ -20,9 +20,10 @@ from planner_jax.core.errors import ArgumentError
 from planner_jax.core.plan_files import leaves_by_name
 from planner_jax.core.protocol import is_solved
 from planner_jax.referee.arm_clearance import clearances, links_of, shield_pose
-from planner_jax.referee.block import entry_time
+from planner_jax.referee.ball_in_box import entry_time
 from planner_jax.referee.solids import from_segment, rotate, rotate_back
 from planner_jax.robot.arm import Arm
+from planner_jax.robot.arm_scene import FLOOR
 from planner_jax.runs.timing import measure_plans
 from planner_jax.sims.execution import FRAME, TIMESTEP, Executed, execute
 from planner_jax.sims.launch import flight_keys
@@ -35,7 +36,6 @@ from planner_jax.sims.task import FlightCases, Flights
 from planner_jax.task.block.api import planner as block_planner
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.plan import BlockPlan
-from planner_jax.task.block.scene import FLOOR
 from planner_jax.task.block.suites import BALL_RADIUS
 from planner_jax.task.block.suites import draw as draw_throws
 

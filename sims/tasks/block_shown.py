@@ -5,11 +5,11 @@ from typing import Any
 import numpy as np
 
 from planner_jax.robot.arm import Arm
+from planner_jax.robot.arm_scene import FLOOR, Scene
 from planner_jax.runs.style import BLUE, GREEN, GREY, INK, PALE, PURPLE, RED, SKY, label
 from planner_jax.runs.table import RateTable
 from planner_jax.sims.scenery import Part, make_hull_part
 from planner_jax.task.block.drawing import obstacle_points
-from planner_jax.task.block.scene import FLOOR, Scene
 
 _BARS = 32  # greatest number of balls in the picture of the time budget
 _DEEP = -10.0  # [m], a floor below this height stands for no floor, and is not drawn

@@ -22,14 +22,8 @@ from planner_jax.sims.launch import flight_keys
 from planner_jax.sims.loop_state import Loop
 from planner_jax.sims.model import World
 from planner_jax.sims.noise import NOISES
-from planner_jax.sims.rally_loop import (
-    RallyPilot,
-    Trial,
-    begin_trials,
-    first_cases,
-    fly_on,
-    partner_cases,
-)
+from planner_jax.sims.rally_loop import RallyPilot, begin_trials, first_cases, fly_on, partner_cases
+from planner_jax.sims.rally_state import Trial
 from planner_jax.sims.recording import Recording
 from planner_jax.sims.robots.quadrotor.robot import Quadrotor
 from planner_jax.sims.robots.quadrotor.squad import Squad

@@ -11,7 +11,7 @@ import pytest
 import planner_jax as pj
 from planner_jax.core.rules import all_ruled, is_sound, part_at
 from planner_jax.planning.decided import DecidedPlanner
-from planner_jax.task.block.scene import paper_scene
+from planner_jax.robot.arm_scene import paper_scene
 from planner_jax.task.catch.decide import MOST_SEARCHED
 
 TASKS = ("hit", "catch", "intercept", "block")

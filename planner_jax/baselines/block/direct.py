@@ -17,12 +17,13 @@ from jax import Array, lax
 from planner_jax.baselines.parts.bang_bang import bang_bang
 from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import BaseAttempt, is_solved, require_settings, select, status_of
+from planner_jax.robot.arm_clearance import least_clearances
 from planner_jax.robot.arm_dynamics import measure_torques
+from planner_jax.robot.arm_motion import least_times
 from planner_jax.task.block.case import BlockCase
-from planner_jax.task.block.clearance import least_clearances
-from planner_jax.task.block.end_poses import EndPoses, end_poses, flight_of
-from planner_jax.task.block.motion import least_times
 from planner_jax.task.block.plan import BlockPlan, explain_status, make_empty_plan, mark_blocked
+from planner_jax.task.block.problem.end_poses import EndPoses, end_poses
+from planner_jax.task.block.problem.flight import flight_of
 from planner_jax.trajectory.polynomial import evaluate
 
 _PIECES = 10  # number of polynomial pieces of the straight motions that `end_poses` evaluates

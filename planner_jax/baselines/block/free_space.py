@@ -12,9 +12,9 @@ import numpy as np
 from jax import Array
 
 from planner_jax.robot.arm import Arm
+from planner_jax.robot.arm_clearance import least_clearances
+from planner_jax.robot.arm_scene import Scene
 from planner_jax.task.block.case import BlockCase
-from planner_jax.task.block.clearance import least_clearances
-from planner_jax.task.block.scene import Scene
 
 # [rad], joint-space distance between samples of an edge, as in the code that the authors of
 # [Natarajan2024] published (github.com/sbpl/parallel_search).

@@ -25,8 +25,8 @@ from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import Status, take
 from planner_jax.task.intercept.case import InterceptCase
 from planner_jax.task.intercept.plan import InterceptPlan, explain
+from planner_jax.task.intercept.problem.clearance import ends_of
 from planner_jax.task.intercept.searches import Search
-from planner_jax.task.intercept.terms import ends_of
 
 _PACE = 1.2  # the path must be drivable, within the steering rate limit, at 1.2 times mean speed
 

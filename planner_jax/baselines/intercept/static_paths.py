@@ -22,7 +22,8 @@ from planner_jax.plane.obstacles import Obstacles
 from planner_jax.plane.target import TurningPath
 from planner_jax.robot.car_motion import motion
 from planner_jax.task.intercept.case import InterceptCase
-from planner_jax.task.intercept.problem import Guess, MotionProblem
+from planner_jax.task.intercept.problem.clearance import wrap
+from planner_jax.task.intercept.problem.motion_problem import Guess, MotionProblem
 from planner_jax.task.intercept.searches import (
     Reachability,
     Search,
@@ -31,7 +32,6 @@ from planner_jax.task.intercept.searches import (
     make_grid,
     search_reach,
 )
-from planner_jax.task.intercept.terms import wrap
 
 _SHARES = 8  # number of points of a path at which it is compared with other paths
 _OTHER_SIDE = 8.0  # [m], added to the distance of two paths that pass a wall on different sides

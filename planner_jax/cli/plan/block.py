@@ -73,7 +73,7 @@ class SingleBlock(Single[SingleBlockSettings]):
         """Serve a 3-D view of ball and arm to a browser until Ctrl-C, if `view` is set."""
         given = self.settings
         if given.view:
-            from planner_jax.sims.settings import BlockFly
+            from planner_jax.sims.block_settings import BlockFly
             from planner_jax.sims.tasks.block_flights import Throws, follow_plans
             from planner_jax.sims.view import Viewer
 

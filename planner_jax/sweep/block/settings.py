@@ -47,7 +47,7 @@ class ArmSettings:
 
     def arm_options(self) -> Options:
         """Return the arguments of `case` and `draw` that these options specify."""
-        from planner_jax.task.block.scene_file import read_scene, shield_arm  # imports JAX
+        from planner_jax.robot.arm_scene_file import read_scene, shield_arm  # imports JAX
 
         own: Options = {}
         if self.arm is not None or self.shield is not None:

@@ -15,15 +15,17 @@ from planner_jax.core.checks import floating, require_kind, require_switch, shap
 from planner_jax.core.choices import require
 from planner_jax.core.registry import require_name
 from planner_jax.core.rules import Field, Table, require_sound
+from planner_jax.robot import arm_scene
 from planner_jax.robot.arm import REGIMES, Arm, ArmLimits
-from planner_jax.robot.arm_file import Shield as Shield
+from planner_jax.robot.arm_clearance import least_clearances
 from planner_jax.robot.arm_file import describe_arm as describe_arm
 from planner_jax.robot.arm_file import irb1600
 from planner_jax.robot.arm_file import read_arm as read_arm
+from planner_jax.robot.arm_scene import Scene, paper_scene
+from planner_jax.robot.arm_scene import make_scene as make_scene
+from planner_jax.robot.arm_scene_file import read_scene as read_scene
+from planner_jax.robot.arm_shield import Shield as Shield
 from planner_jax.task.arguments import array_of, batch_of, repeat_leaves
-from planner_jax.task.block import scene as scene_module
-from planner_jax.task.block.clearance import least_clearances
-from planner_jax.task.block.scene import Scene, paper_scene
 
 _TOLERANCE = 1e-3  # [rad], by which a joint may start beyond its range; as in the referee
 _IN_RANGE = rules.Rule(
@@ -59,7 +61,7 @@ RULES: Table = (
     Field("scene.outer.upper", (3,)),
     Field("scene.inner.lower", (3,), rules.at_least("scene.outer.lower")),
     Field("scene.inner.upper", (3,), rules.at_most("scene.outer.upper")),
-    *scene_module.RULES,
+    *arm_scene.RULES,
 )
 # Tolerances of a contact: greatest distance [m] of the ball from the shield's middle, and greatest
 # angle [rad] between the shield's normal and the reversed velocity of the ball.

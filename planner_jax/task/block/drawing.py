@@ -17,13 +17,13 @@ from planner_jax.core.checks import require_kind
 from planner_jax.core.choices import require
 from planner_jax.referee.judging import Verdict
 from planner_jax.robot.arm import Arm, ArmLimits, capsules, shield_pose
+from planner_jax.robot.arm_scene import Box, Scene
 from planner_jax.robot.capsule_fit import directions
 from planner_jax.runs import style
 from planner_jax.runs.style import Look
 from planner_jax.task.block.api import judge
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.plan import BlockPlan
-from planner_jax.task.block.scene import Box, Scene
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
 
 SIZE = (11.0, 4.2)  # [inch], size of a figure

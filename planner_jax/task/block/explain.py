@@ -11,10 +11,12 @@ from planner_jax.core.checks import require_kind
 from planner_jax.core.choices import require
 from planner_jax.robot.arm import shield_inradius
 from planner_jax.robot.arm_dynamics import USED
+from planner_jax.robot.arm_motion import least_times
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.default_planner import OnlineBlock
-from planner_jax.task.block.end_poses import Flight, flight_of, poses_at
-from planner_jax.task.block.motion import least_times
+from planner_jax.task.block.problem.check import torque_excess
+from planner_jax.task.block.problem.end_poses import poses_at
+from planner_jax.task.block.problem.flight import Flight, flight_of
 
 _PIECES = 10  # see `poses_at`
 # Contacts are sampled in rounds: first evenly, then near the best contacts, ever closer to them.
@@ -160,7 +162,7 @@ def _measure_contacts(case: BlockCase, flight: Flight, shares: Array) -> tuple[A
     if case.limits.torque is not None:
         online = OnlineBlock(pieces=_PIECES)
         points = jax.vmap(lambda k: online.encode_straight(case, poses, k))(jnp.arange(len(late)))
-        excess = jax.vmap(lambda point: online.torque_excess(case, point))(points)
+        excess = jax.vmap(lambda point: torque_excess(online, case, point))(points)
         torque = USED * (1.0 + excess)
     gaps = case.clearances(jnp.concatenate([poses.angles, case.angles[None]]))
     return poses.is_found, gaps[:-1], late, torque, gaps[-1]

@@ -6,9 +6,10 @@ from jax import Array, lax
 
 from planner_jax.core.protocol import Status, is_solved
 from planner_jax.robot.arm import ArmPlan
+from planner_jax.robot.arm_motion import polynomial
 from planner_jax.task.block.case import BlockCase
-from planner_jax.task.block.end_poses import EndPoses
-from planner_jax.task.block.motion import polynomial
+from planner_jax.task.block.problem.end_poses import EndPoses
+from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
 
 
 @struct.dataclass
@@ -20,6 +21,23 @@ class BlockPlan(ArmPlan):
     """
 
     contact_time: Array  # () [s], of shield and ball; time 0 is the ball's first observation
+
+
+def append_braking(case: BlockCase, motion: PiecewisePolynomial) -> PiecewisePolynomial:
+    """Append a piece in which all joints brake uniformly and stop at the same time.
+
+    The piece lasts 0 s if the case requires that the motion itself ends at rest.
+    """
+    end = jnp.sum(motion.durations)
+    angles, rates = evaluate(motion, end), evaluate(motion, end, 1)
+    duration = jnp.max(jnp.abs(rates) / case.limits.acceleration)
+    duration = jnp.where(case.ends_at_rest, 0.0, duration)
+    slowing = -0.5 * rates / jnp.where(duration > 0.0, duration, 1.0)
+    piece = jnp.zeros_like(motion.coeffs[:1]).at[0, :3].set(jnp.stack([angles, rates, slowing]))
+    return PiecewisePolynomial(
+        coeffs=jnp.concatenate([motion.coeffs, piece]),
+        durations=jnp.append(motion.durations, duration),
+    )
 
 
 def make_empty_plan(case: BlockCase, pieces: int) -> BlockPlan:

@@ -25,9 +25,8 @@ from planner_jax.planning.replan import Replanning, check_elapsed, resolve_argum
 from planner_jax.robot.arm import shield_pose
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.default_planner import OnlineBlock
-from planner_jax.task.block.end_poses import flight_of
-from planner_jax.task.block.motion import append_braking
-from planner_jax.task.block.plan import BlockPlan
+from planner_jax.task.block.plan import BlockPlan, append_braking
+from planner_jax.task.block.problem.flight import flight_of
 from planner_jax.trajectory.polynomial import evaluate
 
 _SHORTEST = 0.02  # [s] least duration of a start, for previous motions that have nearly ended

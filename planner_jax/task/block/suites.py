@@ -15,12 +15,12 @@ from planner_jax.core.checks import require_kind
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.registry import suite_named
 from planner_jax.referee import solids
+from planner_jax.robot import arm_scene
 from planner_jax.robot.arm import Arm, reach_of
 from planner_jax.robot.arm_file import irb1600
+from planner_jax.robot.arm_scene import Scene
 from planner_jax.task.arguments import make_generators
-from planner_jax.task.block import scene as scenes
 from planner_jax.task.block.case import BlockCase, case
-from planner_jax.task.block.scene import Scene
 from planner_jax.task.block.spec import SUITES, TASK, Suite
 
 BALL_RADIUS = 0.05  # [m]
@@ -73,8 +73,8 @@ def draw(
     inner, outer = (
         size * np.array([(-half, -half, 0.0), (half, half, height)])
         for half, height in (
-            (scenes.INNER_HALF, scenes.INNER_HEIGHT),
-            (scenes.OUTER_HALF, scenes.OUTER_HEIGHT),
+            (arm_scene.INNER_HALF, arm_scene.INNER_HEIGHT),
+            (arm_scene.OUTER_HALF, arm_scene.OUTER_HEIGHT),
         )
     )
     if scene is None:
@@ -100,7 +100,7 @@ def draw(
 
 def scene_for(arm: Arm | None, *, has_pole: bool = True) -> Scene:
     """Return the scene of [Natarajan2024], scaled to the reach of an arm; None: the IRB 1600."""
-    return scenes.paper_scene(has_pole=has_pole, size=_size_for(arm))
+    return arm_scene.paper_scene(has_pole=has_pole, size=_size_for(arm))
 
 
 def _size_for(arm: Arm | None) -> float:

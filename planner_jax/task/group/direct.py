@@ -26,9 +26,10 @@ from planner_jax.task.group.order import Departure, improve, make_table, meet
 from planner_jax.task.group.plan import GroupPlan
 from planner_jax.task.intercept.case import InterceptCase
 from planner_jax.task.intercept.plan import InterceptPlan, make_plan, make_straight_plan
-from planner_jax.task.intercept.problem import MotionProblem
+from planner_jax.task.intercept.problem.clearance import wrap
+from planner_jax.task.intercept.problem.motion_problem import MotionProblem
+from planner_jax.task.intercept.problem.terms import HORIZON
 from planner_jax.task.intercept.searches import Search, make_field, make_grid
-from planner_jax.task.intercept.terms import HORIZON, wrap
 from planner_jax.task.intercept.units import enter_units, leave_units, units_of
 
 # The pursuits that starting points 1 to 7 of a leg follow, and the direct motion 0: the greatest

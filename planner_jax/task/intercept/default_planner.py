@@ -30,13 +30,8 @@ from planner_jax.core.planner import Planner
 from planner_jax.optimise.planner import SearchPlanner
 from planner_jax.task.intercept.case import InterceptCase
 from planner_jax.task.intercept.plan import InterceptPlan, explain, make_straight_plan
-from planner_jax.task.intercept.problem import (
-    Guess,
-    MotionProblem,
-    SmoothIntercept,
-    StartedCase,
-    add_start,
-)
+from planner_jax.task.intercept.problem.motion_problem import Guess, MotionProblem
+from planner_jax.task.intercept.problem.smooth import SmoothIntercept, StartedCase, add_start
 from planner_jax.task.intercept.replan import ReplanIntercept
 from planner_jax.task.intercept.searches import (
     NARROW,

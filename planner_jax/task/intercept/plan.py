@@ -10,8 +10,9 @@ from jax import Array
 from planner_jax.core.protocol import Status, is_solved, status_of
 from planner_jax.robot.car import CarPlan
 from planner_jax.robot.car_motion import motion
-from planner_jax.task.intercept import terms
 from planner_jax.task.intercept.case import InterceptCase
+from planner_jax.task.intercept.problem import bounds, terms
+from planner_jax.task.intercept.problem.clearance import clearance, is_blocked
 
 
 @struct.dataclass
@@ -44,7 +45,7 @@ def make_plan(
     weights = terms.Weights()
     _, violation, discomfort = terms.limit_terms(case, time, speed, curvature, weights, points)
     _, missed = terms.meeting_terms(case, drive, time, weights)
-    too_close = -jnp.min(terms.clearance(case, drive)) / case.body.width
+    too_close = -jnp.min(clearance(case, drive)) / case.body.width
     worst = jnp.maximum(jnp.maximum(violation, missed), too_close)
     return InterceptPlan(
         cost=discomfort,
@@ -87,9 +88,9 @@ def explain(
     enough until any allowed meeting time. Else it is the status `reason` () int32. `is_time_free`
     is true if the planner may choose an earlier meeting time than the time of the case.
     """
-    is_too_far = terms.is_too_far(case, is_time_free=is_time_free)
+    is_too_far = bounds.is_too_far(case, is_time_free=is_time_free)
     reason = jnp.where(is_too_far, Status.TOO_FAR, reason)
-    is_start_blocked, is_goal_blocked = terms.is_blocked(case)
+    is_start_blocked, is_goal_blocked = is_blocked(case)
     blocked = is_start_blocked if is_time_free else is_start_blocked | is_goal_blocked
     reason = jnp.where(blocked, Status.BLOCKED, reason)
     floats = [leaf for leaf in jax.tree.leaves(case) if jnp.issubdtype(leaf.dtype, jnp.floating)]

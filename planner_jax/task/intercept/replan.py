@@ -25,7 +25,7 @@ from planner_jax.planning.replan import Replanning, check_elapsed, resolve_argum
 from planner_jax.robot.car import pose_at
 from planner_jax.task.intercept.case import InterceptCase
 from planner_jax.task.intercept.plan import InterceptPlan
-from planner_jax.task.intercept.problem import MotionProblem
+from planner_jax.task.intercept.problem.motion_problem import MotionProblem
 from planner_jax.task.intercept.searches import Search, Warm, make_field, make_grid
 from planner_jax.task.intercept.units import enter_units, leave_units, units_of
 

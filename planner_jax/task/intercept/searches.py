@@ -22,7 +22,12 @@ from planner_jax.plane import cell_paths, reach
 from planner_jax.plane.distance_field import DistanceField, distance_field
 from planner_jax.plane.target import rotate
 from planner_jax.task.intercept.case import InterceptCase
-from planner_jax.task.intercept.terms import discs_of, inside_map, nearest_in_region, wrap
+from planner_jax.task.intercept.problem.clearance import (
+    discs_of,
+    inside_map,
+    nearest_in_region,
+    wrap,
+)
 
 # Estimated memory of a search for each path, and for each 32-bit word of the bits that mark the
 # reachable cells. The unit is the memory of one starting point of the library's other planners.

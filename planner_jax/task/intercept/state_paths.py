@@ -20,8 +20,8 @@ from planner_jax.plane import reach
 from planner_jax.plane.distance_field import DistanceField
 from planner_jax.robot.car_motion import Motion, motion
 from planner_jax.task.intercept.case import InterceptCase
+from planner_jax.task.intercept.problem.clearance import clearance, nearest_in_region
 from planner_jax.task.intercept.searches import LoadedSearch, compute_reach
-from planner_jax.task.intercept.terms import clearance, nearest_in_region
 
 # Changes of speed and of curvature in a step, relative to their limits.
 _CONTROLS = np.stack(

@@ -7,3 +7,4 @@ from .case import make_scene as make_scene
 from .default_planner import ReachPlan as ReachPlan
 from .default_planner import ReachPlanner as ReachPlanner
 from .pose import solve_pose as solve_pose
+from .suites import draw as draw

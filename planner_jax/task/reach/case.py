@@ -13,12 +13,12 @@ from planner_jax.core import GRAVITY, rules
 from planner_jax.core.checks import floating, require_kind
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.rules import Field, Table, require_sound
+from planner_jax.robot import arm_scene
 from planner_jax.robot.arm import Arm, ArmLimits
 from planner_jax.robot.arm_file import irb1600
+from planner_jax.robot.arm_scene import Scene, paper_scene
+from planner_jax.robot.arm_scene import make_scene as make_scene  # for users of `pj.reach`
 from planner_jax.task.arguments import array_of, batch_of, repeat_leaves
-from planner_jax.task.block import scene as scene_module
-from planner_jax.task.block.scene import Scene, paper_scene
-from planner_jax.task.block.scene import make_scene as make_scene  # for users of `pj.reach`
 
 # Shapes and ranges that `pj.require_sound` checks for the arrays of a `ReachCase`.
 RULES: Table = (
@@ -31,7 +31,7 @@ RULES: Table = (
     Field("limits.velocity", ("J",), rules.POSITIVE),
     Field("limits.acceleration", ("J",), rules.POSITIVE),
     *(Field(f"{of}limits.torque", ("J",), rules.POSITIVE_OR_NONE) for of in ("", "arm.")),
-    *scene_module.RULES,
+    *arm_scene.RULES,
 )
 
 

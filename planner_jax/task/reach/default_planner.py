@@ -10,7 +10,6 @@ from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from flax import struct
 from jax import Array, lax
 
@@ -26,17 +25,16 @@ from planner_jax.core.protocol import (
     select,
     status_of,
 )
-from planner_jax.robot.arm import Arm, ArmPlan
+from planner_jax.robot.arm import ArmPlan
+from planner_jax.robot.arm_clearance import clearances
 from planner_jax.robot.arm_dynamics import measure_torques, stretch
-from planner_jax.task.block.clearance import clearances
 from planner_jax.task.reach import motion, shortcut, tree
 from planner_jax.task.reach.case import ReachCase
-from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
+from planner_jax.task.reach.check import finite_bounds, floors_of, least_excess, levers
 
 # Distances [m] between states of a motion that are checked: of plans, and of motions that shortcuts
 # make faster. If the coarse distance misses a collision, the shortcuts are repeated with the other.
 _RESOLUTION, _COARSE = 0.02, 0.04
-_CHUNK = 16  # number of states that are checked together
 _TORQUES = 256  # number of times, besides the ends of pieces, at which torques are computed
 _CUTS = 30  # number of attempts to shorten a path
 
@@ -166,10 +164,10 @@ class ReachPlanner(Planner):
         ends = jnp.minimum(
             rows[:, 0], jnp.min(jnp.where(is_good[None], rows[:, 1:], jnp.inf), axis=1)
         )
-        floors = self._floors(ends)[:, None]
+        floors = floors_of(ends, self.margin)[:, None]
 
         # The trees measure a turn by the greatest distance by which it can move a part of the arm.
-        lever = _levers(case.arm)
+        lever = levers(case.arm)
 
         def is_free(turned: Array) -> Array:
             return jnp.all(clearances(case.arm, case.scene, turned / lever[None]) >= floors, axis=0)
@@ -181,7 +179,7 @@ class ReachPlanner(Planner):
             is_free,
             case.angles * lever,
             goals * lever[None],
-            _finite_bounds(case, lever),
+            finite_bounds(case, lever),
             attempt.rays,
             attempt.seed,
             self.capacity,
@@ -190,14 +188,14 @@ class ReachPlanner(Planner):
         def follow() -> ReachPlan:
             path = tree.shorten(is_free, points, _CUTS, attempt.seed) / lever[None]
             goal = jnp.argmin(jnp.sum((case.goals - path[-1][None]) ** 2, axis=1))
-            own = self._floors(jnp.minimum(rows[:, 0], rows[:, 1 + goal]))
-            stops = self._stop_at_corners(case, path)
+            own = floors_of(jnp.minimum(rows[:, 0], rows[:, 1 + goal]), self.margin)
+            stops = motion.stop_at_corners(path, case.limits, self.pieces)
 
             def try_next(state: tuple[Array, ReachPlan]) -> tuple[Array, ReachPlan]:
                 k, best = state
                 resolution = jnp.where(k == 0, _COARSE, _RESOLUTION)
                 fast = shortcut.hasten(
-                    lambda path: self._least_excess(case, own, path, resolution) >= 0.0,
+                    lambda path: least_excess(case, own, path, resolution) >= 0.0,
                     case.angles,
                     stops,
                     case.limits,
@@ -214,33 +212,6 @@ class ReachPlanner(Planner):
 
         plan = lax.cond(is_found, follow, lambda: self._stand_still(case))
         return dataclasses.replace(plan, iterations=plan.iterations + rays)
-
-    def _stop_at_corners(self, case: ReachCase, path: Array) -> tuple[Array, Array]:
-        """Return the knots of a motion along a path (N, n) [rad] that stops at its corners.
-
-        The rates are NaN if the path has too many corners for the number of pieces.
-        """
-        line = jnp.diff(path, axis=0)
-        length = jnp.sqrt(jnp.sum(line**2, axis=1))
-        unit = line / jnp.maximum(length, 1e-9)[:, None]
-
-        # A corner is a point after which the direction changes. Successive points may be equal.
-        def turn(last: Array, each: tuple[Array, Array]) -> tuple[Array, Array]:
-            unit, length = each
-            moves = length > 1e-6
-            return jnp.where(moves, unit, last), moves & (jnp.sum(last * unit) < 1.0 - 1e-6)
-
-        _, bends = lax.scan(turn, unit[jnp.argmax(length > 1e-6)], (unit, length))
-        most = self.pieces // 3  # of straight lines
-        corners = jnp.nonzero(bends, size=most, fill_value=path.shape[0] - 1)[0]
-        points = jnp.concatenate([path[:1], path[corners]])
-        knots = motion.pad_knots(*motion.straight_knots(points, case.limits), self.pieces)
-        fits = jnp.sum(bends, dtype=jnp.int32) < most
-        return knots[0], jnp.where(fits, knots[1], jnp.nan)
-
-    def _floors(self, ends: Array) -> Array:
-        """Return the distance (R,) [m] that each pair keeps, by its distance (R,) at the ends."""
-        return jnp.clip(0.5 * ends, 0.0, self.margin)
 
     def finish(
         self, case: ReachCase, rows: Array, goal: Array, durations: Array, rates: Array
@@ -262,8 +233,8 @@ class ReachPlanner(Planner):
             _, factor, weak = measure_torques(case.arm, case.limits, case.gravity, path, _TORQUES)
             path = stretch(path, factor)
         duration = jnp.sum(path.durations)
-        floors = self._floors(jnp.minimum(rows[:, 0], rows[:, 1 + goal]))
-        violation = 100.0 * jnp.maximum(-self._least_excess(case, floors, path, _RESOLUTION), 0.0)
+        floors = floors_of(jnp.minimum(rows[:, 0], rows[:, 1 + goal]), self.margin)
+        violation = 100.0 * jnp.maximum(-least_excess(case, floors, path, _RESOLUTION), 0.0)
         violation = violation if weak is None else jnp.maximum(violation, weak)
         violation = jnp.where(jnp.isfinite(duration + jnp.sum(rates)), violation, jnp.inf)
         return ReachPlan(
@@ -274,50 +245,6 @@ class ReachPlanner(Planner):
             iterations=jnp.zeros((), jnp.int32),
             status=status_of(duration, violation, violation > FEASIBILITY_TOLERANCE),
         )
-
-    def _least_excess(
-        self,
-        case: ReachCase,
-        floors: Array,
-        path: PiecewisePolynomial,
-        resolution: Array | float,
-    ) -> Array:
-        """Return the least excess [m] of a pair's distance over its required distance.
-
-        It is -inf if a joint exceeds its limits of angle. Each chunk of states covers the motion,
-        and the check ends after the first chunk with a collision. The offsets of successive chunks
-        follow the golden ratio, so that the first chunks leave no wide gaps.
-        """
-        rates = path.coeffs[:, 1]
-        last = rates[-1:] + 2.0 * path.durations[-1] * path.coeffs[-1:, 2]
-        speed = jnp.concatenate([rates, last]) * _levers(case.arm)[None]
-        speed = jnp.sqrt(jnp.sum(speed**2, axis=1))
-        # Bounds of the distances from the start to the ends of the pieces.
-        passed = jnp.cumsum(path.durations * jnp.maximum(speed[1:], speed[:-1]))
-        passed, ends = (jnp.append(0.0, each) for each in (passed, jnp.cumsum(path.durations)))
-        chunks = jnp.maximum(jnp.ceil(passed[-1] / (resolution * _CHUNK)), 1.0)
-        num, lane = chunks.astype(jnp.int32), jnp.arange(_CHUNK, dtype=chunks.dtype)
-        # The step between offsets has no common divisor with their number.
-        steps = (0.618 * chunks).astype(jnp.int32) + jnp.arange(1, 9, dtype=jnp.int32)
-        step = steps[jnp.argmax(jnp.gcd(steps, num) == 1)]
-
-        def check(state: tuple[Array, Array]) -> tuple[Array, Array]:
-            done, least = state
-            offset = (done * step % num).astype(chunks.dtype)
-            share = (lane * chunks + offset + 0.5) / (chunks * _CHUNK)
-            times = jnp.interp(share * passed[-1], passed, ends)
-            angles = jax.vmap(lambda time: evaluate(path, time))(times)
-            near = jnp.min(clearances(case.arm, case.scene, angles) - floors[:, None])
-            beyond = jnp.any(
-                (angles < case.arm.lower[None] - 1e-4) | (angles > case.arm.upper[None] + 1e-4)
-            )
-            return done + 1, jnp.minimum(least, jnp.where(beyond, -jnp.inf, near))
-
-        def is_open(state: tuple[Array, Array]) -> Array:
-            return (state[0] < num) & (state[1] >= 0.0)
-
-        first = (jnp.zeros_like(num), jnp.full_like(floors[0], jnp.inf))
-        return lax.while_loop(is_open, check, first)[1]
 
     def _stand_still(self, case: ReachCase) -> ReachPlan:
         num, dtype = case.angles.shape[0], case.angles.dtype
@@ -335,25 +262,3 @@ class ReachPlanner(Planner):
             iterations=jnp.zeros((), jnp.int32),
             status=jnp.full((), Status.INFEASIBLE, jnp.int32),
         )
-
-
-def _finite_bounds(case: ReachCase, lever: Array) -> tuple[Array, Array]:
-    """Return bounds of random joint angles, times levers: at most one turn around the start."""
-    lower = jnp.maximum(case.arm.lower, case.angles - 2.0 * jnp.pi)
-    upper = jnp.minimum(case.arm.upper, case.angles + 2.0 * jnp.pi)
-    return lower * lever, upper * lever
-
-
-def _levers(arm: Arm) -> Array:
-    """Return bounds (n,) [m] of the distances of the arm's parts from each joint's axis."""
-    steps = jnp.sqrt(jnp.sum(arm.origin**2, axis=1))
-    link = np.asarray(arm.capsule_link)
-    outer = jnp.sqrt(jnp.max(jnp.sum(arm.capsule_ends**2, axis=2), axis=1)) + arm.capsule_radius
-    edges = jnp.sqrt(jnp.sum(arm.shield_centre**2)) + jnp.sqrt(jnp.sum(arm.shield_half**2))
-    levers, beyond = [], edges
-    for k in reversed(range(arm.num)):
-        own = np.flatnonzero(link == k)
-        beyond = jnp.max(jnp.append(outer[own], beyond))
-        levers.append(beyond)
-        beyond = beyond + steps[k]
-    return jnp.stack(levers[::-1])

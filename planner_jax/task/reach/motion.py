@@ -4,10 +4,10 @@ Motions without obstacles and motions that stop at corners have a closed form.
 """
 
 import jax.numpy as jnp
-from jax import Array
+from jax import Array, lax
 
 from planner_jax.robot.arm import ArmLimits
-from planner_jax.task.block.motion import least_times
+from planner_jax.robot.arm_motion import least_times
 from planner_jax.trajectory.polynomial import PiecewisePolynomial
 
 
@@ -72,3 +72,27 @@ def straight_knots(points: Array, limits: ArmLimits) -> tuple[Array, Array]:
     rates = jnp.stack([fast, fast, jnp.zeros_like(fast)], axis=1).reshape(-1, points.shape[1])
     zero = jnp.zeros((1, points.shape[1]), points.dtype)
     return jnp.maximum(durations, 0.0), jnp.concatenate([zero, rates])
+
+
+def stop_at_corners(path: Array, limits: ArmLimits, pieces: int) -> tuple[Array, Array]:
+    """Return the knots of a motion along a path (N, n) [rad] that stops at its corners.
+
+    The motion has `pieces` pieces. The rates are NaN if the path has too many corners for them.
+    """
+    line = jnp.diff(path, axis=0)
+    length = jnp.sqrt(jnp.sum(line**2, axis=1))
+    unit = line / jnp.maximum(length, 1e-9)[:, None]
+
+    # A corner is a point after which the direction changes. Successive points may be equal.
+    def turn(last: Array, each: tuple[Array, Array]) -> tuple[Array, Array]:
+        unit, length = each
+        moves = length > 1e-6
+        return jnp.where(moves, unit, last), moves & (jnp.sum(last * unit) < 1.0 - 1e-6)
+
+    _, bends = lax.scan(turn, unit[jnp.argmax(length > 1e-6)], (unit, length))
+    most = pieces // 3  # of straight lines
+    corners = jnp.nonzero(bends, size=most, fill_value=path.shape[0] - 1)[0]
+    points = jnp.concatenate([path[:1], path[corners]])
+    knots = pad_knots(*straight_knots(points, limits), pieces)
+    fits = jnp.sum(bends, dtype=jnp.int32) < most
+    return knots[0], jnp.where(fits, knots[1], jnp.nan)

@@ -8,7 +8,7 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
-from planner_jax.core.checks import require_kind
+from planner_jax.core.checks import require_kind, require_switch
 from planner_jax.core.errors import ArgumentError
 from planner_jax.robot.arm import Arm
 from planner_jax.robot.arm_file import irb1600
@@ -39,10 +39,11 @@ def solve_pose(
         the first one is repeated.
 
     Raises:
-        ArgumentError: no joint state is found, or an argument has a wrong shape.
+        ArgumentError: no joint state is found, or an argument has a wrong shape or type.
     """
     arm = irb1600() if arm is None else arm
     require_kind("arm", arm, Arm)
+    require_switch("is_roll_free", is_roll_free)
     batch = max(batch_of("position", position, 3), batch_of("rotation", rotation, 3, 3), key=len)
     array = functools.partial(array_of, batch=batch, dtype=jnp.float32)
     turn, place = (

@@ -20,6 +20,7 @@ from scipy.spatial.transform import Rotation
 from planner_jax.referee.arm_clearance import links_of, shield_pose
 from planner_jax.robot.arm import Arm
 from planner_jax.robot.arm_file import irb1600
+from planner_jax.robot.arm_scene_file import shield_arm
 from planner_jax.sims.model import World
 from planner_jax.sims.robot import Physics, Shape, Solid, rotation
 from planner_jax.sims.robots.arm.control import (
@@ -32,7 +33,6 @@ from planner_jax.sims.robots.arm.control import (
 )
 from planner_jax.sims.robots.arm.drives import TORQUES
 from planner_jax.sims.scenery import VISUAL, box_solid, capsule_solid, hull, xml_numbers
-from planner_jax.task.block.scene_file import shield_arm
 
 _THICKNESS = 0.01  # [m], thickness of the shield
 

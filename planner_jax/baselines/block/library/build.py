@@ -44,10 +44,11 @@ from planner_jax.core.protocol import are_solved
 from planner_jax.host.files import is_scratch, read_plain, replacing
 from planner_jax.planning.plan import plan
 from planner_jax.robot.arm import shield_pose
-from planner_jax.task.block.clearance import least_clearances
-from planner_jax.task.block.default_planner import OnlineBlock, read_learned_starts
-from planner_jax.task.block.motion import angles_at
-from planner_jax.task.block.scene import Scene
+from planner_jax.robot.arm_clearance import least_clearances
+from planner_jax.robot.arm_motion import angles_at
+from planner_jax.robot.arm_scene import Scene
+from planner_jax.task.block.default_planner import OnlineBlock
+from planner_jax.task.block.search.attempts import read_learned_starts
 
 # Indices of initial guesses of arm motions for least squares (file `learned_starts.json`). A build
 # of a library first uses `STARTS` in this order; a repair, after an obstacle has moved, first uses

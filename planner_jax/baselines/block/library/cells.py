@@ -20,7 +20,7 @@ from jax import Array
 from planner_jax.ball.flight import BallState
 from planner_jax.core import GRAVITY
 from planner_jax.robot.arm import product
-from planner_jax.task.block.scene import Box
+from planner_jax.robot.arm_scene import Box
 
 SPEED = 8.0  # [m/s], speed of the ball that stands for all balls through one pair of cells
 

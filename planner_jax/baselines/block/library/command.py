@@ -24,9 +24,9 @@ from planner_jax.core.choices import (
 from planner_jax.core.room import require_memory
 from planner_jax.robot.arm import REGIMES
 from planner_jax.robot.arm_file import irb1600, read_arm
+from planner_jax.robot.arm_scene import Box, paper_scene
 from planner_jax.runs import style
 from planner_jax.runs.environment import require_backend
-from planner_jax.task.block.scene import Box, paper_scene
 
 _CASE_BYTES = 60_000  # [bytes], memory per ball while the referee judges stored motions
 

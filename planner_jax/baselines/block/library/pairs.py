@@ -31,12 +31,14 @@ from planner_jax.core.protocol import (
 )
 from planner_jax.optimise.levenberg import LevenbergConfig, Model, least_squares
 from planner_jax.robot.arm import product, shield_inradius, shield_jacobian, shield_pose
+from planner_jax.robot.arm_clearance import least_clearances
 from planner_jax.robot.arm_ik import inverse_kinematics
+from planner_jax.robot.arm_motion import angles_at, bump_steps, step_weights
 from planner_jax.task.block.case import STRICT, BlockCase
-from planner_jax.task.block.clearance import least_clearances
-from planner_jax.task.block.default_planner import OnlineBlock, read_learned_starts
-from planner_jax.task.block.end_poses import EndPoses, Flight, face_ball, frame_of, profile_peaks
-from planner_jax.task.block.motion import angles_at, bump_steps, step_weights
+from planner_jax.task.block.default_planner import OnlineBlock
+from planner_jax.task.block.problem.end_poses import EndPoses, face_ball, frame_of, profile_peaks
+from planner_jax.task.block.problem.flight import Flight
+from planner_jax.task.block.search.attempts import read_learned_starts
 
 # Greatest distance [m] between ball and shield centre, and greatest angle [rad] between ball
 # direction and shield normal, at the end of a stored motion. COARSE applies if no motion keeps FINE

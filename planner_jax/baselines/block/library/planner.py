@@ -22,8 +22,8 @@ from planner_jax.core.choices import require
 from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import FEASIBILITY_TOLERANCE, BaseAttempt, Status, status_of
 from planner_jax.robot.arm import product, shield_sides
+from planner_jax.robot.arm_motion import polynomial
 from planner_jax.task.block.case import BlockCase
-from planner_jax.task.block.motion import polynomial
 from planner_jax.task.block.plan import BlockPlan
 from planner_jax.trajectory.polynomial import PiecewisePolynomial
 

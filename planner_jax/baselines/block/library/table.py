@@ -21,8 +21,9 @@ from planner_jax.ball.flight import BallState
 from planner_jax.baselines.block.library.cells import Layout, cell_of
 from planner_jax.core.choices import require
 from planner_jax.robot.arm import Arm, ArmLimits
+from planner_jax.robot.arm_scene import Box, Scene
 from planner_jax.task.block.case import BlockCase
-from planner_jax.task.block.scene import Box, Scene, entry_time
+from planner_jax.task.block.problem.flight import entry_time
 
 
 @struct.dataclass

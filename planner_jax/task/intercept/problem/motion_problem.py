@@ -1,39 +1,30 @@
-"""The least-squares problem of an interception: cost, stages of its solution, and derivatives.
-
-The n unknowns are speed and curvature at K equally spaced times (knots) after the start, and the
-time of the meeting if it is free. The cost is a sum of squares (`terms`): the discomfort, which
-is an integral of squared accelerations, lateral jerk and steering rate; the distance from the
-target at the end; and one-sided penalties (hinges) on limits and on distances from obstacles.
-
-The search for a path round the obstacles cannot be differentiated. Its path only determines where
-least squares start and which local minimum of the cost they reach. This minimum moves smoothly with
-the numbers of the case, and the implicit function theorem gives its derivatives. Hinges that are
-zero at the minimum contribute nothing to the derivatives.
-"""
+"""The unknowns of an interception, its cost as a function of them, and its stages."""
 
 import dataclasses
-from typing import ClassVar, Literal
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from flax import struct
 from jax import Array, lax
 
 from planner_jax.core.protocol import is_solved, select
-from planner_jax.optimise.levenberg import LevenbergConfig, LevenbergState, Model, least_squares
-from planner_jax.optimise.planner import Problem
-from planner_jax.optimise.settings import Attempt, Evaluation, LbfgsConfig
+from planner_jax.optimise.levenberg import LevenbergState, Model, least_squares
 from planner_jax.plane.cell_paths import CellPath
 from planner_jax.plane.distance_field import DistanceField
-from planner_jax.plane.obstacles import join_obstacles
 from planner_jax.plane.reach import Grid
 from planner_jax.robot.car_motion import Quadratic, by_unknowns, motion
-from planner_jax.task.intercept import terms
 from planner_jax.task.intercept.case import InterceptCase
 from planner_jax.task.intercept.plan import InterceptPlan, make_plan
+from planner_jax.task.intercept.problem import terms
+from planner_jax.task.intercept.problem.drives import (
+    Drive,
+    drive_along,
+    drive_directly,
+    earliest_time,
+)
 from planner_jax.task.intercept.searches import Search, Warm
-from planner_jax.task.intercept.units import Units, enter_units, leave_units, units_of
+from planner_jax.task.intercept.units import Units
 
 _LITTLE = 1e-3  # the last stage ends if four steps each lower the cost by less than this share
 _HIGHEST = lax.Precision.HIGHEST
@@ -46,9 +37,6 @@ _KEEPING = terms.Weights()
 _SETTLING = terms.Weights(effort=10.0)
 # Weights of the last stage if the meeting shall be as early as possible.
 _HURRYING = terms.Weights(early=1000.0)
-# Weight of the meeting time in the cost that `pj.gradient` differentiates. It is small, so that the
-# minimum exceeds no limit: penalties on limits start before a limit is reached.
-_EARLY = 80.0
 
 
 @struct.dataclass
@@ -133,105 +121,21 @@ class MotionProblem:
     def guess_along(
         self, case: InterceptCase, grid: Grid, speeds: Array, path: CellPath, layer: Array
     ) -> Guess:
-        """Return a starting point whose motion follows a path of cells, headings and speeds.
-
-        The path has one cell for each of the grid's equally spaced times. It meets the target at
-        the time with the index `layer` () int32. `speeds` (levels,) are the speeds of its levels.
-        """
-        width = 2.0 * np.pi / grid.lattice.headings
-        steps = layer.astype(speeds.dtype) + 0.5
-        # Times of the knots 1 to K, in units of the grid's time step.
-        at = jnp.arange(1, self.pieces + 1, dtype=steps.dtype) * (steps / self.pieces)
-
-        def interpolate(values: Array, first: Array, at: Array) -> Array:
-            at = jnp.clip(at - 1.0, -1.0, layer.astype(at.dtype) - 1.0)
-            below = jnp.floor(at).astype(jnp.int32)
-            share, is_first = (
-                each.reshape(-1, *[1] * (values.ndim - 1))
-                for each in (at - below.astype(at.dtype), below < 0)
-            )
-            low = jnp.where(is_first, first, values[jnp.maximum(below, 0)])
-            return (1.0 - share) * low + share * values[jnp.minimum(below + 1, layer - 1)]
-
-        speed = interpolate(speeds[path.level], case.speed, at)
-        bins = width * path.bin.astype(grid.cell.dtype)
-        # The path's headings, relative to the car's initial heading, may include full turns.
-        # `straight` [rad] is the multiple of 2 pi in the first of these headings.
-        straight = jnp.round(bins[0] / (2.0 * np.pi)) * 2.0 * np.pi
-        after, before = (interpolate(bins, straight, at + half) for half in (0.5, -0.5))
-        rate = (after - before) / grid.step
-        # The car starts with its own turn rate instead of the path's turn rate, which would change
-        # all later headings. The turn rates at the knots 1 and 2 compensate for this.
-        time = steps * grid.step
-        knot = time / self.pieces
-        first = case.speed * case.curvature
-        turned = 0.5 * knot * (first + 2.0 * rate[0] + rate[1])
-        lag = interpolate(bins, straight, at)[1] - straight - turned
-        rate = rate.at[:2].add(0.5 * lag / knot)
-        forward = jnp.maximum(jnp.abs(speed), 0.3 * jnp.max(jnp.abs(speeds)))
-        curvature = rate / jnp.where(speed < 0.0, -forward, forward)
-        limit = case.limits.curvature
-        point = self.pack(speed, jnp.clip(curvature, -limit, limit), time)
-        cells = grid.corner[None] + grid.cell[None] * path.cell.astype(grid.cell.dtype)
-        return Guess(point=point, positions=interpolate(cells, case.start[:2], at - 0.5))
+        """Return a starting point whose motion follows a path of cells; see `drive_along`."""
+        return self._guess(drive_along(case, grid, speeds, path, layer, self.pieces))
 
     def guess_directly(self, case: InterceptCase, is_late: Array | bool) -> Guess:
-        """Return a starting point that leads directly to the target, past no obstacle.
+        """Return a starting point that leads directly to the target; see `drive_directly`.
 
-        The motion is a point's motion with the least integral of the squared acceleration: a cubic
-        polynomial in time. The point starts with the car's position and velocity. It is at the
-        target at the case's time, or at an earlier time if the meeting shall be early, unless
-        `is_late` is true. Obstacles and limits are ignored. The car drives in reverse if it may,
-        does not move forward at first, and the target is behind it. The case is in the units of
-        `units.enter_units`.
+        It is at the target at the case's time, or at an earlier time if the meeting shall be early,
+        unless `is_late` is true.
         """
-        time = jnp.where(is_late, case.time, self._direct_time(case))
-        is_heading_free = case.heading_tolerance >= np.pi
-        first = case.speed * jnp.asarray([1.0, 0.0], time.dtype)
-        limits, is_behind = case.limits, case.target.at(time).pos[0] < 0.0
-        is_reverse = is_behind & (limits.least_speed < 0.0) & (case.speed <= 0.0)
-        gear = jnp.where(is_reverse, -1.0, 1.0).astype(time.dtype)
-        fastest = jnp.where(is_reverse, -limits.least_speed, limits.speed)
-        bounds = jnp.where(is_reverse, -case.end_speed[::-1], case.end_speed)
+        soonest = earliest_time(case) if self.meet == "early" else case.time
+        time = jnp.where(is_late, case.time, soonest)
+        return self._guess(drive_directly(case, time, self.pieces))
 
-        def solve(heading: Array) -> tuple[Array, Array]:
-            ahead = jnp.stack([jnp.cos(heading), jnp.sin(heading)])
-            goal = case.target.at(time).pos - case.body.middle * ahead
-            offset = goal - first * time
-            free = first + 1.5 * offset / time  # velocity at the end of the optimal motion
-            along = jnp.clip(gear * jnp.dot(free, ahead, precision=_HIGHEST), 0.1, fastest)
-            low, high = bounds[0], bounds[1]
-            end = gear * ahead * jnp.clip(along, low, jnp.maximum(high, low))
-            is_free = is_heading_free & (low <= 0.0) & jnp.isinf(high)
-            end = jnp.where(is_free, free, end)
-            # Coefficients of t^2 and t^3 for the given position and velocity at the end.
-            change = end - first
-            return 3.0 * offset / time**2 - change / time, change / time**2 - 2.0 * offset / time**3
-
-        square, cube = solve(case.end_heading)
-        leaving = gear * (first + time * (2.0 * square + 3.0 * time * cube))
-        heading = jnp.where(is_heading_free, jnp.arctan2(leaving[1], leaving[0]), case.end_heading)
-        square, cube = solve(heading)
-        at = time * (jnp.arange(1, self.pieces + 1, dtype=time.dtype) / self.pieces)[:, None]
-        first, square, cube = first[None], square[None], cube[None]
-        pos = at * (first + at * (square + at * cube))
-        vel = first + at * (2.0 * square + 3.0 * at * cube)
-        bend = 2.0 * square + 6.0 * at * cube
-        speed = jnp.sqrt(jnp.sum(vel**2, axis=1) + 1e-6)
-        curvature = gear * (vel[:, 0] * bend[:, 1] - vel[:, 1] * bend[:, 0]) / speed**3
-        limit = limits.curvature
-        speed = gear * jnp.minimum(speed, fastest)
-        return Guess(self.pack(speed, jnp.clip(curvature, -limit, limit), time), pos)
-
-    def _direct_time(self, case: InterceptCase) -> Array:
-        """Return the time () of a direct motion to the target."""
-        if self.meet != "early":
-            return case.time
-        times = case.time * jnp.linspace(1.0 / 16.0, 1.0, 16, dtype=case.time.dtype)
-        away = jax.vmap(lambda time: case.target.at(time).pos)(times)
-        apart = jnp.sqrt(jnp.sum(away**2, axis=1))
-        is_open = (terms.longest_drive(case, times) >= apart) & (times >= case.earliest)
-        return jnp.where(jnp.any(is_open), times[jnp.argmax(is_open)], case.time)
+    def _guess(self, drive: Drive) -> Guess:
+        return Guess(self.pack(*drive[:3]), drive.positions)
 
     def build_model(
         self,
@@ -396,89 +300,3 @@ class MotionProblem:
         stage = dataclasses.replace(last, steps=steps, only_feasible=False)
         points, steps = self.run_stages(case, field, guess, attempt, [stage])
         return select(self.decode(case, points[0], plan.iterations + steps), plan)
-
-
-@struct.dataclass
-class StartedCase(InterceptCase):
-    """An interception to plan, and the unknowns of a known plan, from which least squares start."""
-
-    start_point: Array  # (n,) unknowns, treated as constant when the case is differentiated
-
-
-@struct.dataclass
-class _Context:
-    case: StartedCase
-    units: Units
-    moving: InterceptCase  # the case in its units, with its walls added to the movers, at speed 0
-    field: DistanceField  # distances of a map without walls
-
-
-@jax.tree_util.register_static
-@dataclasses.dataclass(frozen=True)
-class SmoothIntercept(Problem):
-    """The cost of a `MotionProblem`, minimised from a plan; used by `pj.gradient`."""
-
-    case_type: ClassVar[type] = StartedCase
-    adjoint: ClassVar[str] = "whole"
-    guesses_minima: ClassVar[bool] = True
-    # A single attempt without steps of L-BFGS: `guesses` already returns the minimum.
-    attempts: ClassVar[tuple[Attempt, ...]] = (Attempt(solver=LbfgsConfig(max_steps=0)),)
-    problem: MotionProblem = MotionProblem()
-    solver: LevenbergConfig = LevenbergConfig(2000, settled=12, tolerance=0.0)
-
-    def prepare(self, case: StartedCase) -> _Context:
-        """Return the case, and a copy in which the walls are moving obstacles with speed 0.
-
-        Distances from moving obstacles are computed exactly. Distances from walls are usually
-        interpolated on a grid, so that their derivatives are discontinuous.
-        """
-        units = units_of(case)
-        local = enter_units(case, units)
-        none = jnp.zeros_like(local.start[:2])
-        return _Context(
-            case=case,
-            units=units,
-            moving=dataclasses.replace(local, movers=join_obstacles(local.walls, local.movers)),
-            field=DistanceField(
-                values=jnp.full((2, 2), 1e3, none.dtype), corner=none, spacing=none + 1.0
-            ),
-        )
-
-    def guesses(self, context: _Context, num: int) -> Array:
-        """Minimise the cost, from the plan stored in the case; return the n unknowns, (num, n).
-
-        All rows are equal, because there is only one stored plan.
-        """
-        fixed = lax.stop_gradient(context)
-        start = self.problem.enter_units(fixed.case.start_point, fixed.units)
-        end = least_squares(lambda x: self._exact_model(x, fixed), start, self.solver)
-        return jnp.broadcast_to(end.point, (num, *end.point.shape))
-
-    def _model(self, point: Array, context: _Context) -> Model:
-        problem = self.problem
-        weights = dataclasses.replace(problem.weights, early=_EARLY)
-        positions = problem.guess_at(point).positions
-        return problem.build_model(point, context.moving, context.field, weights, positions)
-
-    def _exact_model(self, point: Array, context: _Context) -> Model:
-        # The gradient of `build_model` neglects that the ratio of steering rate to rate of
-        # curvature depends on the curvature. Automatic differentiation is exact.
-        model = self._model(point, context)
-        gradient = jax.grad(lambda x: self.objective(x, context).cost)(point)
-        return dataclasses.replace(model, gradient=0.5 * gradient)
-
-    def objective(self, point: Array, context: _Context) -> Evaluation:
-        """Return the cost at the unknowns `point`, and the largest relative excess over a limit."""
-        model = self._model(point, context)
-        return Evaluation(cost=model.cost, violation=model.violation)
-
-    def decode(self, point: Array, context: _Context) -> InterceptPlan:
-        """Return the plan of the unknowns `point`: speeds, curvatures and, if free, the time."""
-        problem = self.problem
-        plan = problem.decode(context.moving, point, jnp.zeros((), jnp.int32))
-        return leave_units(plan, context.case, context.units, is_early=problem.meet == "early")
-
-
-def add_start(case: InterceptCase, point: Array) -> StartedCase:
-    """Add to a case, or a batch, the unknowns `point` from which least squares start."""
-    return StartedCase(**vars(case), start_point=lax.stop_gradient(point))

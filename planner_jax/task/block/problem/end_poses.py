@@ -1,4 +1,4 @@
-"""Arm poses in which the shield meets a ball, and residuals of this contact for least squares."""
+"""Arm poses in which the shield meets a ball, and the straight motions to them."""
 
 import dataclasses
 
@@ -9,24 +9,15 @@ from flax import struct
 from jax import Array
 
 from planner_jax.ball.flight import drag_free_flight
-from planner_jax.robot.arm import (
-    product,
-    shield_inradius,
-    shield_jacobian,
-    shield_pose,
-    shield_sides,
-)
+from planner_jax.robot.arm import product, shield_inradius
 from planner_jax.robot.arm_ik import inverse_kinematics
+from planner_jax.robot.arm_motion import profiles, step_weights
 from planner_jax.task.block.case import BlockCase
-from planner_jax.task.block.motion import Weights, profiles, step_weights
-from planner_jax.task.block.scene import entry_time, rounded_entry_time
+from planner_jax.task.block.problem.flight import Flight
 
-_PLANE = 1e-3  # [m], greatest distance of the ball from the shield's plane at the contact
 # Tried offsets of the ball from the shield's middle along the two edges, divided by the greatest
 # offset that case and shield allow.
 _OFFSETS = np.array([(0.0, 0.0), (0.8, 0.0), (0.0, 0.8), (-0.8, 0.0), (0.0, -0.8)])
-_SPARE = 0.95  # greatest planned fraction of the distance from the shield's middle to a side
-
 _DELAYED = 0.4  # see `rank_straight`
 
 
@@ -45,25 +36,6 @@ class EndPoses:
     profile: Array  # (C,) int32, speed profile of the straight motion, index in `all_profiles`
     # (C,) bool, whether the shield meets the ball within the limits of the joint angles.
     is_found: Array
-
-
-@struct.dataclass
-class Flight:
-    """Times at which a ball enters an outer and an inner box; it must be met in between."""
-
-    earliest: Array  # () [s], time at which the ball enters the outer box
-    latest: Array  # () [s], time at which the ball enters the inner, protected box
-    comes: Array  # () bool, whether the ball enters both boxes
-
-
-def flight_of(case: BlockCase) -> Flight:
-    """Compute when a ball enters the outer box, where it may be met, and touches the inner box."""
-    scene = case.scene
-    earliest, enters = entry_time(scene.outer, case.ball, case.gravity)
-    radius = scene.inner_radius + case.ball_radius
-    body = scene.inner, radius, case.ball, case.gravity, scene.inner_ends
-    latest, hits = rounded_entry_time(*body)
-    return Flight(earliest=earliest, latest=latest, comes=enters & hits & (latest > earliest))
 
 
 def all_profiles(pieces: int) -> tuple[np.ndarray, np.ndarray]:
@@ -255,101 +227,3 @@ def frame_of(normal: Array) -> Array:
     flat = jnp.sqrt(jnp.maximum(normal[0] ** 2 + normal[1] ** 2, 1e-12))
     side = jnp.stack([-normal[1], normal[0], jnp.zeros_like(flat)]) / flat
     return jnp.stack([normal, side, jnp.cross(normal, side)], axis=1)
-
-
-def contact_terms(
-    case: BlockCase, flight: Flight, angles: Array, time: Array, weights: Weights
-) -> tuple[Array, Array, Array]:
-    """Return the residuals of the contact of shield and ball at angles (n,) [rad] and a time [s].
-
-    Returns:
-        rows: (7,), weighted residuals: the ball's distance from the shield's plane; its offset from
-            the shield's middle in the plane (2); the shield's tilt (2); the time by which the
-            contact is before the interval `flight` or after it; the ball's distance beyond the side
-            of the shield's outline that it exceeds most. Offset and tilt count only beyond the
-            tolerances of the case.
-        slopes: (7, n + 1), derivatives of the rows by the angles and the time.
-        excess: (), largest relative excess over a tolerance, without weights.
-    """
-    rotation, middle = shield_pose(case.arm, angles)
-    jacobian = shield_jacobian(case.arm, angles)
-    ball = drag_free_flight(case.ball, time, case.gravity)
-    velocity = ball.vel
-    normal = rotation[:, 0]
-    away = ball.pos - middle
-    turns = jacobian[3:].T  # (n, 3), joint axes
-    moves = jacobian[:3].T
-    by_normal = jnp.cross(turns, normal)
-    # Distances of the ball's centre and of its nearest point from the plane of the shield.
-    height = jnp.sum(away * normal)
-    off = height - case.ball_radius
-    off_by_angles = product(by_normal, away) - product(moves, normal)
-    off_slope = jnp.append(off_by_angles, jnp.sum(velocity * normal))
-    # Offset of the ball from the shield's middle, within the plane of the shield.
-    beside = away - height * normal
-    beside_slope = jnp.concatenate([-moves, velocity[None]])
-    beside_slope -= jnp.sum(beside_slope * normal[None], axis=1)[:, None] * normal[None]
-    distance = jnp.sqrt(jnp.maximum(jnp.sum(beside**2), 1e-12))
-    spare = jnp.maximum(0.95 * case.offset - 0.002, 0.0)
-    beside_share = jnp.maximum(1.0 - spare / distance, 0.0)
-    # Tilt of the shield's normal against the reversed velocity of the ball.
-    facing = face_ball(velocity)
-    tilt = jnp.cross(facing, normal)
-    tilt_slope = jnp.cross(facing, by_normal)
-    sine = jnp.sqrt(jnp.maximum(jnp.sum(tilt**2), 1e-12))
-    angle = jnp.arctan2(sine, jnp.sum(facing * normal))
-    allowed = jnp.maximum(0.93 * case.tilt - np.deg2rad(0.5), 0.0)
-    tilt_share = jnp.maximum(1.0 - allowed / angle, 0.0) * angle / sine
-    frame = frame_of(facing)[:, 1:]
-    early = jnp.maximum(flight.earliest + 2e-3 - time, 0.0)
-    late = jnp.maximum(time - flight.latest + 2e-3, 0.0)
-    edge = jnp.where(early > 0.0, -1.0, jnp.where(late > 0.0, 1.0, 0.0))
-    # A contact 1 ms too early or too late weighs as much as a distance of 1 cm.
-    pace = 10.0 * weights.meeting
-    across = rotation[:, 1:]
-    sides = shield_sides(case.arm)
-    shares = product(sides, product(beside, across))
-    side = sides[jnp.argmax(shares)]
-    side = side / jnp.sum(side**2)  # vector from the middle to the side
-    width = jnp.sqrt(jnp.sum(side**2))
-    outside = jnp.maximum(jnp.max(shares) - _SPARE, 0.0) * width
-    # If the allowed offsets are within the outline, the residual of the offset suffices.
-    reaches = case.offset > _SPARE * shield_inradius(case.arm)
-    is_outside = jnp.where(reaches & (outside > 0.0), weights.meeting, 0.0)
-    # Derivative of the direction of flight by time: the component of gravity that is perpendicular
-    # to the velocity, divided by the speed.
-    speed_squared = jnp.maximum(jnp.sum(velocity**2), 1e-12)
-    pull = jnp.zeros(3, angles.dtype).at[2].set(case.gravity)
-    turning = (pull - facing * jnp.sum(facing * pull)) / jnp.sqrt(speed_squared)
-    by_time = jnp.cross(turning, normal)
-    rows = jnp.concatenate(
-        [
-            weights.meeting * off[None],
-            weights.meeting * beside_share * product(beside, across),
-            weights.tilt * tilt_share * product(tilt, frame),
-            pace * (early + late)[None],
-            (is_outside * outside)[None],
-        ]
-    )
-    is_beside = jnp.where(beside_share > 0.0, weights.meeting, 0.0)
-    is_tilted = jnp.where(tilt_share > 0.0, weights.tilt, 0.0)
-    tilt_rows = product(jnp.concatenate([tilt_slope, by_time[None]]), frame)
-    slopes = jnp.concatenate(
-        [
-            weights.meeting * off_slope[None],
-            is_beside * product(beside_slope, across).T,
-            is_tilted * tilt_rows.T,
-            pace * jnp.zeros((1, angles.size + 1), angles.dtype).at[0, -1].set(edge),
-            is_outside * product(beside_slope, product(across, side / width))[None],
-        ]
-    )
-    excess = jnp.stack(
-        [
-            jnp.abs(off) / _PLANE - 1.0,
-            distance / case.offset - 1.0,
-            jnp.max(shares) - 1.0,
-            angle / case.tilt - 1.0,
-            jnp.maximum(flight.earliest - time, time - flight.latest) / 1e-3,
-        ]
-    )
-    return rows, slopes, jnp.max(excess)

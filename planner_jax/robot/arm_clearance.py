@@ -18,8 +18,8 @@ import numpy as np
 from jax import Array, lax
 
 from planner_jax.robot.arm import Arm, link_frames, quaternion_rotation
+from planner_jax.robot.arm_scene import Scene
 from planner_jax.space import distances as space
-from planner_jax.task.block.scene import Scene
 
 _HALF_THICKNESS = 0.005  # [m], of the shield
 

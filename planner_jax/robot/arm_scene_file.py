@@ -12,8 +12,9 @@ from planner_jax.core.checks import require_path_name
 from planner_jax.core.errors import ArgumentError
 from planner_jax.host.yaml_files import read_fields
 from planner_jax.robot.arm import Arm
-from planner_jax.robot.arm_file import Shield, irb1600, read_shield_arm
-from planner_jax.task.block.scene import SOLIDS, Scene, make_scene, read_numbers
+from planner_jax.robot.arm_file import irb1600, read_shield_arm
+from planner_jax.robot.arm_scene import SOLIDS, Scene, make_scene, read_numbers
+from planner_jax.robot.arm_shield import Shield
 
 _USUAL = {"turn": [1.0, 0.0, 0.0, 0.0], "scale": 1.0, "position": [0.0, 0.0, 0.0]}
 _SINGLE = ("floor", "protected_box", "outer")

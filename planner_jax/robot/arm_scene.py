@@ -9,11 +9,10 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jax import Array, lax
+from jax import Array
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from planner_jax.ball.flight import BallState, drag_free_fall_time, drag_free_flight
 from planner_jax.core import rules
 from planner_jax.core.arithmetic import host_leaf
 from planner_jax.core.checks import numbers_of, require_number, require_switch
@@ -26,8 +25,6 @@ INNER_HALF, INNER_HEIGHT = 0.4, 1.35  # [m], half side and height of the protect
 OUTER_HALF, OUTER_HEIGHT = 1.0, 1.85  # [m], half side and height of the box where balls are met
 # [m], x and y of a vertical pole, the height of its top, and its radius
 POLE, POLE_TOP, POLE_RADIUS = (0.806, 0.0), 2.52, 0.05
-# See `rounded_entry_time`: number of advances, gain of speed [m/s] during one, and distance [m].
-_ADVANCES, _MORE_SPEED, _REACHED = 32, 1.0, 1e-4
 ABSENT = -10.0  # [m], radius of a capsule that does not exist
 FLOOR = -0.4826  # [m], height of the floor
 _LEAST = 1e-9  # least length of a quaternion, and of a cylinder's axis [m]
@@ -128,7 +125,7 @@ def paper_scene(*, has_pole: bool = True, pole: Sequence[float] = POLE, size: fl
     require_switch("has_pole", has_pole)
     x, y = numbers_of("pole", pole, (), (2,))
 
-    def leaf(value: ArrayLike) -> Array:
+    def leaf(value: float | list | np.ndarray) -> Array:
         return host_leaf(size * np.asarray(value), np.float32)
 
     def box(half: float, height: float) -> Box:
@@ -307,66 +304,3 @@ def _solids(rods: Sequence, boxes: Sequence, cylinders: Sequence) -> dict[str, A
         "cylinder_radius": column(cylinders, 1),
     }
     return {name: host_leaf(leaf, np.float32) for name, leaf in leaves.items()}
-
-
-def entry_time(box: Box, ball: BallState, gravity: Array) -> tuple[Array, Array]:
-    """Return the time at which a ball without drag enters a box through a side or the top.
-
-    The coordinates are processed one by one, so that the compiled program has few loops.
-
-    Returns:
-        time: () [s].
-        enters: () bool; false for a ball that misses the box, starts inside, or enters from below.
-    """
-    between = []
-    for axis in range(2):
-        x, v = ball.pos[axis], ball.vel[axis]
-        moves = jnp.where(jnp.abs(v) > 1e-6, v, 1e-6)
-        between.append(((box.lower[axis] - x) / moves, (box.upper[axis] - x) / moves))
-    from_side = jnp.maximum(*(jnp.minimum(*times) for times in between))
-    until = jnp.minimum(*(jnp.maximum(*times) for times in between))
-    from_top, _ = drag_free_fall_time(ball, box.upper[2], gravity)
-
-    def height(time: Array) -> Array:
-        return ball.pos[2] + ball.vel[2] * time - 0.5 * gravity * time**2
-
-    time = jnp.where(height(jnp.maximum(from_side, 0.0)) > box.upper[2], from_top, from_side)
-    return time, (time > 0.0) & (time <= until) & (height(time) > box.lower[2])
-
-
-def rounded_entry_time(
-    box: Box, radius: Array, ball: BallState, gravity: Array, ends: Array | None = None
-) -> tuple[Array, Array]:
-    """Return the time at which a ball without drag gets to the distance `radius` from a box.
-
-    With the ends (2, 3) [m] of a segment in the box, the distance is the distance from the segment.
-    The ball first enters the box enlarged by the radius. From there it advances by its distance
-    divided by a bound of its speed, which never passes the rounded edges.
-
-    Returns:
-        time: () [s].
-        enters: () bool, as for `entry_time`.
-    """
-    time, enters = entry_time(Box(box.lower - radius, box.upper + radius), ball, gravity)
-
-    def gap(time: Array) -> Array:
-        pos = drag_free_flight(ball, time, gravity).pos
-        if ends is None:
-            away = pos - jnp.clip(pos, box.lower, box.upper)
-        else:
-            span = ends[1] - ends[0]
-            share = jnp.sum((pos - ends[0]) * span) / jnp.sum(span * span)
-            away = pos - ends[0] - jnp.clip(share, 0.0, 1.0) * span
-        return jnp.sqrt(jnp.maximum(jnp.sum(away**2), 1e-12)) - radius
-
-    def advance(_: Array, time: Array) -> Array:
-        velocity = drag_free_flight(ball, time, gravity).vel
-        speed = jnp.sqrt(jnp.sum(velocity**2)) + _MORE_SPEED
-        return time + jnp.maximum(gap(time), 0.0) / speed
-
-    def search() -> tuple[Array, Array]:
-        num = _ADVANCES if ends is None else 4 * _ADVANCES
-        there = lax.fori_loop(0, num, advance, time)
-        return there, enters & (gap(there) < _REACHED)
-
-    return lax.cond(radius > 0.0, search, lambda: (time, enters))

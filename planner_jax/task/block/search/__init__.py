@@ -1,0 +1,1 @@
+"""The searches of the default planner of blocks: straight motions, then least squares."""
