@@ -98,7 +98,7 @@ def _lbfgs(config: LbfgsConfig, objective: Callable, inside: Callable, box: Box 
         memory = lbfgs.remember(state.memory, state.step, grad - state.grad)
         within, free = memory, are_free(state.point, grad, box)
         if box is not None:
-            steps, changes = memory.steps * free, memory.changes * free
+            steps, changes = memory.steps * free[None], memory.changes * free[None]
             pairs = ((steps, changes), (changes, changes), (steps, steps))
             sums = [jnp.sum(a * b, axis=1) for a, b in pairs]
             within = lbfgs.Memory(steps, changes, lbfgs.weigh_pair(*sums)[2])
@@ -162,7 +162,7 @@ def _levenberg(config: LevenbergConfig, residuals: Callable, box: Box | None) ->
         curvature = jnp.matmul(slopes, slopes.T, precision=lax.Precision.HIGHEST)
         free = are_free(point, gradient, box)
         # A fixed variable keeps its diagonal entry, so that the matrix stays positive definite.
-        curvature = jnp.where(free[:, None] * free + unit > 0.0, curvature, 0.0)
+        curvature = jnp.where(jnp.outer(free, free) + unit > 0.0, curvature, 0.0)
         no_limit = jnp.zeros((), point.dtype)
         return levenberg.Model(jnp.sum(values**2), free * gradient, curvature, no_limit)
 

@@ -201,7 +201,7 @@ def _result(value: Callable, found: tuple, args: tuple, shared: list, box: Box |
             moved = (1.0 - free) * jnp.where(point <= box.lower, *tangents[2])
         hessian = jax.hessian(cost)(point, *data)
         right = right + jnp.matmul(hessian, moved, precision=lax.Precision.HIGHEST)
-        block = jnp.where(free[:, None] * free > 0.0, hessian, jnp.eye(free.size))
+        block = jnp.where(jnp.outer(free, free) > 0.0, hessian, jnp.eye(free.size))
         step = moved - jnp.linalg.solve(block, free * right)
         return point, jnp.where(is_stationary, step, jnp.nan)
 
