@@ -5,8 +5,8 @@
 Each problem has --num random starts. A solver takes them as one batch in float32. Its stopping
 tolerance is the fastest of four with which it solves most starts: a start is solved if its cost
 exceeds the known minimum by at most 1e-5 (1 + minimum). Times are medians of --repeats calls, in
-which the tolerances take turns. Compile times are separate. SciPy's L-BFGS-B computes the minimum
-within bounds, in float64.
+which solvers and tolerances take turns. Compile times are separate. The minimum within bounds is
+computed by SciPy's L-BFGS-B in float64.
 
 `optax.lbfgs` and optimistix have no bounds. Within bounds `minimise` is therefore compared with
 Adam of optax, whose steps are projected by `optax.projections`. Without the package optimistix its
@@ -128,7 +128,7 @@ def own_solver(function: Callable, settings: Any, bounds: Any) -> Callable:
 
 
 def by_optax(function: Callable, method: Any, bounds: Any, most: int = 300) -> Callable:
-    """Return the function of `own_solver` by a loop over a transformation of optax, for each lane."""
+    """Return a function like that of `own_solver`, by a loop over a transformation of optax."""
     project = lambda x: optax.projections.projection_box(x, *bounds) if bounds else x  # noqa: E731
 
     def solve_one(start, tolerance):
@@ -152,7 +152,7 @@ def by_optax(function: Callable, method: Any, bounds: Any, most: int = 300) -> C
 
 
 def by_optimistix(function: Callable, kind: str) -> Callable:
-    """Return the function of `own_solver` by a solver of optimistix, with a tenth of the tolerance."""
+    """Return a function like that of `own_solver`, by optimistix at a tenth of the tolerance."""
     import optimistix
 
     squares = kind != "BFGS"
@@ -208,27 +208,31 @@ def least_within(case: Case, bounds: Any, starts: np.ndarray) -> float:
         return min(map(float, runs))
 
 
-def measure(solve: Callable, starts: np.ndarray, is_good: Callable, repeats: int) -> dict:
-    """Return the share of solved starts, ms of a batch, and seconds to compile of a solver."""
-    began = time.perf_counter()
-    compiled = jax.jit(solve).lower(starts, TOLERANCES[0]).compile()
-    compiling = time.perf_counter() - began
-    solved = [is_good(compiled(starts, each)) for each in TOLERANCES]
-    times = np.zeros((repeats, len(TOLERANCES)))
-    for row in times:
-        for k, each in enumerate(TOLERANCES):
-            began = time.perf_counter()
-            jax.block_until_ready(compiled(starts, each))
-            row[k] = 1e3 * (time.perf_counter() - began)
-    shares, median = np.mean(solved, axis=1), np.median(times, axis=0)
-    best = np.argmin(np.where(shares >= shares.max() - MARGIN, median, np.inf))
-    return {
-        "solved": solved[best],
-        "share": shares[best],
-        "ms": median[best],
-        "compile": compiling,
-        "tolerance": TOLERANCES[best],
-    }
+def measure(
+    solvers: dict[str, Callable], starts: np.ndarray, is_good: Callable, repeats: int
+) -> dict[str, dict]:
+    """Return for each solver the share of solved starts, ms of a batch, and seconds to compile."""
+    compiled, rows = {}, {}
+    for name, solve in solvers.items():
+        began = time.perf_counter()
+        compiled[name] = jax.jit(solve).lower(starts, TOLERANCES[0]).compile()
+        rows[name] = {"compile": time.perf_counter() - began}
+    runs = [(name, each) for name in solvers for each in TOLERANCES]
+    solved = {(name, each): is_good(compiled[name](starts, each)) for name, each in runs}
+    times = {run: [] for run in runs}
+    for name, each in runs * repeats:
+        began = time.perf_counter()
+        jax.block_until_ready(compiled[name](starts, each))
+        times[name, each].append(1e3 * (time.perf_counter() - began))
+    for name, row in rows.items():
+        settings = [
+            {"share": solved[run].mean(), "ms": np.median(times[run]), "tolerance": run[1]}
+            for run in runs
+            if run[0] == name
+        ]
+        row |= select(settings)
+        row["solved"] = solved[name, row["tolerance"]]
+    return rows
 
 
 def select(rows: list[dict]) -> dict:
@@ -263,13 +267,13 @@ def main() -> None:
                     return np.asarray(cost(x) <= least + 1e-5 * (1.0 + least))
 
                 rows: dict[str, list] = {"own": [], "peer": []}
-                for solver, solve in solvers_of(case, bounds, by_residuals).items():
-                    found = measure(solve, starts, is_good, options.repeats)
+                solvers = solvers_of(case, bounds, by_residuals)
+                title = f"{name}{', residuals' if by_residuals else ''}"
+                for solver, found in measure(solvers, starts, is_good, options.repeats).items():
+                    solved = found.pop("solved")
                     if not rows["own"]:
-                        bench.count(found["solved"])
+                        bench.count(solved)
                     rows["own" if solver.startswith("own") else "peer"].append(found)
-                    title = f"{name}{', residuals' if by_residuals else ''}"
-                    del found["solved"]
                     bench.row(problem=title, bounds=bounds is not None, solver=solver, **found)
                     bench.say(
                         f"| {title} | {'yes' if bounds else 'no'} | {solver} | "

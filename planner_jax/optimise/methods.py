@@ -57,7 +57,7 @@ class Steps(NamedTuple):
     start: Callable[[Array], PyTree]  # state before the first iteration, from a point
     advance: Callable[[PyTree], tuple[PyTree, Array]]  # next state; norm of projected gradient
     is_open: Callable[[PyTree], Array]  # whether the search continues
-    found: Callable[[PyTree], tuple[Array, Array, Array]]  # point, iterations, is_stationary
+    outcome: Callable[[PyTree], tuple[Array, Array, Array]]  # point, iterations, is_stationary
 
 
 def project(point: Array, box: Box | None) -> Array:
@@ -112,7 +112,7 @@ def _lbfgs(config: LbfgsConfig, objective: Callable, inside: Callable, box: Box 
             after = dataclasses.replace(after, step=after.point - state.point)
         return after, projected_norm(state.point, after.grad, box)
 
-    return _tracked(lbfgs, config, advance_inside)
+    return _steps_by(lbfgs, config, advance_inside)
 
 
 def _newton(config: NewtonConfig, objective: Callable, inside: Callable, box: Box | None) -> Steps:
@@ -131,7 +131,7 @@ def _newton(config: NewtonConfig, objective: Callable, inside: Callable, box: Bo
         after = _inside(newton.step(inside, lambda _: reduced, state, config), box)
         return after, projected_norm(state.point, here.gradient, box)
 
-    return _tracked(newton, config, advance)
+    return _steps_by(newton, config, advance)
 
 
 def _inside(state: Any, box: Box | None) -> Any:
@@ -140,15 +140,15 @@ def _inside(state: Any, box: Box | None) -> Any:
     return dataclasses.replace(state, point=point, best_point=best)
 
 
-def _tracked(module: Any, config: LbfgsConfig | NewtonConfig, advance: Callable) -> Steps:
+def _steps_by(module: Any, config: LbfgsConfig | NewtonConfig, advance: Callable) -> Steps:
     """Return the steps of a module whose states have the best point so far and `numbers`."""
 
-    def found(state: Any) -> tuple[Array, Array, Array]:
+    def outcome(state: Any) -> tuple[Array, Array, Array]:
         numbers = state.numbers
         return state.best_point, numbers.iteration, module.is_stationary(numbers, config)
 
     is_open = lambda state: module.is_unfinished(state.numbers, config)  # noqa: E731
-    return Steps(lambda point: module.init(point, config), advance, is_open, found)
+    return Steps(lambda point: module.init(point, config), advance, is_open, outcome)
 
 
 def _levenberg(config: LevenbergConfig, residuals: Callable, box: Box | None) -> Steps:
@@ -175,7 +175,7 @@ def _levenberg(config: LevenbergConfig, residuals: Callable, box: Box | None) ->
         start=lambda point: levenberg.start_search(point, config),
         advance=advance,
         is_open=lambda state: levenberg.is_open(state, config, config.max_steps),
-        found=lambda state: (state.point, state.steps, state.stalled >= config.settled),
+        outcome=lambda state: (state.point, state.steps, state.stalled >= config.settled),
     )
 
 
@@ -206,5 +206,5 @@ def _optax(config: OptaxSolver, objective: Callable, inside: Callable, box: Box 
         start=start,
         advance=advance,
         is_open=lambda state: state[3] < config.max_steps,
-        found=lambda state: (state[2][0], state[3], jnp.zeros((), bool)),
+        outcome=lambda state: (state[2][0], state[3], jnp.zeros((), bool)),
     )

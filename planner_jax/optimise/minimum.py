@@ -142,7 +142,7 @@ def _search(
         return jax.tree.map(lambda a, b: jnp.where(goes_on, a, b), (state, norm <= tolerance), lane)
 
     def finish(lane: tuple, *own: Any) -> tuple:
-        point, iterations, is_stationary = steps(*own).found(lane[0])
+        point, iterations, is_stationary = steps(*own).outcome(lane[0])
         return point, iterations, is_stationary | lane[1]
 
     last = lax.while_loop(
