@@ -10,13 +10,7 @@ import pytest
 import scipy.optimize
 
 from planner_jax.core.errors import ArgumentError, ArgumentTypeError
-from planner_jax.optimise import (
-    LbfgsConfig,
-    LevenbergConfig,
-    NewtonConfig,
-    OptaxSolver,
-    minimise,
-)
+from planner_jax.optimise import LbfgsConfig, LevenbergConfig, NewtonConfig, OptaxSolver, minimise
 
 LANES, SIZE = 5, 3
 LBFGS = LbfgsConfig(max_steps=300, tolerance=0.0, patience=6)
@@ -53,7 +47,8 @@ def rosenbrock(x):
 @functools.cache
 def bounded(solver):
     with jax.enable_x64(True):
-        return minimise(goal_of(solver), STARTS, solver, args=(ROOTS, RIGHT), bounds=(LOWER, UPPER))
+        data = {"args": (ROOTS, RIGHT), "bounds": (LOWER, UPPER)}
+        return jax.tree.map(np.asarray, minimise(goal_of(solver), STARTS, solver, **data))
 
 
 @SOLVERS
@@ -121,10 +116,13 @@ def test_a_feasible_point_is_selected_before_a_cheaper_one():
 def test_transformations_of_optax_solve_with_and_without_bounds(transformation):
     solver, start = OptaxSolver(transformation, 800), np.array([[1.5, -1.0]], np.float32)
     cost = lambda x: (x[0] - 1.0) ** 2 + 2.0 * (x[1] - 1.0) ** 2  # noqa: E731
-    free = minimise(cost, start, solver, gradient_tolerance=1e-4)
+    bounds = (np.full((1, 2), -2.0), np.array([[0.5, 2.0]]))
+    with jax.numpy_dtype_promotion("standard"):  # which optax needs
+        free, within = (
+            minimise(cost, start, solver, bounds=each, gradient_tolerance=1e-4)
+            for each in (None, bounds)
+        )
     np.testing.assert_allclose(free.point, 1.0, atol=1e-3)
-    bounds = (np.full(2, -2.0), np.array([0.5, 2.0]))
-    within = minimise(cost, start, solver, bounds=bounds, gradient_tolerance=1e-4)
     np.testing.assert_allclose(within.point, [[0.5, 1.0]], atol=1e-3)
     assert free.is_stationary.all() and within.is_stationary.all()
     assert 0 < free.iterations[0] < 800
