@@ -14,6 +14,7 @@ rows are left out. The run's summary has the share of starts that `minimise` sol
 solver, and the numbers of problems that it solves faster than the other packages.
 """
 
+import importlib
 import importlib.util
 import time
 from collections.abc import Callable
@@ -119,7 +120,7 @@ def own_solver(function: Callable, settings: Any, bounds: Any) -> Callable:
     """Return a function of starts (B, n) and a tolerance: points by this library's solver."""
 
     def solve(starts, tolerance):
-        limits = bounds and tuple(jnp.broadcast_to(each, starts.shape) for each in bounds)
+        limits: Any = bounds and [jnp.broadcast_to(each, starts.shape) for each in bounds]
         return minimise(
             function, starts, settings, bounds=limits, gradient_tolerance=tolerance
         ).point
@@ -153,8 +154,7 @@ def by_optax(function: Callable, method: Any, bounds: Any, most: int = 300) -> C
 
 def by_optimistix(function: Callable, kind: str) -> Callable:
     """Return a function like that of `own_solver`, by optimistix at a tenth of the tolerance."""
-    import optimistix
-
+    optimistix: Any = importlib.import_module("optimistix")  # may be absent
     squares = kind != "BFGS"
     run = optimistix.least_squares if squares else optimistix.minimise
 
