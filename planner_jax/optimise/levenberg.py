@@ -101,7 +101,7 @@ def continue_search(
     most = config.max_steps if most is None else most
     return lax.while_loop(
         lambda state: is_open(state, config, most),
-        lambda state: _step(evaluate, state, config),
+        lambda state: step(evaluate, state, config),
         state,
     )
 
@@ -117,9 +117,10 @@ def is_open(state: LevenbergState, config: LevenbergConfig, most: Array | int) -
     return is_left & ((behind < 0) | (state.model.cost <= bound))
 
 
-def _step(
+def step(
     evaluate: Callable[[Array], Model], state: LevenbergState, config: LevenbergConfig
 ) -> LevenbergState:
+    """Return the state after one step, which evaluates one new point."""
     model = state.model
     # All unknowns have the same damping > 0, so an unknown without effect on the cost is unchanged.
     scale = jnp.mean(jnp.diagonal(model.curvature)) * state.damping

@@ -1,6 +1,5 @@
 """The search loop of planners that minimise for one problem, and plans at its result."""
 
-import dataclasses
 from types import ModuleType
 from typing import TYPE_CHECKING
 
@@ -46,7 +45,7 @@ def minimise(
     if _has_steps(config, 0):
         return optimum_at(start, objective(start), config)
     if isinstance(config, NewtonConfig):
-        config = with_stragglers(config)
+        config = _method(config).with_stragglers(config)
     step = lambda s: _step(objective, curved, s, config)  # noqa: E731
     state = _method(config).init(start, config)
     if _has_steps(config, 1):  # without a loop, so that XLA can fuse across the iteration
@@ -72,14 +71,6 @@ def _step(objective: Objective, curved: Curved | None, state: PyTree, config: So
         return lbfgs.step(objective, state, config)
     newton = _method(config)
     return newton.step(objective, curved or newton.by_products(objective), state, config)
-
-
-def with_stragglers(config: NewtonConfig) -> NewtonConfig:
-    """Return settings with which every problem may make the iterations of stragglers."""
-    if config.stragglers is None:
-        return config
-    _, steps, groups = config.stragglers
-    return dataclasses.replace(config, max_steps=config.max_steps + steps * groups, stragglers=None)
 
 
 def optimum_of(state: PyTree, config: Solver) -> Optimum:

@@ -20,6 +20,7 @@ as in the approximate Wolfe conditions [Hager2005]. Among the steps of equal cos
 the least damped one is taken.
 """
 
+import dataclasses
 import functools
 from collections.abc import Callable
 
@@ -99,6 +100,14 @@ def init(point: Array, config: NewtonConfig) -> NewtonState:
             stalled=jnp.zeros((), jnp.int32),
         ),
     )
+
+
+def with_stragglers(config: NewtonConfig) -> NewtonConfig:
+    """Return settings with which every problem may make the iterations of stragglers."""
+    if config.stragglers is None:
+        return config
+    _, steps, groups = config.stragglers
+    return dataclasses.replace(config, max_steps=config.max_steps + steps * groups, stragglers=None)
 
 
 def is_unfinished(numbers: NewtonNumbers, config: NewtonConfig) -> Array:

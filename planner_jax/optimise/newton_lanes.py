@@ -11,7 +11,7 @@ from jaxtyping import PyTree
 
 from planner_jax.lanes import over_lanes
 from planner_jax.optimise import newton
-from planner_jax.optimise.multistart import Optimum, optimum_of, with_stragglers
+from planner_jax.optimise.multistart import Optimum, optimum_of
 from planner_jax.optimise.settings import Curvature, Evaluation, NewtonConfig
 
 
@@ -43,7 +43,7 @@ def minimise_lanes(
     )
     if config.stragglers is not None:
         share, steps, groups = config.stragglers
-        longer, num = with_stragglers(config), math.ceil(share * starts.shape[-1])
+        longer, num = newton.with_stragglers(config), math.ceil(share * starts.shape[-1])
 
         advance_longer = over_lanes(functools.partial(step, longer))
 
