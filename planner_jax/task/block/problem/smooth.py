@@ -20,7 +20,7 @@ from planner_jax.optimise.planner import Problem
 from planner_jax.optimise.preconditioner import positive_inverse
 from planner_jax.optimise.settings import Attempt, Curvature, Evaluation, LbfgsConfig
 from planner_jax.task.block.case import BlockCase
-from planner_jax.task.block.end_poses import Flight, flight_of
+from planner_jax.task.block.problem.flight import Flight, flight_of
 from planner_jax.task.block.plan import BlockPlan
 
 if TYPE_CHECKING:
