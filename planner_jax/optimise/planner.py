@@ -63,6 +63,8 @@ class Problem(Generic[CaseT, PlanT], abc.ABC):
     guesses_minima: ClassVar[bool] = False
     # Default of `curvature` in `pj.gradient`: "products" with the Hessian, or the "whole" Hessian.
     adjoint: ClassVar[str] = "products"
+    # Whether `pj.gradient` computes in float64, since minima in float32 are too inexact.
+    needs_double: ClassVar[bool] = False
 
     @abc.abstractmethod
     def prepare(self, case: PyTree) -> PyTree:
@@ -75,6 +77,16 @@ class Problem(Generic[CaseT, PlanT], abc.ABC):
     @abc.abstractmethod
     def objective(self, point: Array, context: PyTree) -> tuple[Array, Array]:
         """Return the cost and the largest violation of a limit at a point (n,), two arrays ()."""
+
+    def slopes_along(
+        self, point: Array, context_of: Callable[[PyTree], PyTree], parts: PyTree, direction: Array
+    ) -> PyTree:
+        """Return the gradient, by parts of a context, of the cost's derivative along a direction.
+
+        `context_of(parts)` returns the context with these parts. `direction` is (n,).
+        """
+        slopes = jax.grad(lambda parts, x: self.objective(x, context_of(parts))[0])
+        return jax.jvp(lambda x: slopes(parts, x), (point,), (direction,))[1]
 
     def curvature_at(self, point: Array, context: PyTree) -> Curvature:
         """Return gradient, products with the Hessian, and preconditioner at a point (n,).

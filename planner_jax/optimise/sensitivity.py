@@ -36,6 +36,9 @@ _CURVATURES = ("products", "whole")
 # Number of iterations of conjugate gradients, by the setting `curvature`, for about 40 unknowns.
 _STEPS = {"products": 40, "whole": 1}
 _DAMPING = 1e-9  # damping of the preconditioner for products; negligible beside the Hessian
+# Greatest relative decrease of the cost that a Newton step from an optimum predicts, by the
+# precision of the numbers.
+_STATIONARY = {np.dtype(np.float32): 1e-4, np.dtype(np.float64): 1e-6}
 _SMALL = 1e-11  # squared relative residual at which conjugate gradients stop
 
 
@@ -45,6 +48,9 @@ class Gradient:
 
     value: Array  # ()
     by: dict[str, PyTree]  # for each name a part of the case, whose leaves are d value / d leaf
+    # () Relative decrease of the cost that a Newton step from the plan predicts; 0 at an optimum.
+    # Above 1e-4 (1e-6 in float64) the plan is no optimum, and `by` is NaN.
+    stationarity: Array
     # () Relative residual of the linear equation for the adjoint vector, in the preconditioner's
     # norm; 0 if its solution is exact. It does not measure the distance to the optimum. The
     # residual and `by` are NaN if the Hessian is not positive along the first direction of
@@ -202,22 +208,20 @@ def gradient_at(
 
     value, (along_point, by_context) = jax.value_and_grad(value_of, argnums=(0, 1))(point, smooth)
 
-    def products(direction: Array) -> tuple[Array, list]:
-        slopes = lambda x: jax.grad(cost, argnums=(0, 1))(x, smooth)  # noqa: E731
-        return jax.jvp(slopes, (point,), (direction,))[1]
-
     steps = _STEPS[curvature] if steps is None else steps
+    here = problem.curvature_at(point, context)
+    if curvature == "products":
+        solve = here.preconditioner(jnp.asarray(_DAMPING, point.dtype))
+        product = here.products()
+    else:
+        solve, product = _by_whole_hessian(here.products(), point)
+    decrease = 0.5 * jnp.sum(here.gradient * solve(here.gradient))
+    stationarity = decrease / jnp.maximum(jnp.abs(here.evaluation.cost), 1e-30)
     if steps == 0:
         residual = jnp.where(jnp.any(along_point != 0.0), jnp.ones_like(value), 0.0)
     else:
-        if curvature == "products":
-            here = problem.curvature_at(point, context)
-            solve = here.preconditioner(jnp.asarray(_DAMPING, point.dtype))
-            product = here.products()
-        else:
-            solve, product = _by_whole_hessian(lambda unit: products(unit)[0], point)
         adjoint, residual = _adjoint(solve, product, along_point, steps)
-        _, mixed = products(adjoint)
+        mixed = problem.slopes_along(point, context_of, smooth, adjoint)
         by_context = [b - m for b, m in zip(by_context, mixed, strict=True)]
     taken = iter(by_context)
     both = zip(leaves, is_smooth, strict=True)
@@ -225,9 +229,11 @@ def gradient_at(
         next(taken) if flag else np.zeros(leaf.shape, jax.dtypes.float0) for leaf, flag in both
     ]
     (by_parts,) = pull(jax.tree.unflatten(treedef, cotangent))
-    finite = jnp.isfinite(value) & jnp.isfinite(residual)
-    by_parts = jax.tree.map(lambda leaf: jnp.where(finite, leaf, jnp.nan), by_parts)
-    return Gradient(value=value, by=by_parts, residual=residual)
+    holds = (
+        jnp.isfinite(value) & jnp.isfinite(residual) & (stationarity <= _STATIONARY[point.dtype])
+    )
+    by_parts = jax.tree.map(lambda leaf: jnp.where(holds, leaf, jnp.nan), by_parts)
+    return Gradient(value=value, by=by_parts, stationarity=stationarity, residual=residual)
 
 
 def _by_whole_hessian(product: Product, point: Array) -> tuple[Product, Product]:

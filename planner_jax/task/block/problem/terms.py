@@ -177,7 +177,7 @@ def contact_terms(
     off_slope = jnp.append(off_by_angles, jnp.sum(velocity * normal))
     # Offset of the ball from the shield's middle, within the plane of the shield.
     beside = away - height * normal
-    beside_slope = jnp.concatenate([-moves, velocity[None]])
+    beside_slope = jnp.concatenate([-moves - height * by_normal, velocity[None]])
     beside_slope -= jnp.sum(beside_slope * normal[None], axis=1)[:, None] * normal[None]
     distance = jnp.sqrt(jnp.maximum(jnp.sum(beside**2), 1e-12))
     spare = jnp.maximum(0.95 * case.offset - 0.002, 0.0)
@@ -187,7 +187,8 @@ def contact_terms(
     tilt = jnp.cross(facing, normal)
     tilt_slope = jnp.cross(facing, by_normal)
     sine = jnp.sqrt(jnp.maximum(jnp.sum(tilt**2), 1e-12))
-    angle = jnp.arctan2(sine, jnp.sum(facing * normal))
+    cosine = jnp.sum(facing * normal)
+    angle = jnp.arctan2(sine, cosine)
     allowed = jnp.maximum(0.93 * case.tilt - np.deg2rad(0.5), 0.0)
     tilt_share = jnp.maximum(1.0 - allowed / angle, 0.0) * angle / sine
     frame = frame_of(facing)[:, 1:]
@@ -206,6 +207,9 @@ def contact_terms(
     # If the allowed offsets are within the outline, the residual of the offset suffices.
     reaches = case.offset > _SPARE * shield_inradius(case.arm)
     is_outside = jnp.where(reaches & (outside > 0.0), weights.meeting, 0.0)
+    outward = product(across, side / width)
+    outside_slope = product(beside_slope, outward)
+    outside_slope = outside_slope.at[:-1].add(product(jnp.cross(turns, outward), beside))
     # Derivative of the direction of flight by time: the component of gravity that is perpendicular
     # to the velocity, divided by the speed.
     speed_squared = jnp.maximum(jnp.sum(velocity**2), 1e-12)
@@ -223,14 +227,17 @@ def contact_terms(
     )
     is_beside = jnp.where(beside_share > 0.0, weights.meeting, 0.0)
     is_tilted = jnp.where(tilt_share > 0.0, weights.tilt, 0.0)
-    tilt_rows = product(jnp.concatenate([tilt_slope, by_time[None]]), frame)
+    # The angle's derivative is cosine * (derivative of sine) - sine * (derivative of cosine).
+    by_cosine = jnp.append(product(by_normal, facing), jnp.sum(turning * normal))
+    tilt_rows = cosine * jnp.concatenate([tilt_slope, by_time[None]])
+    tilt_rows = product(tilt_rows - by_cosine[:, None] * tilt[None], frame)
     slopes = jnp.concatenate(
         [
             weights.meeting * off_slope[None],
             is_beside * product(beside_slope, across).T,
             is_tilted * tilt_rows.T,
             pace * jnp.zeros((1, angles.size + 1), angles.dtype).at[0, -1].set(edge),
-            is_outside * product(beside_slope, product(across, side / width))[None],
+            is_outside * outside_slope[None],
         ]
     )
     excess = jnp.stack(

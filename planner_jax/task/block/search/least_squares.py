@@ -55,7 +55,7 @@ def refine_in_turn(
         index = jnp.where(is_new, index, jnp.argmin(costs))
         start = _encode_start(planner, case, poses, order, attempt.first + index)
         bump = 0.5 * _encode_bump(planner, case, index - tries - kept)
-        start = jnp.where(is_detour, _encode(best) + bump, start)
+        start = jnp.where(is_detour, encode(best) + bump, start)
         straight_start = planner.encode_straight(case, goals, goal_order[k])
         begin = levenberg.start_search(jnp.where(is_straight, straight_start, start), solver)
         pick = lambda new, old: jnp.where(is_new, new, old[index])  # noqa: E731
@@ -163,7 +163,7 @@ def settle_plan(
     solver = dataclasses.replace(Search.solver, **settle_by(planner.settling), hope=None)
 
     def settle() -> BlockPlan:
-        return select(planner.refine(case, flight, _encode(plan), solver), plan)
+        return select(planner.refine(case, flight, encode(plan), solver), plan)
 
     return lax.cond(is_solved(plan.status), settle, lambda: plan)
 
@@ -212,7 +212,7 @@ def _trial_cost(tried: LevenbergState, solver: LevenbergConfig) -> Array:
     return jnp.where(tried.stalled >= solver.settled, -1.0, tried.model.cost)
 
 
-def _encode(plan: BlockPlan) -> Array:
+def encode(plan: BlockPlan) -> Array:
     """Return the unknowns of a plan whose motion lasts until the contact."""
     coeffs, durations = plan.motion.coeffs, plan.motion.durations
     rates = coeffs[:, 1] + 2.0 * durations[:, None] * coeffs[:, 2]
