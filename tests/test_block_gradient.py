@@ -28,7 +28,7 @@ def throws(num, dtype=np.float32):
 @pytest.mark.parametrize("apart", [0.02, 0.3, 1.0])
 def test_slopes_of_the_contact_are_the_gradient_of_its_cost(apart, float64):
     cases = throws(4, np.float64)
-    plans = pj.plan(pj.block.planner(**SMALL), throws(4))
+    plans = as_type(pj.plan(pj.block.planner(**SMALL), throws(4)), np.float64)
 
     @jax.vmap
     def compare(case, plan, away):

@@ -215,7 +215,7 @@ class Planner(Generic[CaseT, PlanT]):
         """
         raise NotOffered(
             f"{type(self).__name__} minimises nothing, so that its plans have no gradient: use "
-            "a planner that does, such as hits' and catches' exact or intercepts' spacetime"
+            "a planner that does, such as blocks' online or hits' exact"
         )
 
     def with_effort(self, effort: str) -> Self:

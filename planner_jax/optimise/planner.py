@@ -57,14 +57,11 @@ class Problem(Generic[CaseT, PlanT], abc.ABC):
     # Fields that the `settings` of attempts may change to refine plans. A plan of a coarse planner
     # is one of a fine planner, whose additional variables, `held`, are zero.
     refinements: ClassVar[tuple[str, ...]] = ()
-    # Number of Newton's subspace vectors. With 0 the preconditioner counts as inverse Hessian.
-    subspace: ClassVar[int] = 4
-    # Whether the guesses are minima, so that Newton's method need not continue from a search.
-    guesses_minima: ClassVar[bool] = False
+    subspace: ClassVar[int] = 4  # Newton's vectors; 0: the preconditioner is the inverse Hessian
+    guesses_minima: ClassVar[bool] = False  # whether Newton's method need not continue from them
     # Default of `curvature` in `pj.gradient`: "products" with the Hessian, or the "whole" Hessian.
     adjoint: ClassVar[str] = "products"
-    # Whether `pj.gradient` computes in float64, since minima in float32 are too inexact.
-    needs_double: ClassVar[bool] = False
+    needs_double: ClassVar[bool] = False  # whether `pj.gradient` computes in float64
 
     @abc.abstractmethod
     def prepare(self, case: PyTree) -> PyTree:
@@ -78,15 +75,10 @@ class Problem(Generic[CaseT, PlanT], abc.ABC):
     def objective(self, point: Array, context: PyTree) -> tuple[Array, Array]:
         """Return the cost and the largest violation of a limit at a point (n,), two arrays ()."""
 
-    def slopes_along(
-        self, point: Array, context_of: Callable[[PyTree], PyTree], parts: PyTree, direction: Array
-    ) -> PyTree:
-        """Return the gradient, by parts of a context, of the cost's derivative along a direction.
-
-        `context_of(parts)` returns the context with these parts. `direction` is (n,).
-        """
+    def slopes_along(self, x: Array, context_of: Callable, parts: PyTree, along: Array) -> PyTree:
+        """Return the gradient, by parts of the context, of the slope at `x` (n,) along a vector."""
         slopes = jax.grad(lambda parts, x: self.objective(x, context_of(parts))[0])
-        return jax.jvp(lambda x: slopes(parts, x), (point,), (direction,))[1]
+        return jax.jvp(lambda x: slopes(parts, x), (x,), (along,))[1]
 
     def curvature_at(self, point: Array, context: PyTree) -> Curvature:
         """Return gradient, products with the Hessian, and preconditioner at a point (n,).

@@ -99,14 +99,14 @@ def gradient(
     minimiser = dataclasses.replace(minimiser, problem=problem)
     if inner.needs_double:
         with jax.enable_x64(True):
-            found = plan(minimiser, _with_type(cases, np.float64), chunk=chunk, devices=devices)
-        plans = _with_type(found, float_type(cases))
+            found = plan(minimiser, with_type(cases, np.float64), chunk=chunk, devices=devices)
+        plans = with_type(found, float_type(cases))
     else:
         plans = plan(minimiser, cases, chunk=chunk, devices=devices)
     return PlanGradient(plans=with_origin(plans.whole_plan(), cases), **fields_of(plans.gradient))
 
 
-def _with_type(tree: PyTree, dtype: DTypeLike) -> PyTree:
+def with_type(tree: PyTree, dtype: DTypeLike) -> PyTree:
     """Return a pytree in NumPy arrays, whose floating numbers have another type."""
 
     def convert(leaf: np.ndarray) -> np.ndarray:

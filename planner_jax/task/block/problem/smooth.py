@@ -20,8 +20,8 @@ from planner_jax.optimise.planner import Problem
 from planner_jax.optimise.preconditioner import positive_inverse
 from planner_jax.optimise.settings import Attempt, Curvature, Evaluation, LbfgsConfig
 from planner_jax.task.block.case import BlockCase
-from planner_jax.task.block.problem.flight import Flight, flight_of
 from planner_jax.task.block.plan import BlockPlan
+from planner_jax.task.block.problem.flight import Flight, flight_of
 
 if TYPE_CHECKING:
     from planner_jax.task.block.default_planner import OnlineBlock
@@ -78,23 +78,17 @@ class SmoothBlock(Problem):
         model = self._model(point, context)
         return Evaluation(model.cost, model.violation)
 
-    def slopes_along(
-        self,
-        point: Array,
-        context_of: Callable[[PyTree], _Context],
-        parts: PyTree,
-        direction: Array,
-    ) -> PyTree:
-        """Return the gradient, by parts of a context, of the cost's derivative along a direction.
+    def slopes_along(self, x: Array, context_of: Callable, parts: PyTree, along: Array) -> PyTree:
+        """Return the gradient, by parts of the context, of the slope at `x` (n,) along a vector.
 
-        The cost's derivative follows from the residuals' derivatives, which compile faster than
-        automatic differentiation of the cost.
+        The slope follows from the residuals' derivatives, which compile faster than automatic
+        differentiation of the cost.
         """
 
-        def along(parts: PyTree) -> Array:
-            return jnp.sum(2.0 * self._model(point, context_of(parts)).gradient * direction)
+        def slope(parts: PyTree) -> Array:
+            return jnp.sum(2.0 * self._model(x, context_of(parts)).gradient * along)
 
-        return jax.grad(along)(parts)
+        return jax.grad(slope)(parts)
 
     def curvature_at(self, point: Array, context: _Context) -> Curvature:
         """Return gradient, products with the Hessian, and the inverse of the residuals' J'J."""
