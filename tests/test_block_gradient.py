@@ -50,10 +50,15 @@ def test_brisk_plans_have_no_gradient():
         pj.gradient(pj.block.planner("brisk"), throws(2), of="contact_time", by="angles")
 
 
+def aim(plan):
+    """Return the sum of the joints' angles at the start of the last piece [rad]."""
+    return jnp.sum(plan.motion.coeffs[..., -1, 0, :], axis=-1)
+
+
 @pytest.mark.slow
 def test_gradients_match_differences_of_new_plans():
     planner, cases = pj.block.planner(**SMALL), throws(6)
-    found = pj.gradient(planner, cases, of="contact_time", by=BY)
+    found = pj.gradient(planner, cases, of=aim, by=BY)
     assert is_solved(found.plans.status).all()
     assert found.value.dtype == np.float32 and np.all(found.stationarity < 1e-6)
     plans = as_type(found.plans, np.float64)
@@ -70,8 +75,8 @@ def test_gradients_match_differences_of_new_plans():
             def value(step, part=part, first=first, rest=rest, away=away):
                 moved = {rest: getattr(part, rest) + step * away} if rest else None
                 inner = dataclasses.replace(part, **moved) if moved else part + step * away
-                return pj.plan(smooth, dataclasses.replace(started, **{first: inner})).contact_time
+                return aim(pj.plan(smooth, dataclasses.replace(started, **{first: inner})))
 
             expected = (value(1e-4) - value(-1e-4)) / 2e-4
             slope = np.asarray(found.by[name], np.float64) @ away
-            np.testing.assert_allclose(slope, expected, rtol=5e-3, atol=1e-5)
+            np.testing.assert_allclose(slope, expected, rtol=5e-3, atol=1e-3)
