@@ -18,12 +18,11 @@ from planner_jax.core.compiled import Fixed
 from planner_jax.core.errors import ArgumentError, ArgumentTypeError
 from planner_jax.core.rules import NOT_NEGATIVE
 from planner_jax.lanes import over_lanes
+from planner_jax.optimise.efforts import LONG
 from planner_jax.optimise.levenberg import LevenbergConfig
 from planner_jax.optimise.methods import Box, Method, are_free, project, projected_norm, steps_of
 from planner_jax.optimise.multistart import put_lanes_first, put_lanes_last
 from planner_jax.optimise.settings import Evaluation, LbfgsConfig, NewtonConfig
-
-LONG = LbfgsConfig(max_steps=300, tolerance=1e-7, patience=6)
 
 
 @struct.dataclass

@@ -6,7 +6,8 @@ shortcuts in time then remove the stops and make the motion fast.
 """
 
 import dataclasses
-from typing import ClassVar
+from collections.abc import Callable
+from typing import TYPE_CHECKING, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -25,12 +26,16 @@ from planner_jax.core.protocol import (
     select,
     status_of,
 )
-from planner_jax.robot.arm import ArmPlan
+from planner_jax.optimise.planner import SearchPlanner
+from planner_jax.robot.arm import ArmLimits, ArmPlan
 from planner_jax.robot.arm_clearance import clearances
 from planner_jax.robot.arm_dynamics import measure_torques, stretch
 from planner_jax.task.reach import motion, shortcut, tree
 from planner_jax.task.reach.case import ReachCase
 from planner_jax.task.reach.check import finite_bounds, floors_of, least_excess, levers
+
+if TYPE_CHECKING:
+    from planner_jax.task.reach.closed_form import StartedReach
 
 # Distances [m] between states of a motion that are checked: of plans, and of motions that shortcuts
 # make faster. If the coarse distance misses a collision, the shortcuts are repeated with the other.
@@ -105,7 +110,7 @@ class ReachPlanner(Planner):
     def solve(self, case: ReachCase, attempt: Search) -> ReachPlan:
         """Return the plan of one case by one search."""
         attempt = getattr(attempt, "attempt", attempt)
-        limits = jax.tree.map(lambda each: each * (1.0 - self.slack), case.limits)
+        limits = self.strict_limits(case)
         case = dataclasses.replace(case, limits=limits)
         states = jnp.concatenate([case.angles[None], case.goals])
         rows = clearances(case.arm, case.scene, states)
@@ -245,6 +250,30 @@ class ReachPlanner(Planner):
             iterations=jnp.zeros((), jnp.int32),
             status=status_of(duration, violation, violation > FEASIBILITY_TOLERANCE),
         )
+
+    def strict_limits(self, case: ReachCase) -> ArmLimits:
+        """Return the limits that plans use: those of the case, less the reserve `slack`."""
+        return jax.tree.map(lambda each: each * (1.0 - self.slack), case.limits)
+
+    def settle(
+        self, cases: ReachCase, plan_of: Callable[[Planner, ReachCase], ReachPlan] | None = None
+    ) -> "tuple[SearchPlanner, StartedReach]":
+        """Plan cases; return a planner and cases by which `pj.gradient` differentiates the plans.
+
+        `plan_of(self, cases)` makes the plans. By default the first entry of `attempts` makes them.
+        """
+        from planner_jax.task.reach.closed_form import (  # few plans need it
+            ClosedReach,
+            StartedReach,
+        )
+
+        if plan_of is None:
+            plans = self.solve(lax.stop_gradient(cases), self.attempts[0])
+        else:
+            plans = plan_of(self, cases)
+        goal, duration = lax.stop_gradient((plans.goal, plans.cost))
+        started = StartedReach(**vars(cases), goal=goal, duration=duration)
+        return SearchPlanner(ClosedReach(self)), started
 
     def _stand_still(self, case: ReachCase) -> ReachPlan:
         num, dtype = case.angles.shape[0], case.angles.dtype

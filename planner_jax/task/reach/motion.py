@@ -40,7 +40,10 @@ def quickest_knots(start: Array, goal: Array, limits: ArmLimits) -> tuple[Array,
     still = jnp.zeros_like(size)
     total = jnp.max(least_times(size, still, limits.velocity, most, ends_at_rest=True)[0])
     speed = most * total
-    speed = 0.5 * (speed - jnp.sqrt(jnp.maximum(speed**2 - 4.0 * most * size, 0.0)))
+    square = speed**2 - 4.0 * most * size
+    cruises = square > 0.0  # the root has a finite slope for the slowest joint
+    root = jnp.where(cruises, jnp.sqrt(jnp.where(cruises, square, 1.0)), 0.0)
+    speed = 0.5 * (speed - root)
     speed = jnp.minimum(speed, limits.velocity)
     ramps = speed / most
     times = jnp.sort(jnp.concatenate([jnp.zeros(1, turn.dtype), ramps, total - ramps, total[None]]))
