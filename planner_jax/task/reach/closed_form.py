@@ -47,7 +47,7 @@ class ClosedReach(Problem):
 
     def prepare(self, case: StartedReach) -> StartedReach:
         """Return the case with the limits that plans use."""
-        return case.replace(limits=self.own.strict_limits(case))
+        return dataclasses.replace(case, limits=self.own.strict_limits(case))
 
     def guesses(self, context: StartedReach, num: int) -> Array:
         """Return the minimum, (num, 1)."""
@@ -77,13 +77,14 @@ class ClosedReach(Problem):
         _, is_straight = self._durations(context)
         points = jnp.stack([context.angles, context.goals[context.goal]])
         both = (
-            motion.quickest_knots(*points, context.limits),
+            motion.quickest_knots(points[0], points[1], context.limits),
             motion.straight_knots(points, context.limits),
         )
-        padded = [motion.pad_knots(*each, self.own.pieces) for each in both]
+        padded = [motion.pad_knots(times, rates, self.own.pieces) for times, rates in both]
         knots = jax.tree.map(lambda a, b: jnp.where(is_straight, b, a), *padded)
         fixed, constant = lax.stop_gradient((context, knots))
         states = jnp.concatenate([fixed.angles[None], fixed.goals])
         rows = clearances(fixed.arm, fixed.scene, states)
         plan = self.own.finish(fixed, rows, fixed.goal, *constant)
-        return plan.replace(motion=motion.join_knots(context.angles, *knots))
+        path = motion.join_knots(context.angles, knots[0], knots[1])
+        return dataclasses.replace(plan, motion=path)
