@@ -5,7 +5,7 @@
 `pj.gradient` differentiates the contact time by the ball's initial position. The reference moves
 the ball by 0.1 mm and by 0.01 mm along a random direction, forwards and backwards, and minimises
 the cost again in float64, from the same plan. The error is relative, by the nearer of the two
-differences. The table counts cases whose plan is solved, and those of them that have a gradient.
+differences. The table has the number of solved cases, and how many of these have a gradient.
 """
 
 import dataclasses

@@ -129,7 +129,7 @@ def own_solver(function: Callable, settings: Any, bounds: Any) -> Callable:
 
 
 def by_optax(function: Callable, method: Any, bounds: Any, most: int = 300) -> Callable:
-    """Return a function like that of `own_solver`, by a loop over a transformation of optax."""
+    """Return a solver as `own_solver` does, which repeats a transformation of optax."""
     project = lambda x: optax.projections.projection_box(x, *bounds) if bounds else x  # noqa: E731
 
     def solve_one(start, tolerance):
@@ -153,7 +153,7 @@ def by_optax(function: Callable, method: Any, bounds: Any, most: int = 300) -> C
 
 
 def by_optimistix(function: Callable, kind: str) -> Callable:
-    """Return a function like that of `own_solver`, by optimistix at a tenth of the tolerance."""
+    """Return a solver as `own_solver` does, of optimistix at a tenth of the tolerance."""
     optimistix: Any = importlib.import_module("optimistix")  # may be absent
     squares = kind != "BFGS"
     run = optimistix.least_squares if squares else optimistix.minimise

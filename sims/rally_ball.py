@@ -1,4 +1,4 @@
-"""What the robots of a rally know about the ball: predictions and estimates across impacts."""
+"""Predict and estimate the ball of a rally across impacts, from what the robots observe."""
 
 import dataclasses
 import functools

@@ -11,24 +11,21 @@ from planner_jax.core.protocol import is_solved
 from planner_jax.task.block.problem.flight import flight_of
 from planner_jax.task.block.problem.terms import Weights, contact_terms
 from planner_jax.trajectory.polynomial import evaluate
+from tests.derivatives import double
 
 SMALL = {"pieces": 5, "points": 16, "samples": 10, "checked": 20}
 BY = ("ball.pos", "ball.vel", "angles")
 
 
-def as_type(tree, dtype):
-    convert = lambda x: x.astype(dtype) if x.dtype == np.float32 else x  # noqa: E731
-    return jax.tree.map(lambda leaf: convert(np.asarray(leaf)), tree)
-
-
-def throws(num, dtype=np.float32):
-    return as_type(pj.block.draw(num, "open", seed=4), dtype)
+def throws(num):
+    return jax.tree.map(np.asarray, pj.block.draw(num, "open", seed=4))
 
 
 @pytest.mark.parametrize("apart", [0.02, 0.3, 1.0])
 def test_slopes_of_the_contact_are_the_gradient_of_its_cost(apart, float64):
-    cases = throws(4, np.float64)
-    plans = as_type(pj.plan(pj.block.planner(**SMALL), throws(4)), np.float64)
+    cases = throws(4)
+    plans = double(pj.plan(pj.block.planner(**SMALL), cases))
+    cases = double(cases)
 
     @jax.vmap
     def compare(case, plan, away):
@@ -61,9 +58,9 @@ def test_gradients_match_differences_of_new_plans():
     found = pj.gradient(planner, cases, of=aim, by=BY)
     assert is_solved(found.plans.status).all()
     assert found.value.dtype == np.float32 and np.all(found.stationarity < 1e-6)
-    plans = as_type(found.plans, np.float64)
     with jax.enable_x64(True):
-        smooth, started = planner.settle(throws(6, np.float64), lambda *_: plans)
+        plans = double(found.plans)
+        smooth, started = planner.settle(double(cases), lambda *_: plans)
         long = dataclasses.replace(smooth.problem.solver, settled=20)
         smooth = pj.SearchPlanner(dataclasses.replace(smooth.problem, solver=long))
         rng = np.random.default_rng(1)

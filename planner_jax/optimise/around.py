@@ -12,7 +12,7 @@ from planner_jax.optimise.settings import Settings
 
 
 class ProblemAround(Problem[CaseT, PlanT]):
-    """A problem with the field `problem`, whose settings are its own and those of this problem."""
+    """A problem that wraps the field `problem`, and has its own settings and those of the field."""
 
     problem: Problem
 

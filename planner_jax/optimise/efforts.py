@@ -4,7 +4,7 @@ import dataclasses
 from typing import TypeVar
 
 from planner_jax.optimise.planner import SearchPlanner
-from planner_jax.optimise.settings import LbfgsConfig, NewtonConfig, Stage
+from planner_jax.optimise.settings import Attempt, LbfgsConfig, NewtonConfig, Stage
 
 Searching = TypeVar("Searching", bound=SearchPlanner)
 # Settings with which Newton's method continues the first attempt to the optimum.
@@ -19,6 +19,8 @@ _POLISH = NewtonConfig(
     stragglers=(0.125, 10, 10),
 )
 LONG = LbfgsConfig(max_steps=300, tolerance=1e-7, patience=6)
+# The only attempt of problems whose `guesses` already are minima.
+NO_SEARCH = (Attempt(solver=LbfgsConfig(max_steps=0)),)
 # Value of `effort` -> settings of Newton's method, which continues the first attempt.
 _BY_EFFORT = {
     "good": NewtonConfig(max_steps=1, damping=1e-6, tolerance=2e-2, stragglers=(0.125, 2, 60)),

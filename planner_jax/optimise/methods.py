@@ -8,7 +8,8 @@ and trial points along it are projected, as in the two-metric projection of [Ber
 
 import dataclasses
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, NamedTuple
+from types import ModuleType
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -134,16 +135,16 @@ def _newton(config: NewtonConfig, objective: Callable, inside: Callable, box: Bo
     return _steps_by(newton, config, advance)
 
 
-def _inside(state: Any, box: Box | None) -> Any:
+def _inside(state: PyTree, box: Box | None) -> PyTree:
     """Return a state of L-BFGS or Newton's method whose points are within the bounds."""
     point, best = project(state.point, box), project(state.best_point, box)
     return dataclasses.replace(state, point=point, best_point=best)
 
 
-def _steps_by(module: Any, config: LbfgsConfig | NewtonConfig, advance: Callable) -> Steps:
+def _steps_by(module: ModuleType, config: LbfgsConfig | NewtonConfig, advance: Callable) -> Steps:
     """Return the steps of a module whose states have the best point so far and `numbers`."""
 
-    def outcome(state: Any) -> tuple[Array, Array, Array]:
+    def outcome(state: PyTree) -> tuple[Array, Array, Array]:
         numbers = state.numbers
         return state.best_point, numbers.iteration, module.is_stationary(numbers, config)
 
@@ -199,7 +200,7 @@ def _optax(config: OptaxSolver, objective: Callable, inside: Callable, box: Box 
         updates, inner = transformation.update(
             slope, inner, point, value=here.cost, grad=slope, value_fn=value_fn
         )
-        after: Any = optax.apply_updates(point, updates)
+        after: PyTree = optax.apply_updates(point, updates)
         return (project(after, box), inner, best, iteration + 1), projected_norm(point, grad, box)
 
     return Steps(

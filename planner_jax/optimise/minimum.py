@@ -2,7 +2,6 @@
 
 import functools
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -11,6 +10,7 @@ from flax import struct
 from jax import Array, lax
 from jax.core import Tracer
 from jaxtyping import PyTree
+from numpy.typing import ArrayLike
 
 from planner_jax.core.arithmetic import numpy_of
 from planner_jax.core.checks import numbers_of, require_kind, require_number, require_numeric
@@ -38,20 +38,20 @@ class Minimum:
 
 
 def minimise(
-    objective: Callable[..., Any],
-    start: Any,
+    objective: Callable[..., PyTree],
+    start: ArrayLike,
     solver: Method = LONG,
     *,
     args: tuple = (),
-    bounds: tuple[Any, Any] | None = None,
+    bounds: tuple[ArrayLike, ArrayLike] | None = None,
     gradient_tolerance: float = 1e-5,
 ) -> Minimum:
     """Minimise an objective from one start (n,), or from B starts (B, n) in B lanes at once.
 
     The function works inside `jax.jit` and `jax.vmap`, and computes in the type of `start`.
-    Derivatives of the result are those of the minimum, by the implicit function theorem: by `args`,
-    by bounds, and by arrays that the objective closes over. They are NaN in a lane that is not
-    stationary, and zero by `start`. Outside of `jax.jit`, each new objective is compiled.
+    The implicit function theorem gives the derivatives of the minimum by `args`, by bounds, and by
+    arrays that the objective closes over. They are NaN in a lane that is not stationary. The
+    derivatives by `start` are zero. Outside of `jax.jit`, each new objective is compiled.
 
     Args:
         objective: pure function of a point (n,) and of the `args` of one lane. It returns the cost
@@ -87,7 +87,7 @@ def minimise(
     return jax.tree.map(lambda leaf: leaf[0], found) if axes else found
 
 
-def _check(start: Any, args: tuple, bounds: Any) -> tuple[Any, tuple, Box | None]:
+def _check(start: ArrayLike, args: tuple, bounds: PyTree) -> tuple[Array, tuple, Box | None]:
     """Return checked arguments; the start is within the bounds, and NaN where they are wrong."""
     point = require_numeric("start", start)
     if not jnp.issubdtype(point.dtype, jnp.floating):
@@ -117,30 +117,30 @@ def _search(
     objective: Callable, settings: PyTree, tolerance: Array, lanes: tuple, shared: list
 ) -> Minimum:
     """Minimise B lanes, whose axis is the first one in `lanes`: starts, arguments and bounds."""
-    solver: Any = settings.attempt if isinstance(settings, Fixed) else settings
+    solver: PyTree = settings.attempt if isinstance(settings, Fixed) else settings
     is_squares = isinstance(solver, LevenbergConfig)
     over = over_lanes if isinstance(solver, LbfgsConfig | NewtonConfig) else _over_last
     (starts, *data), constants = lax.stop_gradient((put_lanes_last(lanes), shared))
 
-    def steps(args: tuple, box: Box | None) -> Any:
-        def goal(point: Array) -> Any:
+    def steps(args: tuple, box: Box | None) -> PyTree:
+        def goal(point: Array) -> PyTree:
             values = _read(objective(point, *args, *constants), point.dtype, is_squares)
             return values if is_squares else Evaluation(*values)
 
         return steps_of(solver, goal, box)
 
-    def start(point: Array, *own: Any) -> tuple:
+    def start(point: Array, *own: PyTree) -> tuple:
         return steps(*own).start(point), jnp.zeros((), bool)
 
-    def is_open(lane: tuple, *own: Any) -> Array:
+    def is_open(lane: tuple, *own: PyTree) -> Array:
         return steps(*own).is_open(lane[0]) & ~lane[1]
 
-    def advance(lane: tuple, *own: Any) -> tuple:
+    def advance(lane: tuple, *own: PyTree) -> tuple:
         state, norm = steps(*own).advance(lane[0])
         goes_on = is_open(lane, *own)
         return jax.tree.map(lambda a, b: jnp.where(goes_on, a, b), (state, norm <= tolerance), lane)
 
-    def finish(lane: tuple, *own: Any) -> tuple:
+    def finish(lane: tuple, *own: PyTree) -> tuple:
         point, iterations, is_stationary = steps(*own).outcome(lane[0])
         return point, iterations, is_stationary | lane[1]
 
@@ -168,7 +168,7 @@ def _over_last(function: Callable) -> Callable:
     return jax.vmap(function, in_axes=-1, out_axes=-1)
 
 
-def _read(value: Any, dtype: Any, is_squares: bool) -> Any:
+def _read(value: PyTree, dtype: np.dtype, is_squares: bool) -> PyTree:
     """Return residuals (m,), or the pair of cost and violation, as an objective returned them."""
     pair = value if isinstance(value, tuple) else (value,) if is_squares else (value, 0.0)
     shapes = [jnp.shape(each) for each in pair]

@@ -99,7 +99,7 @@ _UNITS = (0.1, 0.05, 0.3, 0.5)
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class BatHit(Problem):
-    """The problem that [Yu2023bat] minimises; with `transition=False`, that of its "Bat-Lite".
+    """The problem that [Yu2023bat] minimises; `transition=False` makes the problem of "Bat-Lite".
 
     A trajectory of M polynomial pieces has M - 1 inner waypoints. The decision variables, in units
     of `scale`, are the waypoints' positions [m], the logarithm of the impact time T [s], y and z of

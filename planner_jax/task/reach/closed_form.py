@@ -14,8 +14,9 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array, lax
 
+from planner_jax.optimise.efforts import NO_SEARCH
 from planner_jax.optimise.planner import Problem
-from planner_jax.optimise.settings import Attempt, Evaluation, LbfgsConfig
+from planner_jax.optimise.settings import Attempts, Evaluation
 from planner_jax.robot.arm_clearance import clearances
 from planner_jax.robot.arm_motion import least_times
 from planner_jax.task.reach import motion
@@ -42,7 +43,7 @@ class ClosedReach(Problem):
 
     case_type: ClassVar[type] = StartedReach
     guesses_minima: ClassVar[bool] = True
-    attempts: ClassVar[tuple[Attempt, ...]] = (Attempt(solver=LbfgsConfig(max_steps=0)),)
+    attempts: ClassVar[Attempts] = NO_SEARCH
     own: "ReachPlanner"
 
     def prepare(self, case: StartedReach) -> StartedReach:

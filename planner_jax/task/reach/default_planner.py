@@ -252,7 +252,7 @@ class ReachPlanner(Planner):
         )
 
     def strict_limits(self, case: ReachCase) -> ArmLimits:
-        """Return the limits that plans use: those of the case, less the reserve `slack`."""
+        """Return the limits of a case, reduced by the fraction `slack`; plans keep these limits."""
         return jax.tree.map(lambda each: each * (1.0 - self.slack), case.limits)
 
     def settle(

@@ -15,10 +15,11 @@ from flax import struct
 from jax import Array, lax
 from jaxtyping import PyTree
 
+from planner_jax.optimise.efforts import NO_SEARCH
 from planner_jax.optimise.levenberg import LevenbergConfig, Model, least_squares
 from planner_jax.optimise.planner import Problem
 from planner_jax.optimise.preconditioner import positive_inverse
-from planner_jax.optimise.settings import Attempt, Curvature, Evaluation, LbfgsConfig
+from planner_jax.optimise.settings import Attempts, Curvature, Evaluation
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.plan import BlockPlan
 from planner_jax.task.block.problem.flight import Flight, flight_of
@@ -51,8 +52,7 @@ class SmoothBlock(Problem):
     case_type: ClassVar[type] = StartedBlock
     guesses_minima: ClassVar[bool] = True
     needs_double: ClassVar[bool] = True
-    # A single attempt without steps of L-BFGS: `guesses` already returns the minimum.
-    attempts: ClassVar[tuple[Attempt, ...]] = (Attempt(solver=LbfgsConfig(max_steps=0)),)
+    attempts: ClassVar[Attempts] = NO_SEARCH
     own: "OnlineBlock"
     solver: LevenbergConfig = LevenbergConfig(200, ease=0.1, settled=6, tolerance=0.0)
 

@@ -8,9 +8,10 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array, lax
 
+from planner_jax.optimise.efforts import NO_SEARCH
 from planner_jax.optimise.levenberg import LevenbergConfig, Model, least_squares
 from planner_jax.optimise.planner import Problem
-from planner_jax.optimise.settings import Attempt, Evaluation, LbfgsConfig
+from planner_jax.optimise.settings import Attempts, Evaluation
 from planner_jax.plane.distance_field import DistanceField
 from planner_jax.plane.obstacles import join_obstacles
 from planner_jax.task.intercept.case import InterceptCase
@@ -46,8 +47,7 @@ class SmoothIntercept(Problem):
     case_type: ClassVar[type] = StartedCase
     adjoint: ClassVar[str] = "whole"
     guesses_minima: ClassVar[bool] = True
-    # A single attempt without steps of L-BFGS: `guesses` already returns the minimum.
-    attempts: ClassVar[tuple[Attempt, ...]] = (Attempt(solver=LbfgsConfig(max_steps=0)),)
+    attempts: ClassVar[Attempts] = NO_SEARCH
     problem: MotionProblem = MotionProblem()
     solver: LevenbergConfig = LevenbergConfig(2000, settled=12, tolerance=0.0)
 
