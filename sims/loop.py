@@ -25,7 +25,7 @@ from jax import Array, lax
 
 from planner_jax.ball.flight import BallState, fly
 from planner_jax.core.compiled import QUICK_OPTIONS
-from planner_jax.host.machine import as_here
+from planner_jax.host.threads import as_here
 from planner_jax.sims import sensing as sight
 from planner_jax.sims.loop_state import FlightState, Loop, Outlook, Pilot, Record
 from planner_jax.sims.model import ball_states, ball_velocity, step

@@ -96,14 +96,14 @@ def finished(request, tmp_path_factory):
 
 
 # Test modules, without "test_", of baselines, observed balls, plans that replace others, policies,
-# clusters, devices, wheels and benchmarks, which only `make test-slow` runs, or the mark `gpu`.
+# clusters, wheels and benchmarks, which only `make test-slow` runs, or the mark `gpu`.
 SLOW = (
     *("b_spline", "baselines", "bezier", "block_library", "block_peers"),
     *("hybrid_astar", "minimum_jerk", "mpp", "paper_catch", "path_smoothing"),
     *("path_then_speed", "qp", "speed", "station_time"),
     *("block_eye", "block_receding", "catch_replan", "trip_peers"),
     *("policy", "training", "learned_start"),
-    *("cluster", "devices", "gpu", "wheel"),
+    *("cluster", "gpu", "wheel"),
     *("bench", "benchmark_ipopt", "intercept_gradient", "intercept_oracle"),
 )
 # Besides `test_sims_*`, modules in which JAX may convert types, because code of MJX, Brax or optax

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+import threading
 
 import chex
 import jax
@@ -10,23 +11,60 @@ import numpy as np
 import pytest
 from test_solve import Well, WellProblem
 
+import planner_jax as pj
+from planner_jax.core.protocol import are_solved
 from planner_jax.planning.plan import plan
 
 GOALS = np.linspace(-1.0, 5.0, 203).astype(np.float32)
+SOME = GOALS[::6][:32]
+TASKS = ("hit", "catch", "rally", "team", "intercept", "group", "block", "reach")
+
+
+def test_two_devices_give_the_plans_of_one():
+    run_on_devices(2, "compare_two()")
 
 
 @pytest.mark.slow
 def test_several_devices_give_the_plans_of_one():
+    run_on_devices(4, "compare_devices()")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", TASKS)
+def test_two_devices_give_the_plans_of_one_for_every_task(name):
+    run_on_devices(2, f"compare_task({name!r})")
+
+
+def run_on_devices(num, call):
+    """Run a function of this module in a process with `num` CPU devices."""
     # XLA reads the number of devices when a process starts.
-    env = {**os.environ, "XLA_FLAGS": "--xla_force_host_platform_device_count=4"}
-    command = [sys.executable, __file__]
-    process = subprocess.run(command, env=env, capture_output=True, text=True, timeout=240)
+    env = {**os.environ, "XLA_FLAGS": f"--xla_force_host_platform_device_count={num}"}
+    command = [sys.executable, "-c", f"from test_devices import *; {call}"]
+    there = os.path.dirname(__file__)
+    process = subprocess.run(
+        command, env=env, cwd=there, capture_output=True, text=True, timeout=560
+    )
     assert process.returncode == 0, process.stderr[-2000:]
-    assert process.stdout.endswith("equal\n")
 
 
 def require_equal(found, expected):
     chex.assert_trees_all_close(found, expected, rtol=1e-5, atol=1e-5)
+
+
+def compare_two():
+    """Check plans, their devices, and reports of progress on two devices."""
+    devices, planner = jax.local_devices(), WellProblem.planner()
+    goals = jax.numpy.asarray(SOME)
+    both = plan(planner, Well(goals))
+    assert both.point.sharding.device_set == set(devices)
+    require_equal(both, plan(planner, Well(goals), devices=devices[:1]))
+    again = plan(planner, Well(jax.device_put(goals, both.cost.sharding)))
+    chex.assert_trees_all_equal(again, both)
+    assert again.point.sharding == both.point.sharding
+    require_equal(plan(planner, Well(SOME)), both)
+    few = plan(planner, Well(goals[:16]))
+    assert few.point.sharding.device_set == {devices[0]}
+    compare_reports(planner, SOME)
 
 
 def compare_devices():
@@ -43,16 +81,42 @@ def compare_devices():
             require_equal(resident, alone)
             assert isinstance(resident.point, jax.Array)
             assert resident.point.sharding.device_set == {(some or devices)[0]}
-    even = plan(WellProblem.planner(), Well(jax.numpy.asarray(GOALS[:200])))
+    even = plan(planner, Well(jax.numpy.asarray(GOALS[:200])))
     assert len(even.point.sharding.device_set) == 4
     broken = GOALS.copy()
     broken[::100] = np.nan
-    spoiled = plan(WellProblem.planner(), Well(broken))
+    spoiled = plan(planner, Well(jax.numpy.asarray(broken)))
     others = np.isfinite(broken)
-    clean = plan(WellProblem.planner(), Well(GOALS))
+    clean = plan(planner, Well(jax.numpy.asarray(GOALS)))
     np.testing.assert_array_equal(spoiled.point[others], clean.point[others])
 
 
-if __name__ == "__main__":
-    compare_devices()
-    print("equal")
+def compare_reports(planner, goals):
+    """Check that reports count the cases of all devices, and that a time limit ends all."""
+    reports, busy = [], threading.Lock()
+
+    def note(report):
+        assert busy.acquire(blocking=False)  # one report at a time
+        reports.append(report)
+        busy.release()
+
+    plans = plan(planner, Well(goals), progress=note)
+    first = [report for report in reports if report.attempt == 1]
+    assert first[-1].tried == first[-1].cases == goals.size
+    assert [report.tried for report in first] == sorted(report.tried for report in first)
+    late = plan(planner, Well(goals), time_limit=0.0)
+    is_late = late.status == pj.Status.OUT_OF_TIME
+    np.testing.assert_array_equal(is_late, ~are_solved(late))
+    assert are_solved(late).sum() < are_solved(plans).sum()
+
+
+def compare_task(name):
+    """Check that the plans of a task on two devices have the bits of its plans on one."""
+    devices, task = jax.local_devices(), pj.task_named(name)
+    assert len(devices) == 2
+    planner, cases = task.planner(), jax.tree.map(np.asarray, task.draw(34, None, seed=3))
+    alone = plan(planner, cases, devices=devices[:1])
+    both = plan(planner, cases, devices=devices)
+    np.testing.assert_array_equal(both.status, alone.status)
+    chex.assert_trees_all_close(both.cost, alone.cost, rtol=1e-4)
+    chex.assert_trees_all_equal(both, alone)

@@ -28,6 +28,7 @@ from planner_jax.core.registry import all_tasks
 from planner_jax.planning.programs import program_key
 from tests.trees import as_numpy, assert_same
 
+CPU = jax.devices("cpu")[0]
 MODES = {
     "x64": {"jax_enable_x64": True},
     "no NaN": {"jax_debug_nans": True},
@@ -153,5 +154,5 @@ def test_threads_know_programs_of_each_precision_apart():
     keys = set()
     for is_double in (False, True):
         with options({"jax_enable_x64": is_double}):
-            keys.add(program_key(Nearest(), BaseAttempt(1), 16, lines(np.float32), False))
+            keys.add(program_key(Nearest(), BaseAttempt(1), 16, lines(np.float32), CPU, False))
     assert len(keys) == 2

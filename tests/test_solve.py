@@ -197,7 +197,7 @@ def test_unsolvable_lanes_keep_the_least_violation_found():
 @pytest.mark.parametrize("apart", [False, True], ids=["in host memory", "as on a GPU"])
 def test_arrays_on_a_device_stay_there_and_give_the_same_plans(apart, monkeypatch):
     if apart:
-        monkeypatch.setattr(batch, "is_one_cpu", lambda mesh: False)
+        monkeypatch.setattr(batch, "is_cpu", lambda device: False)
     goals = np.linspace(-1.0, 5.0, 41).astype(np.float32)
     host = pj.plan(WellProblem.planner(), Well(goals), chunk=16)
     resident = pj.plan(WellProblem.planner(), Well(jnp.asarray(goals)), chunk=16)
@@ -207,17 +207,17 @@ def test_arrays_on_a_device_stay_there_and_give_the_same_plans(apart, monkeypatc
 
 
 def test_a_later_round_takes_only_what_is_unsolved(monkeypatch):
-    monkeypatch.setattr(batch, "is_one_cpu", lambda mesh: False)
+    monkeypatch.setattr(batch, "is_cpu", lambda device: False)
     sizes = []
 
     def note_size(function):
-        def noting(planner, attempt, mesh, cases, before, **options):
+        def noting(planner, attempt, device, cases, before, **options):
             sizes.append(cases.goal.size)
-            return function(planner, attempt, mesh, cases, before, **options)
+            return function(planner, attempt, device, cases, before, **options)
 
         return noting
 
-    monkeypatch.setattr(batch, "solve_on_devices", note_size(batch.solve_on_devices))
+    monkeypatch.setattr(batch, "solve_on_device", note_size(batch.solve_on_device))
     goals = np.full(300, 0.5, np.float32)
     goals[[7, -1]] = 3.5
     assert is_solved(pj.plan(WellProblem.planner(), Well(jnp.asarray(goals))).status).all()
@@ -240,7 +240,7 @@ def test_a_round_leaves_alone_what_is_farther_off_than_it_says(kind, monkeypatch
         if kind == "compiled":
             return jax.jit(lambda goals: pj.solve(planner, Well(goals)))(goals)
         if kind == "as on a GPU":
-            monkeypatch.setattr(batch, "is_one_cpu", lambda mesh: False)
+            monkeypatch.setattr(batch, "is_cpu", lambda device: False)
             return pj.plan(planner, Well(jnp.asarray(goals)))
         return pj.plan(planner, Well(goals))
 

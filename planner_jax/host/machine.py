@@ -1,16 +1,10 @@
 """Functions that measure memory, disk, processor and threads; they do not need JAX."""
 
-import contextlib
 import functools
 import os
 import platform
 import shutil
-from collections.abc import Callable
 from pathlib import Path
-from typing import ParamSpec, TypeVar
-
-_Arguments = ParamSpec("_Arguments")
-_Result = TypeVar("_Result")
 
 _CGROUP = Path("/sys/fs/cgroup")  # control group of a container, version 2
 
@@ -109,18 +103,3 @@ def processor() -> str:
     known = (entries.get("flags") or entries.get("features") or "").split()
     widest = next((vectors for vectors in _VECTORS if vectors in known), None)
     return f"{name} ({widest})" if widest else name
-
-
-def as_here(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
-    """Wrap a function so that other threads run it with this thread's `jax_enable_x64`."""
-    import jax  # the command line measures memory without JAX
-
-    here = jax.config.jax_enable_x64  # type: ignore[attr-defined]
-
-    def call(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> _Result:
-        # Within `enable_x64` JAX compiles programs again, even if the precision is unchanged.
-        is_equal = jax.config.jax_enable_x64 == here  # type: ignore[attr-defined]
-        with contextlib.nullcontext() if is_equal else jax.enable_x64(here):
-            return function(*args, **kwargs)
-
-    return call

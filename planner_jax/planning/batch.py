@@ -1,20 +1,18 @@
-"""Plan batches of cases, for `plan`, in parts (chunks) of a few fixed sizes on all devices.
+"""Plan batches of cases on one device, for `plan`, in parts (chunks) of a few fixed sizes.
 
 A lane is one case of a batch. The cases that an attempt (search) leaves unsolved are gathered into
-a smaller batch for the next attempt. Each device solves its lanes in its own loop and waits for no
-other device. A `Watch` reports progress to the caller and ends the attempts at the time limit.
+a smaller batch for the next attempt. A `Watch` reports progress to the caller and ends the attempts
+at the time limit.
 """
 
 import dataclasses
 import functools
 from collections.abc import Callable, Hashable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING
 
 import jax
 import numpy as np
 from jax import Array
-from jax.sharding import Mesh
 from jaxtyping import PyTree
 
 from planner_jax.core.planner import Planner
@@ -29,17 +27,16 @@ from planner_jax.core.protocol import (
 )
 from planner_jax.planning.programs import (
     FEW,
+    Device,
     Sizes,
     compiled,
     count_lanes,
-    is_one_cpu,
-    lane_sharding,
-    on_devices,
-    place_lanes,
+    is_cpu,
+    place,
     program_key,
     score_of,
     sizes_of,
-    solve_on_devices,
+    solve_on_device,
 )
 
 if TYPE_CHECKING:
@@ -55,7 +52,7 @@ def plan_batch(
     attempts: Sequence[BaseAttempt],
     cases: PyTree,
     chunk: int | None,
-    devices: Sequence[jax.Device] | None,  # pyright: ignore[reportInvalidTypeForm]
+    device: Device | None,
     watch: "Watch",
 ) -> tuple[PyTree, PyTree]:
     """Return plans of a batch, by attempts (searches), each made at the cases still unsolved.
@@ -64,27 +61,29 @@ def plan_batch(
         planner: planner that makes the attempts.
         attempts: one or more attempts, in order.
         cases: batch of B cases, with a leading axis of length B on every leaf.
-        chunk: number of cases that a device solves in one call; None: a number that suits it.
-        devices: devices that share the batch; None for all local devices.
+        chunk: number of cases that the device solves in one call; None: a number that suits it.
+        device: device that plans the batch; None for the first local one.
         watch: ends the attempts at the time limit; the first attempt always starts.
 
     Returns:
         The plans, in NumPy arrays, or in jax arrays if all arrays of the cases are jax arrays;
-        and the number of unsolved cases, or an array with one such number for each device.
+        and the number of unsolved cases.
     """
-    planner, mesh = on_devices(planner, devices)
+    device = jax.local_devices()[0] if device is None else device
+    if jax.tree.leaves(planner):
+        planner = jax.device_put(planner, device)
     resident, num = is_resident(cases), count_lanes(cases)
-    batch = Batch(planner, chunk, mesh, watch, is_one_cpu(mesh) and num <= FEW)
-    # On one CPU, one thread for each core plans a part of the batch. NumPy divides the batch and
+    batch = Batch(planner, chunk, device, watch, is_cpu(device) and num <= FEW)
+    # On a CPU, one thread for each core plans a part of the batch. NumPy divides the batch and
     # joins the plans, because JAX would compile a program for every new batch size.
-    is_small = is_one_cpu(mesh) and num != batch.sizes(attempts[0]).next(num)
+    is_small = is_cpu(device) and num != batch.sizes(attempts[0]).next(num)
     if resident and not is_small:
         from planner_jax.planning.resident import ResidentBatch  # NumPy arrays do not need it
 
         return ResidentBatch(**vars(batch)).plan(attempts, cases)
     cases = jax.tree.map(np.asarray, cases)
     plans, unsolved = _try_in_turn(attempts, num, watch, functools.partial(batch.try_lanes, cases))
-    return (jax.device_put(plans, lane_sharding(mesh)) if resident else plans), unsolved
+    return (jax.device_put(plans, device) if resident else plans), unsolved
 
 
 def plan_on_host(
@@ -132,18 +131,18 @@ def _try_in_turn(
 
 @dataclasses.dataclass(frozen=True)
 class Batch:
-    """A planner and the devices on which it plans batches of cases."""
+    """A planner and the device on which it plans batches of cases."""
 
     planner: Planner
     chunk: int | None
-    mesh: Mesh
+    device: Device
     watch: "Watch"
 
     compiles_quickly: bool  # for a batch of few cases on a CPU
 
     def sizes(self, attempt: BaseAttempt) -> Sizes:
         """Return the numbers of cases that one compiled call of an attempt may solve."""
-        return sizes_of(self.planner, attempt, self.chunk, self.mesh)
+        return sizes_of(self.planner, attempt, self.chunk, self.device)
 
     def try_lanes(
         self, cases: PyTree, attempt: BaseAttempt, lanes: np.ndarray, plans: PyTree
@@ -172,10 +171,10 @@ class Batch:
         return mark_out_of_time(plans, untried) if untried.any() else plans
 
     def _calls(self, attempt: BaseAttempt, lanes: np.ndarray) -> list[_Call]:
-        calls, devices = [], self.mesh.size
-        for first, size in self.sizes(attempt).cuts(-(-lanes.size // devices)):
-            part = lanes[first * devices :][: size * devices]
-            filling = np.full(size * devices - part.size, part[0])
+        calls = []
+        for first, size in self.sizes(attempt).cuts(lanes.size):
+            part = lanes[first : first + size]
+            filling = np.full(size - part.size, part[0])
             calls.append((np.append(part, filling), part.size))
         return calls
 
@@ -188,7 +187,7 @@ class Batch:
         """
         watch = self.watch
         threads, lanes = 1, (cases, score_of(attempt, cases, before))
-        if len(calls) > 1 and is_one_cpu(self.mesh):
+        if len(calls) > 1 and is_cpu(self.device):
             from planner_jax.host.machine import usable_cores  # small batches do not need it
 
             threads = min(len(calls), usable_cores() + 1)
@@ -200,19 +199,19 @@ class Batch:
             some, score = jax.tree.map(lambda leaf: leaf[index], lanes)
             if score is not None:
                 score = score.without(np.arange(index.size) >= num)
-            found, _ = self._solve(attempt, *place_lanes((some, score), self.mesh))
+            found, _ = self._solve(attempt, *place((some, score), self.device))
             return jax.block_until_ready(found) if threads > 1 or watch.waits else found
 
         if threads == 1:  # JAX returns before a result is ready, so the next call is prepared early
             yield from map(solve, calls) if watch.waits else [solve(call) for call in calls]
             return
-        from planner_jax.host.machine import as_here
+        from planner_jax.host.threads import as_here, borrow_threads
 
         # The first call runs alone, so that its program is compiled once and not in every thread.
         key = self._key(attempt, calls[0][0].size, cases)
         alone = [] if key in compiled else [solve(calls[0])]
         compiled.add(key)
-        with ThreadPoolExecutor(threads) as pool:
+        with borrow_threads(threads) as pool:
             later = pool.map(as_here(solve), calls[len(alone) :])
             yield from alone
             yield from later
@@ -221,9 +220,10 @@ class Batch:
         self, attempt: BaseAttempt, cases: PyTree, before: Score | None
     ) -> tuple[PyTree, Array]:
         quickly = self.compiles_quickly
-        return solve_on_devices(
-            self.planner, attempt, self.mesh, cases, before, compiles_quickly=quickly
+        return solve_on_device(
+            self.planner, attempt, self.device, cases, before, compiles_quickly=quickly
         )
 
     def _key(self, attempt: BaseAttempt, num: int, cases: PyTree) -> Hashable:
-        return program_key(self.planner, attempt, num, cases, self.compiles_quickly)
+        options = self.device, self.compiles_quickly
+        return program_key(self.planner, attempt, num, cases, *options)

@@ -40,9 +40,10 @@ class DecidedPlanner(PlannerAround[CaseT, PlanT]):
             return self.planner.settle(first_choice(self.decision, cases))
         if not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(cases)):
             self.decision.check(cases)
-        choices = _propose_all(self.decision, cases)
-        choice = choices[0] if len(choices) == 1 else plan_of(self, cases).choice
-        return self.planner.settle(cases.with_choice(choice), plan_of)
+        choices, decided = _propose_all(self.decision, cases)
+        if len(choices) > 1:
+            decided = cases.with_choice(plan_of(self, cases).choice)
+        return self.planner.settle(decided, plan_of)
 
     def plan_by(self, drive: Drive, cases: PyTree) -> PyTree:
         """Plan cases with each proposed choice by the loop of searches `drive`; return the best."""
@@ -50,12 +51,12 @@ class DecidedPlanner(PlannerAround[CaseT, PlanT]):
         if not drive.is_pure:
             self.decision.check(cases)
         if alone and not drive.is_pure:
-            choices = _split(call_packed(_propose, None, self.decision, cases), 0)
+            choices, decided = _split(call_packed(_propose, None, self.decision, cases), 0), None
         else:
-            choices = _propose_all(self.decision, cases)
+            choices, decided = _propose_all(self.decision, cases)
         if len(choices) == 1:
-            choice = choices[0] if is_resident(cases) else jax.device_get(choices[0])
-            decided = cases.with_choice(choice)
+            if decided is None or not is_resident(cases):
+                decided = cases.with_choice(jax.device_get(choices[0]))
             plans, unsolved = drive(self.planner, decided)
         else:
             if alone:
@@ -102,11 +103,16 @@ def _split(choices: PyTree, axis: int) -> list[PyTree]:
 
 
 @jax.jit
-def _propose_all(decision: Decision, cases: PyTree) -> list[PyTree]:
-    """Return a list of proposed choices, best first; its entries have one choice for each case."""
+def _propose_all(decision: Decision, cases: PyTree) -> tuple[list[PyTree], PyTree]:
+    """Return a list of proposed choices, best first, and the cases with the first choice.
+
+    The entries of the list have one choice for each case.
+    """
     if cases.batch_shape == ():
-        return _split(decision.propose(cases), 0)
-    return _split(jax.vmap(decision.propose)(cases), 1)
+        choices = _split(decision.propose(cases), 0)
+    else:
+        choices = _split(jax.vmap(decision.propose)(cases), 1)
+    return choices, cases.with_choice(choices[0])
 
 
 @jax.jit
@@ -117,4 +123,4 @@ def _explain(decision: Decision, cases: PyTree, status: Array) -> Array:
 
 def first_choice(decision: Decision, cases: PyTree) -> PyTree:
     """Return cases with a decision's first choice, which derivatives treat as constant; pure."""
-    return cases.with_choice(_propose_all(decision, lax.stop_gradient(cases))[0])
+    return cases.with_choice(_propose_all(decision, lax.stop_gradient(cases))[0][0])

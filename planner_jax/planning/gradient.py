@@ -21,6 +21,7 @@ from planner_jax.core.rules import fields_of
 from planner_jax.optimise.sensitivity import Differentiated, Gradient, Quantity, part_of
 from planner_jax.optimise.settings import LbfgsConfig, NewtonConfig, Solver
 from planner_jax.planning.plan import plan, require_fit
+from planner_jax.planning.programs import Device
 
 
 @struct.dataclass
@@ -42,7 +43,7 @@ def gradient(
     solver: Solver | None = None,
     polish: bool = True,
     chunk: int | None = None,
-    devices: Sequence[jax.Device] | None = None,  # pyright: ignore[reportInvalidTypeForm]
+    devices: Sequence[Device] | None = None,
 ) -> PlanGradient:
     """Plan cases, and differentiate one number of every plan by parts of its case.
 

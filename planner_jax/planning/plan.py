@@ -29,7 +29,7 @@ from planner_jax.core.protocol import (
 )
 from planner_jax.core.rules import Case, has_rules, require_shapes, require_sound
 from planner_jax.host.compile_cache import keep_compiled_programs
-from planner_jax.planning.programs import solve_one
+from planner_jax.planning.programs import BUCKETS, GPU_LEAST_PADDED, Device, is_cpu, solve_one
 
 _ARRAYS = (jax.Array, np.ndarray, np.generic)
 
@@ -104,7 +104,7 @@ def plan(
     cases: CaseT,
     *,
     chunk: int | None = None,
-    devices: Sequence[jax.Device] | None = None,  # pyright: ignore[reportInvalidTypeForm]
+    devices: Sequence[Device] | None = None,
     time_limit: float | None = None,
     progress: Callable[[Progress], PyTree] | None = None,
 ) -> PlanT:
@@ -120,7 +120,9 @@ def plan(
             order, each at the cases that are still unsolved.
         cases: one case of the planner's task, or a batch, which has one more leading axis.
         chunk: number of cases that a device solves in one compiled call. The default suits it.
-        devices: devices that share a batch. By default all local ones, `jax.local_devices()`.
+        devices: devices that share a batch. By default all local ones, `jax.local_devices()`. Each
+            device plans its share in a thread of its own. A GPU takes no share below 1,024 cases,
+            and a CPU none below 16; smaller batches use fewer devices.
         time_limit: [s] time, compilation included, after which no attempt but the first starts;
             running computations are finished. Unsolved cases that have not been through all
             attempts have the status `OUT_OF_TIME`; a limit does not change other plans.
@@ -161,13 +163,34 @@ def plan(
         require_batch(cases)
         if not resident:
             require_sound(cases)
-    plans, _ = Driver(chunk, devices, watch)(planner, without_origin(cases))
+    used = _devices_for(planner, cases, devices)
+    if len(used) > 1:
+        from planner_jax.planning.spread import plan_shares  # one device does not need it
+
+        solve_share = lambda device, watch, some: Driver(chunk, device, watch)(planner, some)[0]  # noqa: E731
+        plans = plan_shares(solve_share, without_origin(cases), used, watch)
+    else:
+        device = used[0] if devices is not None and used else None
+        plans, _ = Driver(chunk, device, watch)(planner, without_origin(cases))
     # To save time, a single case's numbers are checked on the host only after the status BAD_INPUT.
     if alone and not resident and int(plans.status) == Status.BAD_INPUT:
         require_sound(cases)
     if not alone and resident and not is_resident(plans):
         plans = jax.device_put(plans, devices[0] if devices else None)
     return with_origin(plans, cases)
+
+
+def _devices_for(
+    planner: Planner,
+    cases: PyTree,
+    devices: Sequence[Device] | None,
+) -> Sequence[Device]:
+    """Return the devices that share a batch, each with enough cases to be worth its thread."""
+    devices = jax.local_devices() if devices is None else devices
+    if len(devices) == 1 or cases.batch_shape == () or planner.kind is Kind.HOST:
+        return devices[:1]
+    least = BUCKETS[0] if is_cpu(devices[0]) else GPU_LEAST_PADDED
+    return devices[: max(1, cases.batch_shape[0] // least)]
 
 
 def _require_layout(chunk: object, devices: object) -> None:
@@ -260,7 +283,7 @@ class Driver:
     """The loop over a planner's attempts (searches) in `pj.plan` or, with `is_pure`, `pj.solve`."""
 
     chunk: int | None = None
-    devices: Sequence[jax.Device] | None = None  # pyright: ignore[reportInvalidTypeForm]
+    device: Device | None = None
     watch: Watch = dataclasses.field(default_factory=Watch)
     is_pure: bool = False  # for use inside a compiled program
 
@@ -294,14 +317,14 @@ class Driver:
         if cases.batch_shape == ():
             plans = _plan_one(planner, attempts, cases, self.watch)
             return plans, is_unsolved(int(plans.status))
-        if cases.batch_shape == (1,) and has_only_cpu() and self.devices is None:
+        if cases.batch_shape == (1,) and has_only_cpu() and self.device is None:
             case = jax.tree.map(lambda leaf: np.asarray(leaf)[0], cases)
             plan = _plan_one(planner, attempts, case, self.watch)
             plans = jax.tree.map(lambda leaf: np.array(leaf)[None], plan)
             return plans, is_unsolved(plans.status)
         from planner_jax.planning.batch import plan_batch  # single cases do not need it
 
-        return plan_batch(planner, attempts, cases, self.chunk, self.devices, self.watch)
+        return plan_batch(planner, attempts, cases, self.chunk, self.device, self.watch)
 
     def plan_again(
         self, plan_of: Callable[[PyTree], PyTree], cases: PyTree, plans: PyTree, left: PyTree

@@ -1,7 +1,7 @@
-"""Compiled programs that make one attempt (search) at one case, or at a batch on all devices.
+"""Compiled programs that make one attempt (search) at one case, or at a batch on one device.
 
-A lane is one case of a batch. A batch is divided equally among the devices, and each device cuts
-its lanes into chunks of a few fixed sizes, so that a new batch size compiles no new program.
+A lane is one case of a batch. The lanes are cut into chunks of a few fixed sizes, so that a new
+batch size compiles no new program.
 
 A single case is packed into one vector for its program, which returns the plan as one vector: each
 array that enters or leaves a program costs some microseconds, a large part of the time of one plan.
@@ -11,20 +11,25 @@ import dataclasses
 import functools
 import math
 from collections.abc import Callable, Hashable, Iterator, Sequence
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.sharding import Mesh, NamedSharding, PartitionSpec, Sharding, SingleDeviceSharding
 from jaxtyping import PyTree
 
 from planner_jax.core.arithmetic import float_type
-from planner_jax.core.compiled import QUICK_OPTIONS, Fixed, Options, trace_for
+from planner_jax.core.compiled import QUICK_OPTIONS, Fixed, Options
 from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import BaseAttempt, Score, is_unsolved, mark_bad_input
 from planner_jax.core.rules import require_shapes
 from planner_jax.planning.traced import Layout, Results, Stored, load_or_trace, settings
+
+if TYPE_CHECKING:  # `jax.Device` is no type for checkers
+    from jaxlib._jax import Device
+else:
+    Device = jax.Device
 
 # Numbers of lanes (cases) that a device solves in one call. Each number needs its own program.
 BUCKETS = (16, 128, 1024, 16384, 65536)
@@ -34,14 +39,13 @@ _CPU_CHUNK, _GPU_CHUNK = 256, 65536
 _GPU_BUSY = 8192  # least number of starts in one call that keeps a GPU busy
 # Least number of lanes of a call on a GPU; fewer lanes take the same time. The second number is for
 # attempts whose padding is never searched.
-_GPU_LEAST, _GPU_LEAST_PADDED = 128, 1024
+_GPU_LEAST, GPU_LEAST_PADDED = 128, 1024
 _SPARED = 8  # a smaller last call must save more than 1/8 of the lanes of all calls before it
-LANES = PartitionSpec("lanes")
 
 
 @dataclasses.dataclass(frozen=True)
 class Sizes:
-    """Numbers of lanes (cases) that one compiled call of an attempt may solve on each device."""
+    """Numbers of lanes (cases) that one compiled call of an attempt may solve."""
 
     most: int  # greatest number of lanes of a call
     busy: int  # least number of lanes of a call that does not hold all remaining lanes
@@ -74,13 +78,13 @@ class Sizes:
             first += size
 
 
-def sizes_of(planner: Planner, attempt: BaseAttempt, chunk: int | None, mesh: Mesh) -> Sizes:
+def sizes_of(planner: Planner, attempt: BaseAttempt, chunk: int | None, device: Device) -> Sizes:
     """Return how many cases one call may solve: `chunk`, or numbers that suit the device."""
-    busy, is_cpu = _GPU_BUSY // attempt.starts, mesh.devices[0].platform == "cpu"
+    busy = _GPU_BUSY // attempt.starts
     if chunk is not None:
         return Sizes(chunk, busy)
-    if not is_cpu:
-        least = _GPU_LEAST_PADDED if attempt.continues else _GPU_LEAST
+    if not is_cpu(device):
+        least = GPU_LEAST_PADDED if attempt.continues else _GPU_LEAST
         many = least if attempt.continues and attempt.starts > 1 else _GPU_CHUNK // attempt.starts
         return Sizes(max(least, many), busy, least)
     # If a core solves cases one after another, small chunks of cases keep all cores busy. Small
@@ -91,81 +95,44 @@ def sizes_of(planner: Planner, attempt: BaseAttempt, chunk: int | None, mesh: Me
     return Sizes(max(BUCKETS[0], _CPU_CHUNK // starts), busy)
 
 
-def on_devices(planner: Planner, devices: Sequence[jax.Device] | None) -> tuple[Planner, Mesh]:  # pyright: ignore[reportInvalidTypeForm]
-    """Return the planner with its arrays on `devices` (None: all local ones), and their mesh."""
-    mesh = Mesh(np.array(jax.local_devices() if devices is None else devices), ("lanes",))
-    if jax.tree.leaves(planner):
-        planner = jax.device_put(planner, replicated_sharding(mesh))
-    return planner, mesh
-
-
 def count_lanes(tree: PyTree) -> int:
     """Return the number of lanes (cases) of a batch: the length of the leading axis."""
     return jax.tree.leaves(tree)[0].shape[0]
 
 
-def is_one_cpu(mesh: Mesh) -> bool:
-    """Return whether the mesh has one device, and this device is a CPU."""
-    return mesh.size == 1 and mesh.devices[0].platform == "cpu"
-
-
-def lane_sharding(mesh: Mesh) -> Sharding:
-    """Return the sharding that divides the leading axis equally among the devices of a mesh."""
-    return NamedSharding(mesh, LANES) if mesh.size > 1 else SingleDeviceSharding(mesh.devices[0])
-
-
-def replicated_sharding(mesh: Mesh) -> Sharding:
-    """Return the sharding of arrays that every device stores completely."""
-    return NamedSharding(mesh, PartitionSpec()) if mesh.size > 1 else lane_sharding(mesh)
+def is_cpu(device: Device) -> bool:
+    """Return whether a device is a CPU."""
+    return device.platform == "cpu"
 
 
 @functools.lru_cache(maxsize=4096)
-def put_number(mesh: Mesh, value: int) -> Array:
-    """Return an integer as an array on every device; cached, because each transfer takes time."""
-    if mesh.size == 1:
-        # JAX compiles a program again if an argument is committed to a device. The arrays of most
-        # users are uncommitted, so an uncommitted number lets all calls use the same program.
-        with jax.default_device(mesh.devices[0]):
-            return jnp.asarray(value, jnp.int32)
-    return jax.device_put(np.int32(value), replicated_sharding(mesh))
+def put_number(device: Device, value: int) -> Array:
+    """Return an integer as an array on a device; cached, because each transfer takes time.
 
-
-def run_per_device(mesh: Mesh, function: Callable, *specs: PartitionSpec) -> Callable:
-    """Return a function that applies `function` on every device to the lanes of that device.
-
-    The arrays have the lanes (cases) on their first axis. `specs` are the shardings of the
-    arguments; by default all arguments are divided by lanes.
+    JAX compiles a program again if an argument is committed to a device. The arrays of most users
+    are uncommitted, so an uncommitted number lets all calls use the same program.
     """
-    if mesh.size == 1:
-        return function
-    # Each device solves its own cases, so JAX's check for replicated values (`vma`) is off.
-    return jax.shard_map(
-        function, mesh=mesh, in_specs=specs or LANES, out_specs=LANES, check_vma=False
-    )
+    with jax.default_device(device):
+        return jnp.asarray(value, jnp.int32)
 
 
-def place_lanes(tree: PyTree, mesh: Mesh) -> PyTree:
-    """Return the tree with its lanes (cases) divided equally among the devices of a mesh.
+def place(tree: PyTree, device: Device) -> PyTree:
+    """Return the tree with its arrays on a device.
 
-    They are committed to these devices, so that all attempts of a call of `plan` share compiled
+    They are committed to the device, so that all attempts of a call of `plan` share compiled
     programs. On the default device arrays stay as they are, since it takes time to commit them.
     """
     default = jax.config.jax_default_device or jax.local_devices()[0]  # type: ignore[attr-defined]
-    if mesh.size == 1 and mesh.devices[0] == default:
-        leaves, here = jax.tree.leaves(tree), {default}
-        is_here = all(isinstance(leaf, Array) and leaf.devices() == here for leaf in leaves)
-        return tree if is_here else jax.device_put(tree)
-    target = lane_sharding(mesh)
+    here, is_default = {device}, device == default
 
     def is_there(leaf: Array | np.ndarray) -> bool:
-        if not isinstance(leaf, Array) or not leaf.committed:
+        if not isinstance(leaf, Array) or leaf.devices() != here:
             return False
-        # == is the faster test, so it is tried first
-        return leaf.sharding == target or leaf.sharding.is_equivalent_to(target, leaf.ndim)
+        return is_default or leaf.committed
 
     if all(map(is_there, jax.tree.leaves(tree))):
         return tree
-    return jax.device_put(tree, target)
+    return jax.device_put(tree, None if is_default else device)
 
 
 # XLA would try its own kernels for every matrix product, which takes a third of the compile time
@@ -201,50 +168,22 @@ def score_of(attempt: BaseAttempt, cases: PyTree, plans: PyTree) -> Score | None
     return Score.none(cases.batch_shape, jax.dtypes.canonicalize_dtype(float_type(cases)))
 
 
-class PerDevice:
-    """A pure function `function(static, *trees, lanes)`, compiled for the devices of a mesh.
-
-    Every device applies the function to its share of `lanes`, a pytree with the lanes (cases) on
-    the first axis. The other arguments are the same on all devices; `static` is hashable. The
-    programs of a single device are stored on the disk.
-    """
-
-    def __init__(self, function: Callable[..., PyTree], options: Options) -> None:
-        self._function = function
-        self._alone = Stored(function, options)
-        self._together = jax.jit(
-            self._run_together, static_argnames=("mesh", "static"), compiler_options=options
-        )
-
-    def __call__(self, mesh: Mesh, static: Hashable, *trees: PyTree) -> PyTree:
-        """Return the function's results, joined over the lanes (cases) of all devices."""
-        if mesh.size == 1:
-            return self._alone(mesh.devices[0].platform, static, *trees)
-        return self._together(*trees, mesh=mesh, static=static)
-
-    def _run_together(self, *trees: PyTree, mesh: Mesh, static: Hashable) -> PyTree:
-        function = functools.partial(self._function, static)
-        specs = (PartitionSpec(),) * (len(trees) - 1)
-        with trace_for(mesh.devices[0].platform):
-            return run_per_device(mesh, function, *specs, LANES)(*trees)
-
-
-def solve_on_devices(
+def solve_on_device(
     planner: Planner,
     attempt: BaseAttempt,
-    mesh: Mesh,
+    device: Device,
     cases: PyTree,
     before: Score | None = None,
     *,
     compiles_quickly: bool = False,
 ) -> tuple[PyTree, Array]:
-    """Return plans of all cases, and the number of unsolved cases on each device, (devices,).
+    """Return plans of all cases, and the number () of unsolved cases.
 
     `before` has the numbers of earlier plans, see `score_of`. With `compiles_quickly`, compilation
     is faster and large batches take about 10 % longer.
     """
     run = _solve_quickly if compiles_quickly and QUICK_OPTIONS else _solve_fast
-    return run(mesh, None, *planner.load(attempt, cases), (cases, before))
+    return run(device.platform, None, *planner.load(attempt, cases), (cases, before))
 
 
 def _solve_and_count(
@@ -253,27 +192,32 @@ def _solve_and_count(
     return with_unsolved(solve_cases(planner, lanes[0], loaded, lanes[1]))
 
 
-_solve_fast = PerDevice(_solve_and_count, COMPILER_OPTIONS)
-_solve_quickly = PerDevice(_solve_and_count, COMPILER_OPTIONS | QUICK_OPTIONS)
+_solve_fast = Stored(_solve_and_count, COMPILER_OPTIONS)
+_solve_quickly = Stored(_solve_and_count, COMPILER_OPTIONS | QUICK_OPTIONS)
 
 
 def with_unsolved(plans: PyTree) -> tuple[PyTree, Array]:
-    """Return the plans, and the number of unsolved plans among them as an array (1,)."""
-    return plans, jnp.sum(is_unsolved(plans.status), keepdims=True)
+    """Return the plans, and the number () of unsolved plans among them."""
+    return plans, jnp.sum(is_unsolved(plans.status))
 
 
-# Keys of the programs of `solve_on_devices` that have been compiled.
+# Keys of the programs of `solve_on_device` that have been compiled.
 compiled: set[Hashable] = set()
 
 
 def program_key(
-    planner: Planner, attempt: BaseAttempt, num: int, cases: PyTree, compiles_quickly: bool
+    planner: Planner,
+    attempt: BaseAttempt,
+    num: int,
+    cases: PyTree,
+    device: Device,
+    compiles_quickly: bool,
 ) -> Hashable:
-    """Return the key of the program that solves `num` cases per device, for the set `compiled`."""
+    """Return the key of the program that solves `num` cases on a device, for `compiled`."""
     own = tuple((leaf.shape, leaf.dtype) for leaf in jax.tree.leaves(planner))
     lanes = tuple((leaf.shape[1:], leaf.dtype) for leaf in jax.tree.leaves(cases))
     tree = jax.tree.structure((*planner.load(attempt, cases), cases))
-    return tree, own, lanes, num, compiles_quickly, settings()
+    return tree, own, lanes, num, device, compiles_quickly, settings()
 
 
 def solve_one(

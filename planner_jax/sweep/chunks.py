@@ -16,7 +16,7 @@ from tqdm import tqdm
 from planner_jax.core.planner import Planner
 from planner_jax.host import signals as stopping
 from planner_jax.host.files import crc32_of, open_plain
-from planner_jax.host.machine import as_here
+from planner_jax.host.threads import as_here
 from planner_jax.runs.columns import RefereedBatch, rows_of
 from planner_jax.runs.dataset import Dataset, encode
 from planner_jax.runs.environment import environment, makers_of

@@ -16,7 +16,7 @@ from planner_jax.ball.target import BallPath
 from planner_jax.core.compiled import QUICK_OPTIONS
 from planner_jax.core.planner import Kind, Planner
 from planner_jax.core.protocol import BaseAttempt, is_solved
-from planner_jax.host.machine import as_here
+from planner_jax.host.threads import as_here
 from planner_jax.planning.plan import Driver, Watch
 from planner_jax.planning.plan import plan as plan_all
 from planner_jax.sims.loop import predict_balls
