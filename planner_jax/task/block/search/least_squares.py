@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
+from jaxtyping import PyTree
 
 from planner_jax.core.protocol import is_solved, select
 from planner_jax.optimise import levenberg
@@ -28,7 +29,9 @@ from planner_jax.task.block.search.straight import EVERY, order_straight
 if TYPE_CHECKING:
     from planner_jax.task.block.default_planner import OnlineBlock
 
-_TURN = 5  # steps of least squares on a GPU before searches that have ended make room for others
+# On a GPU, steps of least squares before searches that have ended make room for others, and the
+# least number of searches that take steps together; fewer would take as long.
+_TURN, _LANES = 5, 1024
 
 
 def refine_in_turn(
@@ -94,62 +97,64 @@ def refine_at_once(
 ) -> BlockPlan:
     """Return the plans of a batch by least squares.
 
-    Each case has one more search than the `attempt.kept` best ones. In each of the first turns
-    it starts at the next starting point, and takes trial steps. In a later turn, open searches
-    of all cases, one for each case on average, take a few steps.
+    Every unsolved case has a search from each starting point. The searches of all cases first take
+    their trial steps. Then the `attempt.kept` best ones of each case continue. In every turn as
+    many searches as there are lanes take a few steps together.
     """
     solver, kept = attempt.solver, max(search.kept for search in planner.searches)
+    num, dtype = orders.shape[0], cases.angles.dtype
+    starts = max(search.tries for search in planner.searches)
+    size = num * starts
+    lanes = min(size, max(num, _LANES))
     is_left = (~is_solved(best.status)) | bool(planner.settling)
-    slots, num, dtype = kept + 1, orders.shape[0], cases.angles.dtype
+    is_tried = is_left[:, None] & (jnp.arange(starts) < attempt.tries)
 
-    def advance(search: LevenbergState, most: Array, given: tuple) -> LevenbergState:
-        return continue_search(lambda x: planner.model(x, *given), search, solver, most)
+    def rank(searches: LevenbergState) -> tuple[Array, Array]:
+        """Return the order of each case's searches, and which of them are kept, (B, starts)."""
+        costs = _trial_cost(searches, solver).reshape(num, starts)
+        order = jnp.argsort(jnp.where(is_tried, costs, jnp.inf), axis=1)
+        place = jnp.argsort(order, axis=1)
+        return order, is_tried & (place < attempt.kept) & jnp.isfinite(costs)
 
-    def find_open(costs: Array, searches: LevenbergState) -> Array:
+    def find_open(searches: LevenbergState) -> tuple[Array, Array]:
+        """Return which searches take the next steps, (B * starts,), and whether it is a trial."""
         each = jax.vmap(lambda search: levenberg.is_open(search, solver, solver.max_steps))
-        chosen = (jnp.arange(slots) < attempt.kept) & jnp.isfinite(costs)
-        is_open = each(searches).reshape(num, slots) & chosen
-        return (is_open & is_left[:, None]).reshape(-1)
+        is_new = is_tried.reshape(-1) & (searches.steps < 0)
+        is_trial = jnp.any(is_new)
+        is_open = rank(searches)[1].reshape(-1) & each(searches)
+        return jnp.where(is_trial, is_new, is_open), is_trial
 
-    def take_turn(state: tuple[Array, Array, LevenbergState]) -> tuple:
-        turn, costs, searches = state
-        is_trial = turn < attempt.tries
-        start = functools.partial(_encode_start, planner, k=attempt.first + turn)
-        begin = lambda *given: levenberg.start_search(start(*given), solver)  # noqa: E731
-        begun = jax.vmap(begin)(cases, poses, orders)
-        every = jnp.nonzero(find_open(costs, searches), size=num, fill_value=num * slots)[0]
-        lanes = jnp.where(is_trial, slots * jnp.arange(num) + kept, every)
-        some = jax.tree.map(lambda leaf: leaf.at[lanes].get(mode="clip"), searches)
-        some = jax.tree.map(lambda a, b: jnp.where(is_trial, a, b), begun, some)
-        own = jnp.minimum(lanes // slots, num - 1)
-        given = jax.tree.map(lambda leaf: leaf[own], (cases, flights))
+    def take_turn(state: tuple[LevenbergState, Array, Array]) -> tuple:
+        searches, is_open, is_trial = state
+        at = jnp.nonzero(is_open, size=lanes, fill_value=size)[0]
+        own, k = jnp.minimum(at // starts, num - 1), at % starts
+        case, flight, goals, order = jax.tree.map(
+            lambda leaf: leaf[own], (cases, flights, poses, orders)
+        )
+        some = jax.tree.map(lambda leaf: leaf.at[at].get(mode="clip"), searches)
+        encode_start = functools.partial(_encode_start, planner)
+        begun = jax.vmap(encode_start)(case, goals, order, attempt.first + k)
+        some = dataclasses.replace(some, point=jnp.where(is_trial, begun, some.point))
         later = jnp.minimum(some.steps + _TURN, solver.max_steps)
-        some = jax.vmap(advance)(some, jnp.where(is_trial, solver.trial, later), given)
-        searches = jax.tree.map(lambda a, b: a.at[lanes].set(b, mode="drop"), searches, some)
+        most = jnp.where(at < size, jnp.where(is_trial, solver.trial, later), -1)
 
-        def rank() -> tuple[Array, LevenbergState]:
-            ranked = costs.at[:, kept].set(_trial_cost(some, solver))
-            order = jnp.argsort(ranked, axis=1)
-            flat = (slots * jnp.arange(num)[:, None] + order).reshape(-1)
-            sort = lambda leaf: leaf[flat]  # noqa: E731
-            return jnp.take_along_axis(ranked, order, 1), jax.tree.map(sort, searches)
+        def advance(search: LevenbergState, most: Array, *given: PyTree) -> LevenbergState:
+            return continue_search(lambda x: planner.model(x, *given), search, solver, most)
 
-        return turn + 1, *lax.cond(is_trial, rank, lambda: (costs, searches))
-
-    def goes_on(state: tuple[Array, Array, LevenbergState]) -> Array:
-        turn, costs, searches = state
-        return (turn < attempt.tries) | jnp.any(find_open(costs, searches))
+        some = jax.vmap(advance)(some, most, case, flight)
+        searches = jax.tree.map(lambda a, b: a.at[at].set(b, mode="drop"), searches, some)
+        return searches, *find_open(searches)
 
     empty = levenberg.start_search(jnp.zeros(cases.arm.num * planner.pieces + 1, dtype), solver)
-    empty = jax.tree.map(lambda x: jnp.broadcast_to(x, (num * slots, *x.shape)), empty)
-    state = jnp.zeros((), jnp.int32), jnp.full((num, slots), jnp.inf, dtype), empty
-    _, costs, ends = lax.while_loop(goes_on, take_turn, state)
+    searches = jax.tree.map(lambda x: jnp.broadcast_to(x, (size, *x.shape)), empty)
+    state = searches, *find_open(searches)
+    ends, *_ = lax.while_loop(lambda state: jnp.any(state[1]), take_turn, state)
+    order, is_kept = rank(ends)
 
     def finish(k: Array, best: BlockPlan) -> BlockPlan:
-        lanes = slots * jnp.arange(num) + k
-        plans = jax.vmap(planner.finish)(cases, flights, ends.point[lanes], ends.steps[lanes])
-        is_left = bool(planner.settling) | ~is_solved(best.status)
-        return select(plans, best, jnp.isfinite(costs[:, k]) & is_left)
+        at = starts * jnp.arange(num) + order[:, k]
+        plans = jax.vmap(planner.finish)(cases, flights, ends.point[at], ends.steps[at])
+        return select(plans, best, is_kept.reshape(-1)[at] & is_left)
 
     return lax.fori_loop(0, jnp.minimum(attempt.kept, kept), finish, best)
 
