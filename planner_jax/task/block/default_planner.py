@@ -28,6 +28,7 @@ from planner_jax.optimise.levenberg import LevenbergConfig, Model
 from planner_jax.optimise.planner import SearchPlanner
 from planner_jax.robot import arm_motion
 from planner_jax.robot.arm_clearance import least_clearances
+from planner_jax.robot.scene_sizes import fit_scene
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.plan import BlockPlan, explain_status
 from planner_jax.task.block.problem.check import checked_shares, make_plan
@@ -121,6 +122,10 @@ class OnlineBlock(Planner):
     def attempts(self) -> tuple[Search, ...]:
         """The searches for a plan, in the order in which they are tried."""
         return self.searches
+
+    def fit_shapes(self, cases: BlockCase) -> BlockCase:
+        """Return cases with the same plans, whose scene is padded to one of few shapes."""
+        return dataclasses.replace(cases, scene=fit_scene(cases.scene, cases.batch_shape))
 
     def load_attempt(self, attempt: Search, cases: BlockCase) -> Search:
         """Return a search whose numbers are arrays, so that all searches use one compiled program.

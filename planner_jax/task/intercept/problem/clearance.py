@@ -1,14 +1,17 @@
 """Geometry of an interception: distances of the car from obstacles, map's edge and target."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
+from jax import Array, lax
 
-from planner_jax.plane.obstacles import distances, join_obstacles, place, separation
+from planner_jax.plane.obstacles import Obstacles, distances, join_obstacles, place, separation
 from planner_jax.plane.target import rotate
 from planner_jax.robot.car import CarBody
 from planner_jax.robot.car_motion import Motion
 from planner_jax.task.intercept.case import InterceptCase
+
+_CHUNK = 16  # number of walls whose distances from the body are computed together
 
 
 def wrap(angle: Array) -> Array:
@@ -66,12 +69,26 @@ def gaps(case: InterceptCase, pos: Array, heading: Array, times: Array) -> Array
         heading: (M,) [rad].
         times: (M,) [s].
     """
-    both = join_obstacles(case.walls, case.movers)
-    placed = place(both, times)
-    x, y = placed.enter(pos[None, :, 0], pos[None, :, 1])
-    angle = heading[None] - (0.0 if placed.turn is None else jnp.arctan2(*placed.turn[1::-1]))
-    apart = separation(both.corners, placed.present, x, y, angle, ends_of(case.body))
-    return apart - placed.radius
+
+    def measure(group: Obstacles) -> Array:
+        placed = place(group, times)
+        x, y = placed.enter(pos[None, :, 0], pos[None, :, 1])
+        angle = heading[None] - (0.0 if placed.turn is None else jnp.arctan2(*placed.turn[1::-1]))
+        apart = separation(group.corners, placed.present, x, y, angle, ends_of(case.body))
+        return apart - placed.radius
+
+    walls, num = case.walls, case.walls.present.shape[0]
+    if num <= _CHUNK or num % _CHUNK:
+        return jnp.concatenate([measure(walls), measure(case.movers)])
+
+    # On a CPU chunks of absent walls, which are padding, take no time.
+    def measure_present(chunk: Obstacles) -> Array:
+        absent = jnp.full((_CHUNK, times.size), 1e3, pos.dtype)
+        return lax.cond(jnp.any(chunk.present), measure, lambda _: absent, chunk)
+
+    chunks = jax.tree.map(lambda leaf: leaf.reshape(-1, _CHUNK, *leaf.shape[1:]), walls)
+    still = lax.map(measure_present, chunks).reshape(num, times.size)
+    return jnp.concatenate([still, measure(case.movers)])
 
 
 def inside_map(case: InterceptCase, points: Array) -> Array:
