@@ -1,9 +1,18 @@
 """Sizes to which arrays of cases are padded, so that many cases share a compiled program."""
 
+from collections.abc import Callable
+from typing import TypeVar
+
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 from planner_jax.core.arithmetic import Numbers
+from planner_jax.core.compiled import has_only_cpu
+from planner_jax.core.protocol import is_resident
+from planner_jax.core.rules import Case
+
+CaseT = TypeVar("CaseT", bound=Case)
 
 
 def next_size(num: int, sizes: tuple[int, ...]) -> int:
@@ -45,3 +54,18 @@ def resize(
 def on_host(leaf: Numbers, batch: tuple[int, ...]) -> Numbers:
     """Return an array of one case as a NumPy array, and an array of a batch as it is."""
     return leaf if batch else np.asarray(leaf)
+
+
+def fit_resident(fit: Callable[[CaseT], CaseT], cases: CaseT) -> CaseT:
+    """Return `fit(cases)`; NumPy pads a batch in jax arrays on CPUs, which compiles nothing.
+
+    The batch stays in jax arrays on its devices. A case alone may become NumPy arrays.
+    """
+    first = jax.tree.leaves(cases)[0]
+    is_kept = cases.batch_shape and has_only_cpu() and is_resident(cases)
+    if not is_kept or not first.is_fully_addressable:
+        return fit(cases)
+    found = fit(jax.tree.map(np.asarray, cases))
+    if len(first.sharding.device_set) == 1:
+        return jax.tree.map(jnp.asarray, found)
+    return jax.device_put(found, first.sharding)

@@ -23,6 +23,7 @@ from planner_jax.core.compiled import place_numbers
 from planner_jax.core.errors import NotOffered
 from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import require_settings
+from planner_jax.core.shapes import fit_resident
 from planner_jax.optimise import levenberg
 from planner_jax.optimise.levenberg import LevenbergConfig, Model
 from planner_jax.optimise.planner import SearchPlanner
@@ -125,8 +126,7 @@ class OnlineBlock(Planner):
 
     def fit_shapes(self, cases: BlockCase) -> BlockCase:
         """Return cases with the same plans, whose scene is padded to one of few shapes."""
-        scene = fit_scene(cases.scene, cases.batch_shape)
-        return cases if scene is cases.scene else dataclasses.replace(cases, scene=scene)
+        return fit_resident(_fit_case, cases)
 
     def load_attempt(self, attempt: Search, cases: BlockCase) -> Search:
         """Return a search whose numbers are arrays, so that all searches use one compiled program.
@@ -245,6 +245,11 @@ class OnlineBlock(Planner):
         from planner_jax.task.block.replan import ReplanBlock, WarmBlock
 
         return ReplanBlock(warm=WarmBlock(planner=self), planner=self)
+
+
+def _fit_case(case: BlockCase) -> BlockCase:
+    scene = fit_scene(case.scene, case.batch_shape)
+    return case if scene is case.scene else dataclasses.replace(case, scene=scene)
 
 
 def brisk(**fields: object) -> OnlineBlock:

@@ -27,6 +27,7 @@ from jax import Array, lax
 from planner_jax.core import protocol
 from planner_jax.core.choices import EFFORTS, require, require_one_of
 from planner_jax.core.planner import Planner
+from planner_jax.core.shapes import fit_resident
 from planner_jax.optimise.planner import SearchPlanner
 from planner_jax.task.intercept.case import InterceptCase
 from planner_jax.task.intercept.plan import InterceptPlan, explain, make_straight_plan
@@ -92,7 +93,7 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
 
     def fit_shapes(self, cases: InterceptCase) -> InterceptCase:
         """Return cases with the same plans, padded to one of few shapes; see `fit_case`."""
-        return fit_case(cases)
+        return fit_resident(fit_case, cases)
 
     @property
     def problem(self) -> MotionProblem:

@@ -27,7 +27,7 @@ from planner_jax.core.protocol import (
     select,
     status_of,
 )
-from planner_jax.core.shapes import next_size, on_host, resize
+from planner_jax.core.shapes import fit_resident, next_size, on_host, resize
 from planner_jax.optimise.planner import SearchPlanner
 from planner_jax.robot.arm import ArmLimits, ArmPlan
 from planner_jax.robot.arm_clearance import clearances
@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 # make faster. If the coarse distance misses a collision, the shortcuts are repeated with the other.
 _RESOLUTION, _COARSE = 0.02, 0.04
 _TORQUES = 256  # number of times, besides the ends of pieces, at which torques are computed
-_GOALS = (64,)  # numbers of goals; they hardly change the computing time
+_GOALS = (1, 8, 64)  # numbers of goals
 _CUTS = 30  # number of attempts to shorten a path
 
 
@@ -110,11 +110,7 @@ class ReachPlanner(Planner):
 
         Added goals are beyond the limits of the joints, so that no search tries them.
         """
-        batch = cases.batch_shape
-        upper, goals = (on_host(each, batch) for each in (cases.arm.upper, cases.goals))
-        beyond = (upper + np.maximum(abs(upper), 1.0))[..., None, :]
-        goals = resize(goals, -2, next_size(goals.shape[-2], _GOALS), beyond)
-        return dataclasses.replace(cases, goals=goals, scene=fit_scene(cases.scene, batch))
+        return fit_resident(_fit_case, cases)
 
     def load_attempt(self, attempt: Search, cases: ReachCase) -> Search:
         """Return a search whose numbers are arrays, so that searches of a class share a program."""
@@ -306,3 +302,14 @@ class ReachPlanner(Planner):
             iterations=jnp.zeros((), jnp.int32),
             status=jnp.full((), Status.INFEASIBLE, jnp.int32),
         )
+
+
+def _fit_case(case: ReachCase) -> ReachCase:
+    batch = case.batch_shape
+    scene, num = fit_scene(case.scene, batch), case.goals.shape[-2]
+    size = next_size(num, _GOALS)
+    if size == num:
+        return case if scene is case.scene else dataclasses.replace(case, scene=scene)
+    upper, goals = (on_host(each, batch) for each in (case.arm.upper, case.goals))
+    beyond = (upper + np.maximum(abs(upper), 1.0))[..., None, :]
+    return dataclasses.replace(case, goals=resize(goals, -2, size, beyond), scene=scene)
