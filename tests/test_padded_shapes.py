@@ -212,7 +212,7 @@ def test_a_session_of_1_to_64_walls_movers_and_nodes_compiles_three_programs(mon
     monkeypatch.setattr(type(INTERCEPT), "solve", counted)
     for walls, movers, nodes in ((1, 1, 5), (16, 4, 64), (17, 5, 9), (3, 12, 20), (64, 64, 30)):
         case = drive(walls, movers, target=table(nodes))
-        assert pj.plan(INTERCEPT, case).status in pj.Status
+        assert pj.plan(INTERCEPT, case).status != pj.Status.BAD_INPUT
     chex.clear_trace_counter()
 
 
