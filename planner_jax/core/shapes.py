@@ -41,7 +41,7 @@ def resize(
     shape, last = list(leaf.shape), (*before, slice(num - 1, num))
     shape[axis] = size
     fill = leaf[last] if fill is None else fill
-    if isinstance(leaf, np.ndarray):  # three times as fast as the functions of NumPy for padding
+    if isinstance(leaf, np.ndarray):  # assignments take less time than NumPy's concatenation
         found = np.empty(shape, leaf.dtype)
         found[(*before, slice(num))] = leaf
         found[(*before, slice(num, None))] = fill
