@@ -34,6 +34,7 @@ class PathTable:
     pos: Array  # (N, 3) [m], or (N, 2) in the plane
     vel: Array  # (N, 3) or (N, 2) [m/s]
     resolution: Array  # () [s], > 0
+    count: Array | None = None  # () number of nodes without padding, as a float; None: all nodes
 
     def at(self, time: Array) -> BallState:
         """Return position [m] and velocity [m/s] at one time () [s], by cubic convolution."""
@@ -80,7 +81,11 @@ def predict_path(
 
 def horizon_of(table: PathTable) -> Array:
     """Return the last time [s] at which a table of a path can be interpolated; the first is 0."""
-    return table.resolution * (table.pos.shape[0] - 3)
+    return table.resolution * (_count_nodes(table) - 3)
+
+
+def _count_nodes(table: PathTable) -> Array | int:
+    return table.pos.shape[0] if table.count is None else table.count
 
 
 def convolution_weights(u: Array) -> Array:
@@ -104,7 +109,7 @@ def target_at(table: PathTable, time: Array) -> BallState:
     time = jnp.asarray(require_scalar("time", time), jnp.result_type(table.resolution))
     inside = jax.lax.clamp(jnp.zeros_like(time), time, horizon_of(table))
     position = inside * reciprocal(table.resolution)
-    index = jnp.clip(jnp.floor(position), 0, table.pos.shape[0] - 4)
+    index = jnp.clip(jnp.floor(position), 0, _count_nodes(table) - 4)
     weights = convolution_weights(position - index)
     first = index.astype(jnp.int32)
 

@@ -97,11 +97,12 @@ class Planner(Generic[CaseT, PlanT]):
         return (BaseAttempt(),)
 
     def attempts_for(self, cases: CaseT) -> Sequence[BaseAttempt]:
-        """Return the attempts that are useful for these cases, by default all `attempts`.
-
-        The cases are in arrays, or traced inside compiled functions.
-        """
+        """Return the attempts useful for cases, which may be traced; by default all `attempts`."""
         return self.attempts
+
+    def fit_shapes(self, cases: CaseT, /) -> CaseT:
+        """Return cases with the same plans, in arrays of few shapes; by default the cases."""
+        return cases
 
     def load_attempt(self, attempt: PyTree, cases: CaseT, /) -> PyTree:
         """Convert an attempt (settings of a search) to the second argument of the compiled `solve`.

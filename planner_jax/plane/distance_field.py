@@ -7,8 +7,8 @@ from jax import Array, lax
 from planner_jax.plane.obstacles import Obstacles, distances
 
 # A wall's array of corners is padded by repeats of its last corner. To save time, distances are
-# computed from half the array, if the other half is only padding and has at least this length.
-_HALF = 4
+# computed from half the array, but at least so many corners, if the others are only padding.
+_FEWEST = 4
 
 
 @struct.dataclass
@@ -62,7 +62,8 @@ def distance_field(
     along = [corner[k] + spacing[k] * jnp.arange(size[k], dtype=corner.dtype) for k in range(2)]
     x, y = jnp.meshgrid(*along)
     vertices = walls.vertices(jnp.zeros_like(spacing[0]))
-    num, half = vertices.shape[0], vertices.shape[1] // 2
+    num, size = vertices.shape[:2]
+    half = max(_FEWEST, size // 2)
 
     def take_nearer(k: Array, nearest: Array) -> Array:
         corners, present, radius = (
@@ -73,7 +74,7 @@ def distance_field(
             far = distances(corners, present, x.reshape(1, -1), y.reshape(1, -1))[0]
             return far - radius[:, None]
 
-        if half < _HALF:
+        if half >= size:
             return jnp.minimum(nearest, measure(corners))
         few = corners[:, :half]
         is_padded = jnp.all(corners[:, half:] == few[:, -1:])

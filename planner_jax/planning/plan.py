@@ -149,9 +149,8 @@ def plan(
     kinds = {type(leaf) for leaf in (*leaves, *jax.tree.leaves(planner))}
     if any(issubclass(kind, Tracer) for kind in kinds):
         if watch.waits:
-            raise ArgumentTypeError(
-                "time_limit and progress", "left out inside compiled functions", shown=""
-            )
+            rule = "left out inside compiled functions"
+            raise ArgumentTypeError("time_limit and progress", rule, shown="")
         return solve(planner, cases)
     keep_compiled_programs()
     require_fit(planner, cases)
@@ -310,6 +309,7 @@ class Driver:
             require_pure(planner)
             plans = plan_purely(planner, attempts, cases)
             return plans, is_unsolved(plans.status)
+        cases = planner.fit_shapes(cases)
         if planner.kind is Kind.HOST:
             from planner_jax.planning.batch import plan_on_host  # compiled programs do not need it
 

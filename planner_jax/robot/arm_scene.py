@@ -165,7 +165,9 @@ def make_scene(
 ) -> Scene:
     """Return a scene of solid obstacles, without a rig, with NumPy float32 leaves.
 
-    A program is compiled for each combination of numbers of obstacles.
+    A program is compiled for each combination of numbers of obstacles, where capsules and spheres,
+    boxes, and cylinders are padded to 0, 1, 8 or 64 each. Meshes are planned as the enclosing
+    capsules and boxes.
 
     Args:
         boxes: for each box its middle (3,) [m], the lengths of its edges (3,) [m], and its rotation

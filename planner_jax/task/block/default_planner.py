@@ -23,11 +23,13 @@ from planner_jax.core.compiled import place_numbers
 from planner_jax.core.errors import NotOffered
 from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import require_settings
+from planner_jax.core.shapes import fit_resident
 from planner_jax.optimise import levenberg
 from planner_jax.optimise.levenberg import LevenbergConfig, Model
 from planner_jax.optimise.planner import SearchPlanner
 from planner_jax.robot import arm_motion
 from planner_jax.robot.arm_clearance import least_clearances
+from planner_jax.robot.scene_sizes import fit_scene
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.plan import BlockPlan, explain_status
 from planner_jax.task.block.problem.check import checked_shares, make_plan
@@ -121,6 +123,10 @@ class OnlineBlock(Planner):
     def attempts(self) -> tuple[Search, ...]:
         """The searches for a plan, in the order in which they are tried."""
         return self.searches
+
+    def fit_shapes(self, cases: BlockCase) -> BlockCase:
+        """Return cases with the same plans, whose scene is padded to one of few shapes."""
+        return fit_resident(_fit_case, cases)
 
     def load_attempt(self, attempt: Search, cases: BlockCase) -> Search:
         """Return a search whose numbers are arrays, so that all searches use one compiled program.
@@ -239,6 +245,11 @@ class OnlineBlock(Planner):
         from planner_jax.task.block.replan import ReplanBlock, WarmBlock
 
         return ReplanBlock(warm=WarmBlock(planner=self), planner=self)
+
+
+def _fit_case(case: BlockCase) -> BlockCase:
+    scene = fit_scene(case.scene, case.batch_shape)
+    return case if scene is case.scene else dataclasses.replace(case, scene=scene)
 
 
 def brisk(**fields: object) -> OnlineBlock:

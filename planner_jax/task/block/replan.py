@@ -49,6 +49,10 @@ class WarmBlock(Planner):
     planner: OnlineBlock = OnlineBlock()  # its unknowns, limits and weights are used
     attempts: tuple[Warm, ...] = (Warm(),)  # pyright: ignore[reportIncompatibleMethodOverride]
 
+    def fit_shapes(self, tasks: Replanning) -> Replanning:
+        """Return the tasks with cases that the planner has padded to one of few shapes."""
+        return dataclasses.replace(tasks, case=self.planner.fit_shapes(tasks.case))
+
     def solve(self, task: Replanning, attempt: Warm) -> BlockPlan:
         """Return the plan of one case, refined from the remainder of the previous motion."""
         case, planner = task.case, self.planner

@@ -27,10 +27,12 @@ from jax import Array, lax
 from planner_jax.core import protocol
 from planner_jax.core.choices import EFFORTS, require, require_one_of
 from planner_jax.core.planner import Planner
+from planner_jax.core.shapes import fit_resident
 from planner_jax.optimise.planner import SearchPlanner
 from planner_jax.task.intercept.case import InterceptCase
 from planner_jax.task.intercept.plan import InterceptPlan, explain, make_straight_plan
 from planner_jax.task.intercept.problem.motion_problem import Guess, MotionProblem
+from planner_jax.task.intercept.problem.shapes import fit_case
 from planner_jax.task.intercept.problem.smooth import SmoothIntercept, StartedCase, add_start
 from planner_jax.task.intercept.replan import ReplanIntercept
 from planner_jax.task.intercept.searches import (
@@ -88,6 +90,10 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
     def attempts_for(self, cases: InterceptCase) -> tuple[Search, ...]:
         """Return the searches of `attempts` that the cases need."""
         return choose_searches(self.attempts, cases)
+
+    def fit_shapes(self, cases: InterceptCase) -> InterceptCase:
+        """Return cases with the same plans, padded to one of few shapes; see `fit_case`."""
+        return fit_resident(fit_case, cases)
 
     @property
     def problem(self) -> MotionProblem:

@@ -123,6 +123,10 @@ class ReplanIntercept(Planner[Replanning, InterceptPlan]):
         )
         return Replanning(case=remainder, previous=previous, elapsed=elapsed)
 
+    def fit_shapes(self, tasks: Replanning) -> Replanning:
+        """Return the tasks with cases that the planner has padded to one of few shapes."""
+        return dataclasses.replace(tasks, case=self.planner.fit_shapes(tasks.case))
+
     def load_attempt(self, attempt: Search | Warm, tasks: Replanning) -> PyTree:
         """Return settings of an attempt in the form of an argument of the compiled `solve`.
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 from jax import Array, lax
 
@@ -26,10 +27,12 @@ from planner_jax.core.protocol import (
     select,
     status_of,
 )
+from planner_jax.core.shapes import fit_resident, next_size, on_host, resize
 from planner_jax.optimise.planner import SearchPlanner
 from planner_jax.robot.arm import ArmLimits, ArmPlan
 from planner_jax.robot.arm_clearance import clearances
 from planner_jax.robot.arm_dynamics import measure_torques, stretch
+from planner_jax.robot.scene_sizes import fit_scene
 from planner_jax.task.reach import motion, shortcut, tree
 from planner_jax.task.reach.case import ReachCase
 from planner_jax.task.reach.check import finite_bounds, floors_of, least_excess, levers
@@ -41,6 +44,7 @@ if TYPE_CHECKING:
 # make faster. If the coarse distance misses a collision, the shortcuts are repeated with the other.
 _RESOLUTION, _COARSE = 0.02, 0.04
 _TORQUES = 256  # number of times, besides the ends of pieces, at which torques are computed
+_GOALS = (1, 8, 64)  # numbers of goals
 _CUTS = 30  # number of attempts to shorten a path
 
 
@@ -100,6 +104,13 @@ class ReachPlanner(Planner):
     def attempts(self) -> tuple[Search, ...]:
         """The searches for a plan, in the order in which they are tried."""
         return self.searches
+
+    def fit_shapes(self, cases: ReachCase) -> ReachCase:
+        """Return cases with the same plans, whose goals and scene are padded to few shapes.
+
+        Added goals are beyond the limits of the joints, so that no search tries them.
+        """
+        return fit_resident(_fit_case, cases)
 
     def load_attempt(self, attempt: Search, cases: ReachCase) -> Search:
         """Return a search whose numbers are arrays, so that searches of a class share a program."""
@@ -291,3 +302,14 @@ class ReachPlanner(Planner):
             iterations=jnp.zeros((), jnp.int32),
             status=jnp.full((), Status.INFEASIBLE, jnp.int32),
         )
+
+
+def _fit_case(case: ReachCase) -> ReachCase:
+    batch = case.batch_shape
+    scene, num = fit_scene(case.scene, batch), case.goals.shape[-2]
+    size = next_size(num, _GOALS)
+    if size == num:
+        return case if scene is case.scene else dataclasses.replace(case, scene=scene)
+    upper, goals = (on_host(each, batch) for each in (case.arm.upper, case.goals))
+    beyond = (upper + np.maximum(abs(upper), 1.0))[..., None, :]
+    return dataclasses.replace(case, goals=resize(goals, -2, size, beyond), scene=scene)

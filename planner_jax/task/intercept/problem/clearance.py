@@ -1,14 +1,19 @@
 """Geometry of an interception: distances of the car from obstacles, map's edge and target."""
 
+from collections.abc import Callable
+
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
+from jax import Array, lax
 
-from planner_jax.plane.obstacles import distances, join_obstacles, place, separation
+from planner_jax.plane.obstacles import Obstacles, distances, join_obstacles, place, separation
 from planner_jax.plane.target import rotate
 from planner_jax.robot.car import CarBody
 from planner_jax.robot.car_motion import Motion
 from planner_jax.task.intercept.case import InterceptCase
+
+_CHUNK = 16  # number of walls whose distances from the body are computed together
 
 
 def wrap(angle: Array) -> Array:
@@ -37,8 +42,9 @@ def clearance(case: InterceptCase, drive: Motion) -> Array:
     """
     pos, heading = drive.pos.reshape(-1, 2), drive.heading.reshape(-1)
     middle = pos + case.body.middle * drive.direction.reshape(-1, 2)
-    apart = least_between(gaps(case, pos, heading, drive.time.reshape(-1))) - case.margin
-    return jnp.minimum(jnp.min(inside_map(case, middle)), jnp.min(apart))
+    least_of = lambda gaps: jnp.min(least_between(gaps))  # noqa: E731
+    apart = least_gap(case, pos, heading, drive.time.reshape(-1), least_of) - case.margin
+    return jnp.minimum(jnp.min(inside_map(case, middle)), apart)
 
 
 def least_between(gaps: Array) -> Array:
@@ -57,21 +63,42 @@ def least_between(gaps: Array) -> Array:
     return jnp.minimum(jnp.min(gaps, axis=1), jnp.min(dip, axis=1))
 
 
-def gaps(case: InterceptCase, pos: Array, heading: Array, times: Array) -> Array:
-    """Return the gaps (N, M) [m] between N obstacles and the body at M poses.
+def least_gap(
+    case: InterceptCase,
+    pos: Array,
+    heading: Array,
+    times: Array,
+    least_of: Callable[[Array], Array] = jnp.min,
+) -> Array:
+    """Return the least gap () [m] between the obstacles and the body at M poses.
 
     Args:
         case: the case, with its walls and moving obstacles.
         pos: (M, 2) [m], positions of the rear axle.
         heading: (M,) [rad].
         times: (M,) [s].
+        least_of: function that returns the least gap () of N obstacles from their gaps (N, M).
     """
-    both = join_obstacles(case.walls, case.movers)
-    placed = place(both, times)
-    x, y = placed.enter(pos[None, :, 0], pos[None, :, 1])
-    angle = heading[None] - (0.0 if placed.turn is None else jnp.arctan2(*placed.turn[1::-1]))
-    apart = separation(both.corners, placed.present, x, y, angle, ends_of(case.body))
-    return apart - placed.radius
+
+    def measure(group: Obstacles) -> Array:
+        placed = place(group, times)
+        x, y = placed.enter(pos[None, :, 0], pos[None, :, 1])
+        angle = heading[None] - (0.0 if placed.turn is None else jnp.arctan2(*placed.turn[1::-1]))
+        apart = separation(group.corners, placed.present, x, y, angle, ends_of(case.body))
+        return least_of(apart - placed.radius)
+
+    walls, movers = case.walls, case.movers
+    num = walls.present.shape[0]
+    if num <= _CHUNK or num % _CHUNK or not movers.present.shape[0]:
+        return measure(join_obstacles(walls, movers))
+
+    # On a CPU chunks of absent walls, which are padding, take no time.
+    def measure_present(chunk: Obstacles) -> Array:
+        absent = jnp.full((), 1e3, pos.dtype)
+        return lax.cond(jnp.any(chunk.present), measure, lambda _: absent, chunk)
+
+    chunks = jax.tree.map(lambda leaf: leaf.reshape(-1, _CHUNK, *leaf.shape[1:]), walls)
+    return jnp.minimum(jnp.min(lax.map(measure_present, chunks)), measure(movers))
 
 
 def inside_map(case: InterceptCase, points: Array) -> Array:
@@ -92,7 +119,7 @@ def is_blocked(case: InterceptCase) -> tuple[Array, Array]:
     """
     goal = case.target.at(case.time).pos
     first = jnp.zeros_like(case.time)[None]
-    at_start = gaps(case, case.start[None, :2], case.start[2:], first)
+    at_start = least_gap(case, case.start[None, :2], case.start[2:], first)
     is_off = inside_map(case, case.body.middle_at(case.start)) < 0.0
     both = join_obstacles(case.walls, case.movers)
     placed = place(both, case.time[None])
@@ -102,7 +129,7 @@ def is_blocked(case: InterceptCase) -> tuple[Array, Array]:
     is_point = jnp.all(case.region == 0.0)
     is_near = jnp.min(at_goal) < 0.5 * case.body.width
     is_goal_blocked = is_point & (is_near | (inside_map(case, goal) <= 0.0))
-    return (jnp.min(at_start) < 0.0) | is_off, is_goal_blocked
+    return (at_start < 0.0) | is_off, is_goal_blocked
 
 
 def nearest_in_region(region: Array, point: Array) -> tuple[Array, Array]:

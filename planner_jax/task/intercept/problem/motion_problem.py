@@ -175,10 +175,18 @@ class MotionProblem:
                 speed, _, time = self.unpack(case, point)
                 return jnp.maximum(terms.jerk_excess(most, time, speed) + weights.slack, 0.0)
 
-            over, slope = exceed(point), jax.jacfwd(exceed)(point)
-            gradient += weights.limit * jnp.matmul(over, slope, precision=_HIGHEST)
-            curvature += weights.limit * jnp.matmul(slope.T, slope, precision=_HIGHEST)
-            total += weights.limit * jnp.sum(over**2)
+            def penalise() -> tuple[Array, Array, Array]:
+                over, slope = exceed(point), jax.jacfwd(exceed)(point)
+                push = jnp.matmul(over, slope, precision=_HIGHEST)
+                square = jnp.matmul(slope.T, slope, precision=_HIGHEST)
+                own = jnp.sum(over**2), push, square
+                return jax.tree.map(lambda term: weights.limit * term, own)
+
+            # On a CPU a car without a limit of jerk skips the penalty.
+            before = total, gradient, curvature
+            nothing = lambda: jax.tree.map(jnp.zeros_like, before)  # noqa: E731
+            added = lax.cond(jnp.isfinite(most), penalise, nothing)
+            total, gradient, curvature = jax.tree.map(jnp.add, before, added)
         if self.is_time_free:
             # Add two costs of the meeting time: a penalty if it exceeds the case's time, and, if
             # the meeting shall be early, the square of the time.
