@@ -62,8 +62,8 @@ def distance_field(
     along = [corner[k] + spacing[k] * jnp.arange(size[k], dtype=corner.dtype) for k in range(2)]
     x, y = jnp.meshgrid(*along)
     vertices = walls.vertices(jnp.zeros_like(spacing[0]))
-    num, size = vertices.shape[:2]
-    half = max(_FEWEST, size // 2)
+    num, most = vertices.shape[:2]
+    half = max(_FEWEST, most // 2)
 
     def take_nearer(k: Array, nearest: Array) -> Array:
         corners, present, radius = (
@@ -74,7 +74,7 @@ def distance_field(
             far = distances(corners, present, x.reshape(1, -1), y.reshape(1, -1))[0]
             return far - radius[:, None]
 
-        if half >= size:
+        if half >= most:
             return jnp.minimum(nearest, measure(corners))
         few = corners[:, :half]
         is_padded = jnp.all(corners[:, half:] == few[:, -1:])
