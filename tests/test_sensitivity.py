@@ -10,7 +10,7 @@ import pytest
 from flax import struct
 
 import planner_jax as pj
-from planner_jax.optimise.implicit import newton_refine, optimal_plan
+from planner_jax.optimise.implicit import implicit_point, newton_refine, optimal_plan
 from planner_jax.optimise.inverse_kernel import inverse_kernel
 from planner_jax.optimise.multistart import minimise
 from planner_jax.optimise.preconditioner import positive_inverse
@@ -116,6 +116,59 @@ def test_an_optimal_plan_has_the_same_gradient_forward_and_backward(bowls):
         by_b, by_k = slopes(bowl.b, bowl.k)
         np.testing.assert_allclose(by_b, inverse, atol=1e-9)
         np.testing.assert_allclose(by_k, inverse[:, 0], atol=1e-9)
+
+
+def minimum(bowl):
+    return jnp.linalg.solve(CURVED, bowl.b + bowl.k * jnp.eye(3)[0])
+
+
+def test_an_implicit_point_has_the_derivative_of_the_optimum(bowls):
+    problem = BowlProblem()
+
+    @jax.jit
+    @jax.vmap
+    def compare(b, k):
+        def of_known_point(b, k):
+            bowl = Bowl(b, k, jnp.zeros((), jnp.int32))
+            point = jax.lax.stop_gradient(minimum(bowl))
+            return jnp.sum(implicit_point(problem, bowl, point) ** 2)
+
+        closed = lambda b, k: jnp.sum(minimum(Bowl(b, k, None)) ** 2)  # noqa: E731
+        return [jax.value_and_grad(each, argnums=(0, 1))(b, k) for each in (of_known_point, closed)]
+
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-9), *compare(bowls.b, bowls.k))
+
+
+def test_the_optimum_of_one_problem_may_enter_the_case_of_another(bowls):
+    bowl = jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), bowls)
+    inverse = np.linalg.inv(CURVED)
+
+    def second(b, settle):
+        first = settle(bowl.replace(b=b))
+        return settle(bowl.replace(b=first))[1]
+
+    def known(case):
+        return implicit_point(BowlProblem(), case, jax.lax.stop_gradient(minimum(case)))
+
+    slope = jax.grad(second)(bowl.b, known)
+    np.testing.assert_allclose(slope, (inverse @ inverse)[1], rtol=1e-9)
+
+
+def test_an_implicit_point_that_is_not_stationary_has_no_derivative_unless_it_is_unused(bowls):
+    bowl = jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), bowls)
+
+    def value(b, meter, away, weight):
+        case = bowl.replace(b=b)
+        point = jax.lax.stop_gradient(minimum(case)) + away
+        return weight * jnp.sum(implicit_point(BowlProblem(), case, point, meter, 3))
+
+    differentiate = jax.jit(jax.grad(value, argnums=(0, 1)))
+    by_b, meter = differentiate(bowl.b, jnp.zeros(2), 0.0, 1.0)
+    np.testing.assert_allclose(by_b, np.linalg.inv(CURVED).sum(axis=0), rtol=1e-9)
+    assert (meter < 1e-6).all()
+    by_b, meter = differentiate(bowl.b, jnp.zeros(2), 0.3, 1.0)
+    assert np.isnan(by_b).all() and meter[0] > 1e-6
+    assert (differentiate(bowl.b, jnp.zeros(2), 0.3, 0.0)[0] == 0.0).all()
 
 
 def test_a_batch_equals_its_lanes_and_a_broken_lane_affects_no_other(bowls):

@@ -186,14 +186,7 @@ def gradient_at(
         return functools.reduce(lambda s, name: _with_part(s, name, parts[name]), parts, case)
 
     context, pull = jax.vjp(lambda parts: problem.prepare(change_case(parts)), parts)
-    leaves, treedef = jax.tree.flatten(context)
-    is_smooth = [jnp.issubdtype(leaf.dtype, jnp.floating) for leaf in leaves]
-    smooth = [leaf for leaf, flag in zip(leaves, is_smooth, strict=True) if flag]
-
-    def context_of(smooth: list) -> PyTree:
-        taken = iter(smooth)
-        both = zip(leaves, is_smooth, strict=True)
-        return jax.tree.unflatten(treedef, [next(taken) if flag else leaf for leaf, flag in both])
+    smooth, context_of, cotangent_of = split_smooth(context)
 
     def cost(x: Array, smooth: list) -> Array:
         return problem.objective(x, context_of(smooth))[0]
@@ -208,6 +201,47 @@ def gradient_at(
 
     value, (along_point, by_context) = jax.value_and_grad(value_of, argnums=(0, 1))(point, smooth)
 
+    adjoint, stationarity, residual = solve_adjoint(
+        problem, context, point, along_point, steps, curvature
+    )
+    if steps != 0:
+        mixed = problem.slopes_along(point, context_of, smooth, adjoint)
+        by_context = [b - m for b, m in zip(by_context, mixed, strict=True)]
+    (by_parts,) = pull(cotangent_of(by_context))
+    holds = jnp.isfinite(value) & is_optimum(stationarity, residual)
+    by_parts = jax.tree.map(lambda leaf: jnp.where(holds, leaf, jnp.nan), by_parts)
+    return Gradient(value=value, by=by_parts, stationarity=stationarity, residual=residual)
+
+
+def split_smooth(context: PyTree) -> tuple[list[Array], Callable, Callable]:
+    """Return the floating leaves of a problem's data, and two functions of a list of such leaves.
+
+    The first function returns the data with these leaves; the second one returns the data's
+    cotangent, which has no derivative by the other leaves.
+    """
+    leaves, treedef = jax.tree.flatten(context)
+    is_smooth = [jnp.issubdtype(leaf.dtype, jnp.floating) for leaf in leaves]
+
+    def merge(smooth: list, others: list) -> PyTree:
+        taken = iter(smooth)
+        both = zip(others, is_smooth, strict=True)
+        return jax.tree.unflatten(treedef, [next(taken) if flag else leaf for leaf, flag in both])
+
+    def cotangent_of(smooth: list) -> PyTree:
+        return merge(smooth, [np.zeros(leaf.shape, jax.dtypes.float0) for leaf in leaves])
+
+    smooth = [leaf for leaf, flag in zip(leaves, is_smooth, strict=True) if flag]
+    return smooth, lambda smooth: merge(smooth, leaves), cotangent_of
+
+
+def solve_adjoint(
+    problem: Problem, context: PyTree, point: Array, rhs: Array, steps: int | None, curvature: str
+) -> tuple[Array, Array, Array]:
+    """Solve cost_uu lambda = rhs at a point (n,), as `gradient_at` explains.
+
+    Returns:
+        The adjoint vector lambda (n,), and the fields `stationarity` and `residual` of `Gradient`.
+    """
     steps = _STEPS[curvature] if steps is None else steps
     here = problem.curvature_at(point, context)
     if curvature == "products":
@@ -218,22 +252,15 @@ def gradient_at(
     decrease = 0.5 * jnp.sum(here.gradient * solve(here.gradient))
     stationarity = decrease / jnp.maximum(jnp.abs(here.evaluation.cost), 1e-30)
     if steps == 0:
-        residual = jnp.where(jnp.any(along_point != 0.0), jnp.ones_like(value), 0.0)
-    else:
-        adjoint, residual = _adjoint(solve, product, along_point, steps)
-        mixed = problem.slopes_along(point, context_of, smooth, adjoint)
-        by_context = [b - m for b, m in zip(by_context, mixed, strict=True)]
-    taken = iter(by_context)
-    both = zip(leaves, is_smooth, strict=True)
-    cotangent = [
-        next(taken) if flag else np.zeros(leaf.shape, jax.dtypes.float0) for leaf, flag in both
-    ]
-    (by_parts,) = pull(jax.tree.unflatten(treedef, cotangent))
-    holds = (
-        jnp.isfinite(value) & jnp.isfinite(residual) & (stationarity <= _STATIONARY[point.dtype])
-    )
-    by_parts = jax.tree.map(lambda leaf: jnp.where(holds, leaf, jnp.nan), by_parts)
-    return Gradient(value=value, by=by_parts, stationarity=stationarity, residual=residual)
+        residual = jnp.where(jnp.any(rhs != 0.0), jnp.ones_like(stationarity), 0.0)
+        return jnp.zeros_like(rhs), stationarity, residual
+    adjoint, residual = _adjoint(solve, product, rhs, steps)
+    return adjoint, stationarity, residual
+
+
+def is_optimum(stationarity: Array, residual: Array) -> Array:
+    """Return whether the implicit function theorem holds, () bool, by two fields of `Gradient`."""
+    return jnp.isfinite(residual) & (stationarity <= _STATIONARY[stationarity.dtype])
 
 
 def _by_whole_hessian(product: Product, point: Array) -> tuple[Product, Product]:
