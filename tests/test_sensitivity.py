@@ -14,7 +14,7 @@ from planner_jax.optimise.implicit import implicit_point, newton_refine, optimal
 from planner_jax.optimise.inverse_kernel import inverse_kernel
 from planner_jax.optimise.multistart import minimise
 from planner_jax.optimise.preconditioner import positive_inverse
-from planner_jax.optimise.sensitivity import _with_part, gradient_at, part_of
+from planner_jax.optimise.sensitivity import gradient_at, part_of, replace_part
 from planner_jax.planning.decided import first_choice
 from planner_jax.task.hit.suites import generate_serves, to_cases
 from tests.derivatives import double
@@ -136,7 +136,8 @@ def test_an_implicit_point_has_the_derivative_of_the_optimum(bowls):
         closed = lambda b, k: jnp.sum(minimum(Bowl(b, k, None)) ** 2)  # noqa: E731
         return [jax.value_and_grad(each, argnums=(0, 1))(b, k) for each in (of_known_point, closed)]
 
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-9), *compare(bowls.b, bowls.k))
+    found, expected = compare(bowls.b, bowls.k)
+    jax.tree.map(functools.partial(np.testing.assert_allclose, rtol=1e-9), found, expected)
 
 
 def test_the_optimum_of_one_problem_may_enter_the_case_of_another(bowls):
@@ -272,7 +273,7 @@ def test_the_gradient_at_an_optimum_matches_differences_of_optima(name, float64)
     for place, step in steps.items():
         here = part_of(case, place)
         ahead, behind = (
-            refine(_with_part(case, place, here + sign * step), point)[1] for sign in (1.0, -1.0)
+            refine(replace_part(case, place, here + sign * step), point)[1] for sign in (1.0, -1.0)
         )
         numeric = (ahead - behind) / (2.0 * step)
         np.testing.assert_allclose(found.by[place], numeric, rtol=5e-3, atol=2e-4, err_msg=place)

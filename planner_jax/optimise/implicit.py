@@ -173,7 +173,7 @@ def implicit_point(
         point: (n,) minimiser of the objective, such as an entry of `problem.guesses` if the guesses
             are minima. It is a constant.
         meter: (2,) zeros. The gradient by `meter` is no derivative: its entries are `stationarity`
-            and `residual` of the reverse pass, as in `sensitivity.Gradient`.
+            and `residual` of the reverse pass, as in `sensitivity.Gradient`, or 0 if unused.
         steps: as in `sensitivity.gradient_at`.
         curvature: as in `sensitivity.gradient_at`; None: the problem's own setting `adjoint`.
     """
@@ -210,7 +210,8 @@ def _differentiate(
         return jnp.where(is_used, jnp.where(holds, leaf, jnp.nan), 0.0)
 
     by_problem = jax.tree.map(_no_derivative, problem)
-    by_meter = None if meter is None else jnp.stack([stationarity, residual])
+    measured = jnp.where(is_used, jnp.stack([stationarity, residual]), 0.0)
+    by_meter = None if meter is None else measured
     return by_problem, jax.tree.map(mask, by_case), jnp.zeros_like(point), by_meter
 
 
