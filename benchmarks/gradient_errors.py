@@ -1,8 +1,8 @@
-"""Compare gradients of plans of groups with differences of plans that are made anew.
+"""Compare gradients of plans of groups and teams with differences of plans that are made anew.
 
     python -m benchmarks.gradient_errors [--task group] [--num 100] [--chunk 10] [--out DIR]
 
-`pj.gradient` differentiates the time of the last meeting by several parts of
+`pj.gradient` differentiates the time of the last meeting, or of the last catch, by several parts of
 the case. The reference moves all these parts along one random direction, forwards and backwards, by
 two step lengths, and minimises again in float64, from the same plan and with the same decisions.
 The error is relative, by the nearer of the two differences. The table has the number of solved
@@ -14,6 +14,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 import planner_jax as pj
@@ -23,11 +24,17 @@ from planner_jax.planning.gradient import with_type
 
 _STEPS = (1e-4, 1e-5)  # in the units of the parts
 
+
+def _last_catch(plan: Any) -> jax.Array:
+    return jnp.max(plan.robots.times)
+
+
 _TASKS = {  # the number of a plan, and the parts of a case
     "group": (
         "cost",
         ("shared.limits.acceleration", "shared.target.vel", "shared.movers.centre", "shared.speed"),
     ),
+    "team": (_last_catch, ("shared.limits.body_rate", "shared.net.height", "head_states")),
 }
 
 

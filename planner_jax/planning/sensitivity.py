@@ -36,7 +36,7 @@ class Sensitivity(Generic[PlanT]):
     plans: PlanT
     # Numbers () by name: times of contact [s], "cost", "violation", and "margin.LIMIT".
     values: dict[str, Array]
-    case: dict[str, Array]  # floating numbers of the case by dotted name
+    case: dict[str, PyTree]  # floating numbers of the case by dotted name
     # For a name of `values` and a name of `case`: d value / d leaf, with the shape of the leaf. NaN
     # where the plan is no optimum.
     by: dict[str, dict[str, Array]]
@@ -55,10 +55,10 @@ class Sensitivity(Generic[PlanT]):
 
         def scale(theta: Array, slope: Array) -> np.ndarray:
             unit = value.reshape(value.shape + (1,) * (np.ndim(theta) - batch))
-            theta = np.asarray(theta, float)
+            size = np.asarray(theta, float)
             with np.errstate(all="ignore"):  # numbers without a limit are infinite
-                found = np.where(theta == 0.0, 0.0, theta * np.asarray(slope, float) / unit)
-            return np.where(np.isinf(theta), 0.0, found)
+                found = np.where(size == 0.0, 0.0, size * np.asarray(slope, float) / unit)
+            return np.where(np.isinf(size), 0.0, found)
 
         return {name: scale(self.case[name], slope) for name, slope in self.by[number].items()}
 
@@ -141,7 +141,8 @@ def _floating_names(tree: PyTree, before: str = "") -> list[str]:
     if members:
         parts = [_floating_names(each, f"{before}{name}.") for name, each in members.items()]
         return [name for part in parts for name in part]
-    is_number = hasattr(tree, "dtype") and jnp.issubdtype(tree.dtype, jnp.floating)
+    is_number = isinstance(tree, Array | np.ndarray | np.floating)
+    is_number = is_number and jnp.issubdtype(tree.dtype, jnp.floating)
     name = before.removesuffix(".")
     return [name] if is_number and not name.endswith("origin") else []
 

@@ -56,7 +56,7 @@ class SmoothGroup(Composed):
         """
         fixed = lax.stop_gradient(context)
 
-        def minimise(leg: StartedCase, needed: Array, k: Array) -> Array:
+        def minimise(leg: StartedCase, needed: Array, k: Array | int) -> Array:
             steps = jnp.where(needed, self.leg.solver.max_steps, 0)
             solver = dataclasses.replace(self.leg.solver, max_steps=steps)
             problem = dataclasses.replace(self.leg, solver=solver)
@@ -69,17 +69,19 @@ class SmoothGroup(Composed):
         """Return the plan of the legs' minima `point` (N n,), with derivatives by the case."""
         points = point.reshape(case.num_targets, -1)
 
-        def known(leg: StartedCase, needed: Array, k: Array) -> Array:
+        def point_of(leg: StartedCase, needed: Array, k: Array | int) -> Array:
             return implicit_point(self.leg, leg, points[k], meters[k])
 
-        return self._drive(case, known)[1]
+        return self._drive(case, point_of)[1]
 
     def _drive(
-        self, case: StartedGroup, point_of: Callable[[StartedCase, Array, Array], Array]
+        self, case: StartedGroup, point_of: Callable[[StartedCase, Array, Array | int], Array]
     ) -> tuple[Array, GroupPlan]:
         """Return the points (N, n) of the legs, which `point_of` finds, and the plan."""
 
-        def plan_legs(legs: InterceptCase, needed: Array, k: Array) -> tuple[InterceptPlan, Array]:
+        def plan_legs(
+            legs: InterceptCase, needed: Array, k: Array | int
+        ) -> tuple[InterceptPlan, Array]:
             def plan(leg: InterceptCase, needed: Array) -> tuple[InterceptPlan, Array]:
                 started = add_start(leg, case.start_points[k])
                 point = point_of(started, needed, k)
