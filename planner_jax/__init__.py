@@ -16,6 +16,7 @@ The tasks are `hit`, `rally`, `catch`, `team`, `intercept`, `group`, `block` and
 * `replan`: updates a plan while a robot executes it
 * `gradient`: differentiates one number of every plan by parts of its case; `optimal_plan`: a plan
   that `jax.grad` can differentiate, for use inside a loss function
+* `sensitivity`: differentiates contact time, cost and margins of plans by all numbers of a case
 * `take`, `are_solved`, `Status`: read plans; a plan has `sample`, `save` and `load`
 * `export`: writes one plan to a file for a controller; `show`: draws one plan
 

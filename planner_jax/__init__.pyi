@@ -44,6 +44,7 @@ from .planning.plan import Progress as Progress
 from .planning.plan import plan as plan
 from .planning.plan import solve as solve
 from .planning.replan import replan as replan
+from .planning.sensitivity import sensitivity as sensitivity
 from .planning.warm_up import warm_up as warm_up
 from .recovery.planner import RecoveryProblem as RecoveryProblem
 from .recovery.with_recovery import RecoveringPlanner as RecoveringPlanner

@@ -10,11 +10,11 @@ import pytest
 from flax import struct
 
 import planner_jax as pj
-from planner_jax.optimise.implicit import newton_refine, optimal_plan
+from planner_jax.optimise.implicit import implicit_point, newton_refine, optimal_plan
 from planner_jax.optimise.inverse_kernel import inverse_kernel
 from planner_jax.optimise.multistart import minimise
 from planner_jax.optimise.preconditioner import positive_inverse
-from planner_jax.optimise.sensitivity import _with_part, gradient_at, part_of
+from planner_jax.optimise.sensitivity import gradient_at, part_of, replace_part
 from planner_jax.planning.decided import first_choice
 from planner_jax.task.hit.suites import generate_serves, to_cases
 from tests.derivatives import double
@@ -118,6 +118,60 @@ def test_an_optimal_plan_has_the_same_gradient_forward_and_backward(bowls):
         np.testing.assert_allclose(by_k, inverse[:, 0], atol=1e-9)
 
 
+def minimum(bowl):
+    return jnp.linalg.solve(CURVED, bowl.b + bowl.k * jnp.eye(3)[0])
+
+
+def test_an_implicit_point_has_the_derivative_of_the_optimum(bowls):
+    problem = BowlProblem()
+
+    @jax.jit
+    @jax.vmap
+    def compare(b, k):
+        def of_known_point(b, k):
+            bowl = Bowl(b, k, jnp.zeros((), jnp.int32))
+            point = jax.lax.stop_gradient(minimum(bowl))
+            return jnp.sum(implicit_point(problem, bowl, point) ** 2)
+
+        closed = lambda b, k: jnp.sum(minimum(Bowl(b, k, None)) ** 2)  # noqa: E731
+        return [jax.value_and_grad(each, argnums=(0, 1))(b, k) for each in (of_known_point, closed)]
+
+    found, expected = compare(bowls.b, bowls.k)
+    jax.tree.map(functools.partial(np.testing.assert_allclose, rtol=1e-9), found, expected)
+
+
+def test_the_optimum_of_one_problem_may_enter_the_case_of_another(bowls):
+    bowl = jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), bowls)
+    inverse = np.linalg.inv(CURVED)
+
+    def second(b, settle):
+        first = settle(bowl.replace(b=b))
+        return settle(bowl.replace(b=first))[1]
+
+    def known(case):
+        return implicit_point(BowlProblem(), case, jax.lax.stop_gradient(minimum(case)))
+
+    slope = jax.grad(second)(bowl.b, known)
+    np.testing.assert_allclose(slope, (inverse @ inverse)[1], rtol=1e-9)
+
+
+def test_an_implicit_point_that_is_not_stationary_has_no_derivative_unless_it_is_unused(bowls):
+    bowl = jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), bowls)
+
+    def value(b, meter, away, weight):
+        case = bowl.replace(b=b)
+        point = jax.lax.stop_gradient(minimum(case)) + away
+        return weight * jnp.sum(implicit_point(BowlProblem(), case, point, meter, 3))
+
+    differentiate = jax.jit(jax.grad(value, argnums=(0, 1)))
+    by_b, meter = differentiate(bowl.b, jnp.zeros(2), 0.0, 1.0)
+    np.testing.assert_allclose(by_b, np.linalg.inv(CURVED).sum(axis=0), rtol=1e-9)
+    assert (meter < 1e-6).all()
+    by_b, meter = differentiate(bowl.b, jnp.zeros(2), 0.3, 1.0)
+    assert np.isnan(by_b).all() and meter[0] > 1e-6
+    assert (differentiate(bowl.b, jnp.zeros(2), 0.3, 0.0)[0] == 0.0).all()
+
+
 def test_a_batch_equals_its_lanes_and_a_broken_lane_affects_no_other(bowls):
     b = bowls.b.copy()
     b[2] = np.nan
@@ -219,7 +273,7 @@ def test_the_gradient_at_an_optimum_matches_differences_of_optima(name, float64)
     for place, step in steps.items():
         here = part_of(case, place)
         ahead, behind = (
-            refine(_with_part(case, place, here + sign * step), point)[1] for sign in (1.0, -1.0)
+            refine(replace_part(case, place, here + sign * step), point)[1] for sign in (1.0, -1.0)
         )
         numeric = (ahead - behind) / (2.0 * step)
         np.testing.assert_allclose(found.by[place], numeric, rtol=5e-3, atol=2e-4, err_msg=place)

@@ -1,4 +1,4 @@
-"""Gradients of an optimal plan by the implicit function theorem, for `pj.optimal_plan`.
+"""Optima that are differentiable by the implicit function theorem, such as `pj.optimal_plan`.
 
 Let theta be the numbers of the case, and u* the variables that minimise the objective J(u, theta).
 There the gradient J_u vanishes, so du*/dtheta = -J_uu^-1 J_utheta. This takes one linear solve with
@@ -10,6 +10,7 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 from jax import Array, lax
 from jaxtyping import PyTree
@@ -21,6 +22,8 @@ from planner_jax.core.origin import with_origin
 from planner_jax.core.planner import Planner, require_fit
 from planner_jax.core.protocol import mark_bad_input, status_of
 from planner_jax.optimise.multistart import minimise
+from planner_jax.optimise.planner import Problem
+from planner_jax.optimise.sensitivity import is_optimum, solve_adjoint, split_smooth
 from planner_jax.optimise.settings import Evaluation, LbfgsConfig, Objective
 
 
@@ -145,3 +148,76 @@ def optimal_plan(planner: Planner, case: PyTree, *, solver: LbfgsConfig | None =
     plan = problem.decode(point, context).replace(cost=cost(point))
     plan = plan.replace(status=status_of(plan.cost, plan.violation, excess <= 1e3))
     return with_origin(mark_bad_input(plan, case), case)
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(4, 5))
+def implicit_point(
+    problem: Problem,
+    case: PyTree,
+    point: Array,
+    meter: Array | None = None,
+    steps: int | None = None,
+    curvature: str | None = None,
+) -> Array:
+    """Return a stationary point (n,) unchanged, with the derivative of the optimum by the case.
+
+    Reverse mode uses the implicit function theorem: the optimum of one problem may enter the case
+    of another one. The function is pure, for use under `jax.jit`, `jax.vmap` and `jax.grad`.
+
+    The derivative is NaN if the point is not stationary, or if the Hessian is not positive there,
+    unless nothing depends on the point. It is correct to first order only at a stationary point.
+
+    Args:
+        problem: the problem whose objective the point minimises; its numbers are constants.
+        case: one case.
+        point: (n,) minimiser of the objective, such as an entry of `problem.guesses` if the guesses
+            are minima. It is a constant.
+        meter: (2,) zeros. The gradient by `meter` is no derivative: its entries are `stationarity`
+            and `residual` of the reverse pass, as in `sensitivity.Gradient`, or 0 if unused.
+        steps: as in `sensitivity.gradient_at`.
+        curvature: as in `sensitivity.gradient_at`; None: the problem's own setting `adjoint`.
+    """
+    return point
+
+
+def _keep(
+    problem: Problem,
+    case: PyTree,
+    point: Array,
+    meter: Array | None,
+    steps: int | None,
+    curvature: str | None,
+) -> tuple[Array, tuple]:
+    return point, (problem, case, point, meter)
+
+
+def _differentiate(
+    steps: int | None, curvature: str | None, kept: tuple, along_point: Array
+) -> tuple[PyTree, PyTree, Array, Array | None]:
+    problem, case, point, meter = kept
+    context, pull = jax.vjp(problem.prepare, case)
+    smooth, context_of, cotangent_of = split_smooth(context)
+    adjoint, stationarity, residual = solve_adjoint(
+        problem, context, point, along_point, steps, curvature or problem.adjoint
+    )
+    mixed = problem.slopes_along(point, context_of, smooth, adjoint)
+    (by_case,) = pull(cotangent_of([-each for each in mixed]))
+    is_used, holds = jnp.any(along_point != 0.0), is_optimum(stationarity, residual)
+
+    def mask(leaf: Array) -> Array:
+        if leaf.dtype == jax.dtypes.float0:
+            return leaf
+        return jnp.where(is_used, jnp.where(holds, leaf, jnp.nan), 0.0)
+
+    by_problem = jax.tree.map(_no_derivative, problem)
+    measured = jnp.where(is_used, jnp.stack([stationarity, residual]), 0.0)
+    by_meter = None if meter is None else measured
+    return by_problem, jax.tree.map(mask, by_case), jnp.zeros_like(point), by_meter
+
+
+def _no_derivative(leaf: Array) -> np.ndarray:
+    is_smooth = jnp.issubdtype(jnp.result_type(leaf), jnp.floating)
+    return np.zeros(np.shape(leaf), jnp.result_type(leaf) if is_smooth else jax.dtypes.float0)
+
+
+implicit_point.defvjp(_keep, _differentiate)

@@ -26,11 +26,20 @@ from planner_jax.core.choices import require_size
 from planner_jax.core.errors import ArgumentError, ArgumentTypeError
 from planner_jax.core.protocol import Plan
 from planner_jax.optimise.around import ProblemAround
+from planner_jax.optimise.composed import Composed
 from planner_jax.optimise.planner import Problem, pending
 from planner_jax.optimise.preconditioner import positive_inverse
 from planner_jax.optimise.settings import Curvature
 
-Quantity = str | Callable[[PyTree], Array]
+
+@dataclasses.dataclass(frozen=True)
+class Numbers:
+    """K numbers of a plan, which depend on the plan and also directly on its case."""
+
+    function: Callable[[PyTree, PyTree], Array]  # takes plan and case; returns (K,)
+
+
+Quantity = str | Numbers | Callable[[PyTree], Array]
 Product = Callable[[Array], Array]  # product of a matrix with a vector (n,)
 _CURVATURES = ("products", "whole")
 # Number of iterations of conjugate gradients, by the setting `curvature`, for about 40 unknowns.
@@ -44,7 +53,10 @@ _SMALL = 1e-11  # squared relative residual at which conjugate gradients stop
 
 @struct.dataclass
 class Gradient:
-    """The value of one number of a plan, and its gradient by parts of the case."""
+    """The value of one number of a plan, and its gradient by parts of the case.
+
+    For K `Numbers`, the value and the leaves of `by` have a leading axis K.
+    """
 
     value: Array  # ()
     by: dict[str, PyTree]  # for each name a part of the case, whose leaves are d value / d leaf
@@ -94,7 +106,7 @@ class Differentiated(ProblemAround):
             raise ArgumentError("curvature", f"one of {known}", self.curvature)
         if self.steps is not None:
             require_size("steps", self.steps, 0)
-        if not callable(self.quantity) and not isinstance(self.quantity, str):
+        if not callable(self.quantity) and not isinstance(self.quantity, str | Numbers):
             raise ArgumentTypeError("of", "a name or a function of a plan", self.quantity)
         if not self.by:
             raise ArgumentError("by", "something in the case", verb="name", shown="nothing")
@@ -166,7 +178,7 @@ def gradient_at(
         case: one case.
         point: (n,) minimiser of the problem's objective. At another point the result
             is not the gradient at the optimum.
-        quantity: dotted name of a number in the plan, or a function of the plan.
+        quantity: dotted name of a number in the plan, a function of the plan, or `Numbers`.
         by: dotted names of parts of the case, such as "limits.speed".
         steps: iterations of conjugate gradients, each with one product with the Hessian. They stop
             early if the Hessian is not positive. 0 sets the adjoint vector to zero, which is
@@ -183,31 +195,112 @@ def gradient_at(
     parts = {name: part_of(case, name) for name in by}
 
     def change_case(parts: dict) -> PyTree:
-        return functools.reduce(lambda s, name: _with_part(s, name, parts[name]), parts, case)
+        return functools.reduce(lambda s, name: replace_part(s, name, parts[name]), parts, case)
 
+    if isinstance(problem, Composed):
+        return _of_composed(problem, point, number, change_case, parts)
     context, pull = jax.vjp(lambda parts: problem.prepare(change_case(parts)), parts)
-    leaves, treedef = jax.tree.flatten(context)
-    is_smooth = [jnp.issubdtype(leaf.dtype, jnp.floating) for leaf in leaves]
-    smooth = [leaf for leaf, flag in zip(leaves, is_smooth, strict=True) if flag]
-
-    def context_of(smooth: list) -> PyTree:
-        taken = iter(smooth)
-        both = zip(leaves, is_smooth, strict=True)
-        return jax.tree.unflatten(treedef, [next(taken) if flag else leaf for leaf, flag in both])
+    smooth, context_of, cotangent_of = split_smooth(context)
 
     def cost(x: Array, smooth: list) -> Array:
         return problem.objective(x, context_of(smooth))[0]
 
-    def value_of(x: Array, smooth: list) -> Array:
-        value = number(problem.decode(x, context_of(smooth)).replace(cost=cost(x, smooth)))
-        if numeric(value) is None:
-            raise ArgumentTypeError("of", "one number", value)
-        if value.shape:
-            raise ArgumentError("of", "one number", shown=f"shape {value.shape}")
-        return value
+    def value_of(x: Array, smooth: list, parts: dict) -> Array:
+        plan = problem.decode(x, context_of(smooth)).replace(cost=cost(x, smooth))
+        return number(plan, change_case(parts))
 
-    value, (along_point, by_context) = jax.value_and_grad(value_of, argnums=(0, 1))(point, smooth)
+    value, pull_value = jax.vjp(value_of, point, smooth, parts)
 
+    def differentiate(cotangent: Array) -> tuple[dict, Array, Array]:
+        along_point, by_context, direct = pull_value(cotangent)
+        adjoint, stationarity, residual = solve_adjoint(
+            problem, context, point, along_point, steps, curvature
+        )
+        if steps != 0:
+            mixed = problem.slopes_along(point, context_of, smooth, adjoint)
+            by_context = [b - m for b, m in zip(by_context, mixed, strict=True)]
+        (by_parts,) = pull(cotangent_of(by_context))
+        by_parts = jax.tree.map(jnp.add, by_parts, direct)
+        return by_parts, stationarity, residual
+
+    by_parts, stationarity, residual = _for_each(differentiate, value)
+    holds = jnp.isfinite(value) & is_optimum(stationarity, residual)
+    return Gradient(value, _where(holds, by_parts), stationarity, residual)
+
+
+def _for_each(differentiate: Callable, value: Array) -> tuple[dict, Array, Array]:
+    """Differentiate one number (), or K numbers (K,), by their unit cotangents."""
+    if not value.shape:
+        return differentiate(jnp.ones_like(value))
+    by_parts, stationarity, residual = jax.vmap(differentiate)(
+        jnp.eye(len(value), dtype=value.dtype)
+    )
+    return by_parts, jnp.max(stationarity), jnp.max(residual)
+
+
+def _where(holds: Array, by_parts: dict) -> dict:
+    """Replace the derivatives of the numbers by NaN where they do not hold, () or (K,) bool."""
+
+    def mask(leaf: Array) -> Array:
+        return jnp.where(
+            holds.reshape(holds.shape + (1,) * (leaf.ndim - holds.ndim)), leaf, jnp.nan
+        )
+
+    return jax.tree.map(mask, by_parts)
+
+
+def _of_composed(
+    problem: Composed, point: Array, number: Callable, change_case: Callable, parts: dict
+) -> Gradient:
+    """Return the gradient of one number of a plan that is composed of minima; see `gradient_at`."""
+
+    def value_of(parts: dict, meters: Array) -> tuple[Array, Array]:
+        case = change_case(parts)
+        plan = problem.compose(point, case, meters)
+        return number(plan, case), problem.is_kept(plan)
+
+    meters = jnp.zeros((problem.num_minima(change_case(parts)), 2), point.dtype)
+    value, pull, is_kept = jax.vjp(value_of, parts, meters, has_aux=True)
+
+    def differentiate(cotangent: Array) -> tuple[dict, Array, Array]:
+        by_parts, measured = pull(cotangent)
+        stationarity, residual = jnp.max(measured, axis=0)
+        return by_parts, stationarity, residual
+
+    by_parts, stationarity, residual = _for_each(differentiate, value)
+    holds = jnp.isfinite(value) & is_kept
+    return Gradient(value, _where(holds, by_parts), stationarity, residual)
+
+
+def split_smooth(context: PyTree) -> tuple[list[Array], Callable, Callable]:
+    """Return the floating leaves of a problem's data, and two functions of a list of such leaves.
+
+    The first function returns the data with these leaves; the second one returns the data's
+    cotangent, which has no derivative by the other leaves.
+    """
+    leaves, treedef = jax.tree.flatten(context)
+    is_smooth = [jnp.issubdtype(leaf.dtype, jnp.floating) for leaf in leaves]
+
+    def merge(smooth: list, others: list) -> PyTree:
+        taken = iter(smooth)
+        both = zip(others, is_smooth, strict=True)
+        return jax.tree.unflatten(treedef, [next(taken) if flag else leaf for leaf, flag in both])
+
+    def cotangent_of(smooth: list) -> PyTree:
+        return merge(smooth, [np.zeros(leaf.shape, jax.dtypes.float0) for leaf in leaves])
+
+    smooth = [leaf for leaf, flag in zip(leaves, is_smooth, strict=True) if flag]
+    return smooth, lambda smooth: merge(smooth, leaves), cotangent_of
+
+
+def solve_adjoint(
+    problem: Problem, context: PyTree, point: Array, rhs: Array, steps: int | None, curvature: str
+) -> tuple[Array, Array, Array]:
+    """Solve cost_uu lambda = rhs at a point (n,), as `gradient_at` explains.
+
+    Returns:
+        The adjoint vector lambda (n,), and the fields `stationarity` and `residual` of `Gradient`.
+    """
     steps = _STEPS[curvature] if steps is None else steps
     here = problem.curvature_at(point, context)
     if curvature == "products":
@@ -218,22 +311,15 @@ def gradient_at(
     decrease = 0.5 * jnp.sum(here.gradient * solve(here.gradient))
     stationarity = decrease / jnp.maximum(jnp.abs(here.evaluation.cost), 1e-30)
     if steps == 0:
-        residual = jnp.where(jnp.any(along_point != 0.0), jnp.ones_like(value), 0.0)
-    else:
-        adjoint, residual = _adjoint(solve, product, along_point, steps)
-        mixed = problem.slopes_along(point, context_of, smooth, adjoint)
-        by_context = [b - m for b, m in zip(by_context, mixed, strict=True)]
-    taken = iter(by_context)
-    both = zip(leaves, is_smooth, strict=True)
-    cotangent = [
-        next(taken) if flag else np.zeros(leaf.shape, jax.dtypes.float0) for leaf, flag in both
-    ]
-    (by_parts,) = pull(jax.tree.unflatten(treedef, cotangent))
-    holds = (
-        jnp.isfinite(value) & jnp.isfinite(residual) & (stationarity <= _STATIONARY[point.dtype])
-    )
-    by_parts = jax.tree.map(lambda leaf: jnp.where(holds, leaf, jnp.nan), by_parts)
-    return Gradient(value=value, by=by_parts, stationarity=stationarity, residual=residual)
+        residual = jnp.where(jnp.any(rhs != 0.0), jnp.ones_like(stationarity), 0.0)
+        return jnp.zeros_like(rhs), stationarity, residual
+    adjoint, residual = _adjoint(solve, product, rhs, steps)
+    return adjoint, stationarity, residual
+
+
+def is_optimum(stationarity: Array, residual: Array) -> Array:
+    """Return whether the implicit function theorem holds, () bool, by two fields of `Gradient`."""
+    return jnp.isfinite(residual) & (stationarity <= _STATIONARY[stationarity.dtype])
 
 
 def _by_whole_hessian(product: Product, point: Array) -> tuple[Product, Product]:
@@ -309,15 +395,25 @@ def _members(tree: PyTree) -> dict[str, PyTree]:
     return vars(tree) if dataclasses.is_dataclass(tree) else {}
 
 
-def _with_part(tree: PyTree, name: str, part: PyTree) -> PyTree:
+def replace_part(tree: PyTree, name: str, part: PyTree) -> PyTree:
+    """Return a case with another value of the part that a dotted name selects."""
     first, _, rest = name.partition(".")
-    inner = _with_part(_members(tree)[first], rest, part) if rest else part
+    inner = replace_part(_members(tree)[first], rest, part) if rest else part
     if isinstance(tree, tuple):
         return tuple((_members(tree) | {first: inner}).values())
     return dataclasses.replace(tree, **{first: inner})
 
 
-def _quantity(quantity: Quantity) -> Callable[[PyTree], Array]:
-    if callable(quantity):
-        return quantity
-    return lambda plan: _find_part(plan, quantity, "of")
+def _quantity(quantity: Quantity) -> Callable[[PyTree, PyTree], Array]:
+    if isinstance(quantity, Numbers):
+        return quantity.function
+
+    def number(plan: PyTree, _: PyTree) -> Array:
+        value = quantity(plan) if callable(quantity) else _find_part(plan, quantity, "of")
+        if numeric(value) is None:
+            raise ArgumentTypeError("of", "one number", value)
+        if value.shape:
+            raise ArgumentError("of", "one number", shown=f"shape {value.shape}")
+        return value
+
+    return number

@@ -120,6 +120,7 @@ pj.replan(blocker, blocks, block_plans, 0.1, rates=nan) | rates must
 pj.replan(pj.block.planner("direct"), blocks, block_plans, 0.1) | DirectBlock cannot plan again
 pj.gradient(exact, hits, of=5, by='target') | of must
 pj.gradient(exact, hits, of='cost', by='limits.nothing') | by must
+pj.sensitivity(exact, catches) | cases must be of the class HitCase
 pj.optimal_plan(exact, hits) | case must be one case, got batch shape (2,)
 pj.hit.judge(hits, catch_plans) | plans must be a HitPlan, got a CatchPlan
 pj.catch.judge(catches, catch_plans, net_test='box') | net_test must

@@ -4,7 +4,8 @@ import dataclasses
 import functools
 import itertools
 import operator
-from typing import ClassVar
+from collections.abc import Callable
+from typing import TYPE_CHECKING, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -24,15 +25,20 @@ from planner_jax.task.catch.case import CatchCase
 from planner_jax.task.catch.plan import CatchPlan
 from planner_jax.task.team.case import TeamCase
 from planner_jax.task.team.decide import PER_SECOND, SWEEPS, assign
+from planner_jax.task.team.meeting import (
+    TIMES,
+    hover_recovery,
+    sample_positions,
+    with_stricter_limits,
+)
 from planner_jax.task.team.plan import TeamPlan
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
 
+if TYPE_CHECKING:
+    from planner_jax.optimise.planner import SearchPlanner
+    from planner_jax.task.team.smooth import StartedTeam
+
 _NODES = 256  # number of nodes of the table of a robot's path
-# Relative difference of the limits in plans of several robots from the case's limits: between the
-# samples at which a planner evaluates limits, a trajectory may exceed them slightly.
-_STRICTER = 2e-3
-_TIMES = 1024  # number of times at which the distance of two robots is compared
-_HOVER = 1.0  # [s], duration of the recovery of a robot that catches nothing
 _SPARE = 1.01  # planned least distance between robots, relative to the least distance of the case
 _WIDTH = 128  # number of sequences of each length in the joint decision
 # Factors on the agility of robots in the joint decision, in the order of trial. Plans nearly always
@@ -62,6 +68,24 @@ class ExactTeam(Planner[TeamCase, TeamPlan]):
         """The planner of one robot's catches, behind its decision and its recovery."""
         return self.planner.inner.inner
 
+    def settle(
+        self,
+        cases: TeamCase,
+        plan_of: Callable[[Planner, TeamCase], TeamPlan] | None = None,
+    ) -> "tuple[SearchPlanner, StartedTeam]":
+        """Plan cases; return a planner and cases by which `pj.gradient` differentiates the plans.
+
+        `plan_of(self, cases)` makes the plans. `TypeError` is raised without `plan_of`, because
+        teams are planned on the host.
+        """
+        from planner_jax.task.team.smooth import smooth_near  # only gradients need it
+
+        minimiser, _ = self.inner.settle(cases)
+        if plan_of is None:
+            raise NotOffered("ExactTeam works on the host, so that optimal_plan cannot plan teams")
+        recovery = self.planner.recovery_planner.problem
+        return smooth_near(cases, plan_of(self, cases), minimiser.problem, recovery)
+
     def plan_by(self, drive: Drive, cases: TeamCase) -> TeamPlan:
         """Return plans of teams, by the loop over searches `drive`."""
         if drive.is_pure:
@@ -74,7 +98,7 @@ class ExactTeam(Planner[TeamCase, TeamPlan]):
         if cases.num_robots == 1:
             robots = [drive(self.planner, cases.of_robot(0))[0]]
         else:
-            cases = jax.tree.map(np.asarray, _with_stricter_limits(cases))
+            cases = jax.tree.map(np.asarray, with_stricter_limits(cases))
             robots, wanting = self._plan_jointly(drive, cases)
             lanes = np.flatnonzero(wanting)
             if lanes.size:
@@ -123,17 +147,10 @@ class ExactTeam(Planner[TeamCase, TeamPlan]):
 
     def _hover(self, drive: Drive, cases: TeamCase, k: int) -> PyTree:
         """Return plans (B, ...) in which robot k hovers at its start and catches nothing."""
-        start, pieces = (
-            cases.head_states[:, k, None, 0],
-            self.planner.recovery_planner.problem.num_pieces,
-        )
-        still = np.zeros((len(start), pieces, 8, 3), start.dtype)
-        still[:, :, 0] = start
-        lasting = np.full(still.shape[:2], _HOVER / pieces, start.dtype)
         idle = cases.of_robot(k, present=np.zeros_like(cases.shared.present))
         plans: PyTree = drive(self.inner, idle)[0]
-        recovery: PyTree = still, lasting
-        return plans.replace(recovery=PiecewisePolynomial(*recovery))
+        pieces = self.planner.recovery_planner.problem.num_pieces
+        return plans.replace(recovery=hover_recovery(cases.head_states[:, k, 0], pieces))
 
     def _plan_in_turn(self, drive: Drive, cases: TeamCase, plans: list[PyTree]) -> list[PyTree]:
         """Return the plans of N robots, leaves (B, ...), after new plans with more catches."""
@@ -158,15 +175,6 @@ class ExactTeam(Planner[TeamCase, TeamPlan]):
             plans[k] = jax.tree.map(pick, new, old)
             paths[k] = _tabulate(plans[k].whole)
         return plans
-
-
-def _with_stricter_limits(cases: TeamCase) -> TeamCase:
-    limits = cases.shared.limits.scale(1.0 - _STRICTER, cases.shared.gravity)
-    height = limits.min_height + _STRICTER * abs(limits.min_height)
-    shared = dataclasses.replace(
-        cases.shared, limits=dataclasses.replace(limits, min_height=height)
-    )
-    return dataclasses.replace(cases, shared=shared)
 
 
 def _put(old: PyTree, new: PyTree, lanes: np.ndarray) -> None:
@@ -208,25 +216,14 @@ def _near(pool: list[list[PyTree]], apart: np.ndarray) -> np.ndarray:
     paths = [jax.tree.map(lambda *x: np.stack(x), *[plan.whole for plan in row]) for row in pool]
     whole = jax.tree.map(lambda *leaves: np.stack(leaves), *paths)
     ends = whole.durations.sum(axis=3)
-    times = np.linspace(0.0, ends.max(axis=(0, 1)), _TIMES, axis=1, dtype=ends.dtype)
-    pos = np.asarray(_sample(whole, times))
+    times = np.linspace(0.0, ends.max(axis=(0, 1)), TIMES, axis=1, dtype=ends.dtype)
+    pos = np.asarray(sample_positions(whole, times))
     near = np.zeros((len(pool), len(pool), *ends.shape[1:2] * 2, len(apart)), bool)
     for (i, p), (j, q) in itertools.combinations(np.ndindex(ends.shape[:2]), 2):
         if i != j:
             squared = ((pos[i, p] - pos[j, q]) ** 2).sum(axis=2).min(axis=1)
             near[i, j, p, q] = near[j, i, q, p] = squared < apart**2
     return near
-
-
-@jax.jit
-def _sample(whole: PiecewisePolynomial, times: Array) -> Array:
-    """Return positions (N, K, B, T, 3) of robots at times (B, T); they stand after their ends."""
-
-    def at(path: PiecewisePolynomial, times: Array) -> Array:
-        end = jnp.sum(path.durations)
-        return jax.vmap(lambda time: evaluate(path, jnp.minimum(time, end)))(times)
-
-    return jax.vmap(jax.vmap(jax.vmap(at), (0, None)), (0, None))(whole, times)
 
 
 @jax.jit
