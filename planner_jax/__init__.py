@@ -14,9 +14,8 @@ The tasks are `hit`, `rally`, `catch`, `team`, `intercept`, `group`, `block` and
 * `keep_compiled_programs`: stores on disk programs that are compiled before the first plan;
   `quick_options`: compiler options with which loops over single cases compile faster on a CPU
 * `replan`: updates a plan while a robot executes it
-* `gradient`: differentiates one number of every plan by parts of its case; `optimal_plan`: a plan
-  that `jax.grad` can differentiate, for use inside a loss function
-* `sensitivity`: differentiates contact time, cost and margins of plans by all numbers of a case
+* `gradient`: differentiates one number of every plan by parts of its case; `sensitivity`: the main
+  numbers by all parts; `optimal_plan`: a plan that `jax.grad` can differentiate in a loss function
 * `take`, `are_solved`, `Status`: read plans; a plan has `sample`, `save` and `load`
 * `export`: writes one plan to a file for a controller; `show`: draws one plan
 

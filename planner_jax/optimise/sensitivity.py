@@ -55,7 +55,7 @@ _SMALL = 1e-11  # squared relative residual at which conjugate gradients stop
 class Gradient:
     """The value of one number of a plan, and its gradient by parts of the case.
 
-    For K `Numbers`, the value and the leaves of `by` have a leading axis K.
+    For K `Numbers`, value, residual and the leaves of `by` have a leading axis K.
     """
 
     value: Array  # ()
@@ -235,7 +235,7 @@ def _for_each(differentiate: Callable, value: Array) -> tuple[dict, Array, Array
     by_parts, stationarity, residual = jax.vmap(differentiate)(
         jnp.eye(len(value), dtype=value.dtype)
     )
-    return by_parts, jnp.max(stationarity), jnp.max(residual)
+    return by_parts, jnp.max(stationarity), residual
 
 
 def _where(holds: Array, by_parts: dict) -> dict:
@@ -313,8 +313,11 @@ def solve_adjoint(
     if steps == 0:
         residual = jnp.where(jnp.any(rhs != 0.0), jnp.ones_like(stationarity), 0.0)
         return jnp.zeros_like(rhs), stationarity, residual
-    adjoint, residual = _adjoint(solve, product, rhs, steps)
-    return adjoint, stationarity, residual
+    # The unit prevents that squares of small numbers vanish, as in derivatives that are rounding.
+    largest = jnp.max(jnp.abs(rhs))
+    unit = jnp.where(largest > 0.0, largest, 1.0)
+    adjoint, residual = _adjoint(solve, product, rhs / unit, steps)
+    return unit * adjoint, stationarity, residual
 
 
 def is_optimum(stationarity: Array, residual: Array) -> Array:

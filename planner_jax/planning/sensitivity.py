@@ -35,14 +35,14 @@ class Sensitivity(Generic[PlanT]):
     """
 
     plans: PlanT
-    # Numbers () by name: times of contact [s], "cost", "violation", and "margin.LIMIT".
+    # Numbers () by name: times of contact [s], "cost", and "margin.LIMIT".
     values: dict[str, Array]
     case: dict[str, PyTree]  # floating numbers of the case by dotted name
     # For a name of `values` and a name of `case`: d value / d leaf, with the shape of the leaf. NaN
     # where the plan is no optimum.
     by: dict[str, dict[str, Array]]
     stationarity: Array  # (), as in the result of `pj.gradient`
-    residual: Array  # (), as in the result of `pj.gradient`
+    residual: dict[str, Array]  # () for each name of `values`, as in the result of `pj.gradient`
 
     def relative(self, number: str) -> dict[str, np.ndarray]:
         """Return (theta / q) dq / dtheta for a number q and every number theta of the case.
@@ -51,7 +51,7 @@ class Sensitivity(Generic[PlanT]):
         margin, the result is theta dq / dtheta, as a margin is already relative to its limit.
         """
         value, batch = np.asarray(self.values[number], float), np.ndim(self.stationarity)
-        if number.startswith("margin.") or number == "violation":
+        if number.startswith("margin."):
             value = np.ones_like(value)
 
         def scale(theta: Array, slope: Array) -> np.ndarray:
@@ -100,10 +100,9 @@ def sensitivity(
     """Plan cases, and differentiate the main numbers of every plan by all numbers of its case.
 
     The numbers are the times of contact, which the task names (`stroke.time` of a hit), the cost,
-    the violation (the largest relative excess over a limit), and for quadrotors and cars the
-    margin of each limit of motion: 1 - q / limit for the greatest q along the trajectory, and for
-    the least height the height above it [m]. One program computes all derivatives, as
-    `pj.gradient` does.
+    and for quadrotors and cars the margin of each limit of motion: 1 - q / limit for the greatest q
+    along the trajectory, and for the least height the height above it [m]. One program computes all
+    derivatives, as `pj.gradient` does.
 
     Args:
         planner: a planner that minimises, as for `pj.gradient`.
@@ -131,7 +130,7 @@ def sensitivity(
             for k, label in enumerate(labels)
         },
         stationarity=found.stationarity,
-        residual=found.residual,
+        residual={label: pick(found.residual, k) for k, label in enumerate(labels)},
     )
 
 
@@ -185,7 +184,6 @@ def _list_numbers(plan: PyTree, case: PyTree, contact: str | None) -> list[tuple
             else [(f"{contact}.{k}", times[k]) for k in range(times.shape[0])]
         )
     found += [("cost", plan.cost)] if contact != "cost" else []
-    found.append(("violation", plan.violation))
     if isinstance(plan, QuadrotorPlan):
         found += _flight_margins(plan, case)
     elif isinstance(plan, CarPlan):
@@ -196,11 +194,20 @@ def _list_numbers(plan: PyTree, case: PyTree, contact: str | None) -> list[tuple
 def _flight_margins(plan: QuadrotorPlan, case: PyTree) -> list[tuple[str, Array]]:
     motion = sample_pieces(plan.trajectory, _NODES)
     excess = flight_excess(motion, case.gravity, case.limits)
-    greatest = relative_excess(case.limits, [jnp.max(each) for each in excess])
+    greatest = relative_excess(case.limits, [_greatest(each) for each in excess])
     margins: dict[str, Array] = {}
     for name, each in zip(flight_names(case.limits), greatest, strict=True):
         margins[name] = jnp.minimum(margins.get(name, jnp.inf), -each)
     return [(f"margin.{name}", each) for name, each in margins.items()]
+
+
+def _greatest(values: Array) -> Array:
+    """Return the greatest of values (N,); unlike `jnp.max`, the derivative is always finite.
+
+    `jnp.max` divides by the number of values that are equal to the greatest one. This number is 0
+    if XLA computes the values again with other rounding.
+    """
+    return values[jnp.argmax(values)]
 
 
 def _car_margins(plan: CarPlan, limits: CarLimits) -> list[tuple[str, Array]]:
@@ -214,7 +221,7 @@ def _car_margins(plan: CarPlan, limits: CarLimits) -> list[tuple[str, Array]]:
 
     def margin(limit: Array, values: Array) -> Array:
         is_finite = jnp.isfinite(limit)
-        return 1.0 - jnp.where(is_finite, jnp.max(jnp.abs(values)), 0.0) / jnp.where(
+        return 1.0 - jnp.where(is_finite, _greatest(jnp.abs(values)), 0.0) / jnp.where(
             is_finite, limit, 1.0
         )
 
