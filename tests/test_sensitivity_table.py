@@ -35,12 +35,17 @@ def test_the_table_lists_the_largest_relative_sensitivities_first(float64):
     assert lines[2].split(" | ")[2] == rows[0][0] and len(lines) == 6
 
 
+def test_rallies_are_refused_by_name():
+    rally = pj.task_named("rally")
+    with pytest.raises(TypeError, match="does not offer the task rally"):
+        pj.sensitivity(rally.planner(), rally.draw(2, seed=2))
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("task", "contact", "name"),
     [
         ("hit", "stroke.time", "limits.body_rate"),
-        ("rally", "strokes.time.0", "racket_height"),
         ("catch", "times.0", "net.height"),
     ],
 )
@@ -59,6 +64,4 @@ def test_every_number_has_the_derivative_of_gradient(task, contact, name):
 
 
 def first_time(plan):
-    if hasattr(plan, "stroke"):
-        return plan.stroke.time
-    return plan.strokes.time[0] if hasattr(plan, "strokes") else plan.times[0]
+    return plan.stroke.time if hasattr(plan, "stroke") else plan.times[0]

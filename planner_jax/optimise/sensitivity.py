@@ -232,9 +232,8 @@ def _for_each(differentiate: Callable, value: Array) -> tuple[dict, Array, Array
     """Differentiate one number (), or K numbers (K,), by their unit cotangents."""
     if not value.shape:
         return differentiate(jnp.ones_like(value))
-    by_parts, stationarity, residual = jax.vmap(differentiate)(
-        jnp.eye(len(value), dtype=value.dtype)
-    )
+    units = jnp.eye(len(value), dtype=value.dtype)
+    by_parts, stationarity, residual = jax.lax.map(differentiate, units)
     return by_parts, jnp.max(stationarity), residual
 
 

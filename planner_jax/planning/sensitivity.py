@@ -12,8 +12,9 @@ from flax import struct
 from jax import Array
 from jaxtyping import PyTree
 
+from planner_jax.core.errors import NotOffered
 from planner_jax.core.planner import PlanT
-from planner_jax.core.registry import all_tasks
+from planner_jax.core.registry import Task, all_tasks
 from planner_jax.cost.quadrotor import flight_excess, flight_names, relative_excess
 from planner_jax.optimise.sensitivity import Numbers, part_of
 from planner_jax.planning.gradient import gradient
@@ -23,6 +24,8 @@ from planner_jax.robot.quadrotor import QuadrotorPlan
 from planner_jax.trajectory.polynomial import sample_pieces
 
 _NODES = 32  # intervals of a polynomial piece, at whose ends margins are evaluated
+# Tasks whose programs end the process by a segmentation fault (JAX 0.10.2, CPU).
+_REFUSED = ("rally",)
 _ROWS = 5  # greatest number of rows that a table shows for each number
 
 
@@ -111,10 +114,15 @@ def sensitivity(
         devices: as for `pj.plan`.
 
     Raises:
-        TypeError: the planner does not minimise, or the cases have a wrong type.
+        TypeError: the planner does not minimise, the cases have a wrong type, or they are rallies.
     """
-    names = tuple(_floating_names(cases))
-    contact = _contact_of(cases)
+    task = _task_of(cases)
+    if task is not None and task.name in _REFUSED:
+        raise NotOffered(
+            f"pj.sensitivity does not offer the task {task.name}, as XLA's program ends the process"
+            " on a CPU: use pj.gradient by the parts that you need"
+        )
+    names, contact = tuple(_floating_names(cases)), None if task is None else task.contact
     found = gradient(
         planner, cases, of=_numbers_of(contact), by=names, chunk=chunk, devices=devices
     )
@@ -146,10 +154,10 @@ def _floating_names(tree: PyTree, before: str = "") -> list[str]:
     return [name] if is_array and jnp.issubdtype(jnp.result_type(tree), jnp.floating) else []
 
 
-def _contact_of(cases: PyTree) -> str | None:
-    """Return the dotted name of the times of contact in the plans of cases; None without any."""
+def _task_of(cases: PyTree) -> Task | None:
+    """Return the registered task of cases; None for cases of a user's own task."""
     home = type(cases).__module__.rpartition(".")[0]
-    return next((task.contact for task in all_tasks().values() if task.home == home), None)
+    return next((task for task in all_tasks().values() if task.home == home), None)
 
 
 @functools.cache  # each new function would compile a new program
