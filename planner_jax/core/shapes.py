@@ -23,14 +23,14 @@ def next_size(num: int, sizes: tuple[int, ...]) -> int:
 def resize(
     leaf: Numbers, axis: int, size: int, fill: Numbers | float | bool | None = 0.0
 ) -> Numbers:
-    """Return an array of which one axis has the length `size`: cut off, or padded at its end.
+    """Cut or pad an array at the end of one axis, so that the axis has the length `size`.
 
     Args:
         leaf: NumPy or jax array.
         axis: negative number of the axis, so that it is the same for one case and for a batch.
         size: new length of the axis.
-        fill: value of the added entries, which is broadcast to them. None repeats the last entry,
-            of which there must be one.
+        fill: value of the added entries, which is broadcast to them. None repeats the last entry
+            of an axis that is not empty.
     """
     num = leaf.shape[axis]
     if num == size:

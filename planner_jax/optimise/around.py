@@ -12,7 +12,7 @@ from planner_jax.optimise.settings import Settings
 
 
 class ProblemAround(Problem[CaseT, PlanT]):
-    """A problem that wraps the field `problem`, and has its own settings and those of the field."""
+    """A problem around the one in the field `problem`; it has the settings of both."""
 
     problem: Problem
 

@@ -379,7 +379,7 @@ def _find_part(tree: PyTree, name: str, argument: str) -> PyTree:
         raise ArgumentTypeError(argument, "a name or some", name)
     part = tree
     for field in name.split("."):
-        known = _members(part)
+        known = members_of(part)
         if field not in known:
             raise ArgumentError(
                 argument,
@@ -391,7 +391,8 @@ def _find_part(tree: PyTree, name: str, argument: str) -> PyTree:
     return part
 
 
-def _members(tree: PyTree) -> dict[str, PyTree]:
+def members_of(tree: PyTree) -> dict[str, PyTree]:
+    """Return the parts of a dataclass by field, those of a tuple by index, and none of others."""
     if isinstance(tree, tuple):
         return {str(k): member for k, member in enumerate(tree)}
     return vars(tree) if dataclasses.is_dataclass(tree) else {}
@@ -400,9 +401,9 @@ def _members(tree: PyTree) -> dict[str, PyTree]:
 def replace_part(tree: PyTree, name: str, part: PyTree) -> PyTree:
     """Return a case with another value of the part that a dotted name selects."""
     first, _, rest = name.partition(".")
-    inner = replace_part(_members(tree)[first], rest, part) if rest else part
+    inner = replace_part(members_of(tree)[first], rest, part) if rest else part
     if isinstance(tree, tuple):
-        return tuple((_members(tree) | {first: inner}).values())
+        return tuple((members_of(tree) | {first: inner}).values())
     return dataclasses.replace(tree, **{first: inner})
 
 

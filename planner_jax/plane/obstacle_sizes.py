@@ -17,7 +17,7 @@ POSES = (64,)  # numbers of poses of a track; the number does not change the com
 def count_present(group: Obstacles, batch: tuple[int, ...]) -> int:
     """Return the number of entries of a group up to the last obstacle that is present in any case.
 
-    All entries count in a jax array of which other hosts hold a part.
+    If other hosts hold a part of a jax array, the number of all its entries is returned.
     """
     present, num = group.present, group.present.shape[-1]
     if isinstance(present, jax.Array) and not present.is_fully_addressable:

@@ -169,7 +169,7 @@ def plan(
         solve_share = lambda device, watch, some: Driver(chunk, device, watch)(planner, some)[0]  # noqa: E731
         plans = plan_shares(solve_share, without_origin(cases), used, watch)
     else:
-        device = used[0] if devices is not None and used else None
+        device = used[0] if len(used) else None
         plans, _ = Driver(chunk, device, watch)(planner, without_origin(cases))
     # To save time, a single case's numbers are checked on the host only after the status BAD_INPUT.
     if alone and not resident and int(plans.status) == Status.BAD_INPUT:
@@ -184,12 +184,17 @@ def _devices_for(
     cases: PyTree,
     devices: Sequence[Device] | None,
 ) -> Sequence[Device]:
-    """Return the devices that share a batch, each with enough cases to be worth its thread."""
+    """Return the devices that share a batch, each with enough cases to be worth its thread.
+
+    None means the default device. The local devices are not listed for one case, as it takes time.
+    """
+    first = () if devices is None else devices[:1]
+    if cases.batch_shape == () or planner.kind is Kind.HOST:
+        return first
     devices = jax.local_devices() if devices is None else devices
-    if len(devices) == 1 or cases.batch_shape == () or planner.kind is Kind.HOST:
-        return devices[:1]
     least = BUCKETS[0] if is_cpu(devices[0]) else GPU_LEAST_PADDED
-    return devices[: max(1, cases.batch_shape[0] // least)]
+    used = devices[: max(1, cases.batch_shape[0] // least)]
+    return used if len(used) > 1 else first
 
 
 def _require_layout(chunk: object, devices: object) -> None:

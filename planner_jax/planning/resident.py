@@ -106,7 +106,7 @@ def _place_none(device: Device, num: int, dtype: np.dtype) -> Score:
 
 @jax.jit
 def take_lanes(tree: PyTree, lanes: Array) -> PyTree:
-    """Return the cases with these indices; indices past the end are those of the last case."""
+    """Return the cases at these indices; an index past the end selects the last case."""
     return jax.tree.map(lambda leaf: leaf[jnp.minimum(lanes, leaf.shape[0] - 1)], tree)
 
 
@@ -142,7 +142,7 @@ def _join(parts: list[PyTree], num: int) -> tuple[PyTree, Array]:
 
 @jax.jit
 def _put_better(plans: PyTree, later: PyTree, lanes: Array) -> tuple[PyTree, Array]:
-    """Return plans with those of `later`, of the cases at the indices `lanes`, that are better."""
+    """Replace plans of the cases at the indices `lanes` by those of `later` that are better."""
     kept = select(later, take_lanes(plans, lanes))
     put = lambda old, new: old.at[lanes].set(new, mode="drop")  # noqa: E731
     return with_unsolved(jax.tree.map(put, plans, kept))

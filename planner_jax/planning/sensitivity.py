@@ -1,6 +1,5 @@
 """`pj.sensitivity`: derivatives of a plan's main numbers by every number of its case."""
 
-import dataclasses
 import functools
 from collections.abc import Sequence
 from typing import Generic
@@ -16,7 +15,7 @@ from planner_jax.core.errors import NotOffered
 from planner_jax.core.planner import PlanT
 from planner_jax.core.registry import Task, all_tasks
 from planner_jax.cost.quadrotor import flight_excess, flight_names, relative_excess
-from planner_jax.optimise.sensitivity import Numbers, part_of
+from planner_jax.optimise.sensitivity import Numbers, members_of, part_of
 from planner_jax.planning.gradient import gradient
 from planner_jax.planning.programs import Device
 from planner_jax.robot.car import CarLimits, CarPlan
@@ -144,9 +143,7 @@ def sensitivity(
 
 def _floating_names(tree: PyTree, before: str = "") -> list[str]:
     """Return the dotted names of the floating leaves of a case, without positions of origins."""
-    members = {str(k): each for k, each in enumerate(tree)} if isinstance(tree, tuple) else {}
-    members = vars(tree) if dataclasses.is_dataclass(tree) else members
-    if members:
+    if members := members_of(tree):
         parts = [_floating_names(each, f"{before}{name}.") for name, each in members.items()]
         return [name for part in parts for name in part]
     name = before.removesuffix(".")

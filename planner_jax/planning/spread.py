@@ -32,7 +32,7 @@ def plan_shares(
     devices: Sequence[Device],
     watch: Watch,
 ) -> PyTree:
-    """Return the plans of a batch, of which each device plans an equal share of cases.
+    """Divide a batch equally among devices, which plan their shares, and join the plans.
 
     The plans of cases in NumPy arrays are in NumPy arrays. Those of cases in jax arrays stay on
     their devices; if the shares cannot be equal, the first device holds all plans.
@@ -63,7 +63,7 @@ def plan_shares(
 
 
 def _split_resident(cases: PyTree, share: int, together: Sharding) -> list[PyTree]:
-    """Return the cases of each device, on this device; the last cases repeat the last one."""
+    """Return the share of each device, on this device; repeats of the last case fill the shares."""
     num, size = count_lanes(cases), together.num_devices
     if num < share * size:
         cases = take_lanes(cases, np.arange(share * size))

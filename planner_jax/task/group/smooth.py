@@ -42,19 +42,14 @@ class SmoothGroup(Composed):
     """The legs of groups, each a minimum of the cost `leg` from the leg of a known plan."""
 
     case_type: ClassVar[type] = StartedGroup
-    needs_double: ClassVar[bool] = True
     leg: SmoothIntercept
 
     def num_minima(self, case: StartedGroup) -> int:
         """Return the number N of legs."""
         return case.num_targets
 
-    def guesses(self, context: StartedGroup, num: int) -> Array:
-        """Minimise the costs of the legs, one after another; return the minima, (num, N n).
-
-        All rows are equal, because there is only one known plan.
-        """
-        fixed = lax.stop_gradient(context)
+    def find_minima(self, case: StartedGroup) -> Array:
+        """Minimise the costs of the legs, one after another; return the minima, (N n,)."""
 
         def minimise(leg: StartedCase, needed: Array, k: Array | int) -> Array:
             steps = jnp.where(needed, self.leg.solver.max_steps, 0)
@@ -62,8 +57,7 @@ class SmoothGroup(Composed):
             problem = dataclasses.replace(self.leg, solver=solver)
             return problem.guesses(problem.prepare(leg), 1)[0]
 
-        points, _ = self._drive(fixed, minimise)
-        return jnp.broadcast_to(points.ravel(), (num, points.size))
+        return self._drive(case, minimise)[0].ravel()
 
     def compose(self, point: Array, case: StartedGroup, meters: Array) -> GroupPlan:
         """Return the plan of the legs' minima `point` (N n,), with derivatives by the case."""

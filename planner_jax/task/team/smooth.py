@@ -57,7 +57,6 @@ class SmoothTeam(Composed):
     """The catches and recovery trajectories of the robots of a team, each a minimum of its own."""
 
     case_type: ClassVar[type] = StartedTeam
-    needs_double: ClassVar[bool] = True
     catches: CatchProblem
     recovery: RecoveryProblem
 
@@ -65,22 +64,17 @@ class SmoothTeam(Composed):
         """Return 2 N: the catches of N robots, then their recovery trajectories."""
         return 2 * case.num_robots
 
-    def guesses(self, context: StartedTeam, num: int) -> Array:
-        """Minimise the costs of all robots' catches and recoveries; return the minima, (num, n).
-
-        All rows are equal, because there is only one known plan.
-        """
-        fixed = lax.stop_gradient(context)
-        own = robots_of(fixed)
-        points = jax.vmap(functools.partial(_minimise, self.catches))(own, fixed.start_points)
+    def find_minima(self, case: StartedTeam) -> Array:
+        """Minimise the costs of all robots' catches and recoveries; return the minima, (n,)."""
+        own = robots_of(case)
+        points = jax.vmap(functools.partial(_minimise, self.catches))(own, case.start_points)
         cases = recovery_cases(own, jax.vmap(functools.partial(_decode, self.catches))(own, points))
 
         def recover(case: PyTree) -> Array:
             start = self.recovery.guesses(self.recovery.prepare(case), 1)[0]
             return _minimise(self.recovery, case, start)
 
-        point = jnp.concatenate([points.ravel(), jax.vmap(recover)(cases).ravel()])
-        return jnp.broadcast_to(point, (num, point.size))
+        return jnp.concatenate([points.ravel(), jax.vmap(recover)(cases).ravel()])
 
     def compose(self, point: Array, case: StartedTeam, meters: Array) -> TeamPlan:
         """Return the plan of the minima `point` (n,), with derivatives by the case."""
