@@ -1,14 +1,16 @@
-"""Compare gradients of plans of groups and teams with differences of plans that are made anew.
+"""Compare gradients of plans with differences of plans that are made anew.
 
-    python -m benchmarks.gradient_errors [--task group] [--num 100] [--chunk 10] [--out DIR]
+    python -m benchmarks.gradient_errors [--task hit] [--num 100] [--float64] [--out DIR]
 
-`pj.gradient` differentiates the time of the last meeting, or of the last catch, by several parts of
-the case. The reference moves all these parts along one random direction, forwards and backwards, by
-two step lengths, and minimises again in float64, from the same plan and with the same decisions.
-The error is relative, by the nearer of the two differences. The table has the number of solved
-cases, and how many of these have a gradient.
+`pj.gradient` differentiates the time of the last contact, or the cost, by several parts of the
+case. The reference moves all these parts along one random direction, forwards and backwards, by two
+step lengths, and minimises again in float64, with the same decisions, and from the same plan if the
+task's planner searches for a path. The error is relative, by the nearer of the two differences. The
+table has the number of solved cases, and how many of these have a gradient.
 """
 
+import contextlib
+import dataclasses
 import time
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -21,21 +23,26 @@ import planner_jax as pj
 from planner_jax.benchmarks.run import argument_parser, at_least, begin
 from planner_jax.optimise.sensitivity import part_of, replace_part
 from planner_jax.planning.gradient import with_type
+from planner_jax.task.block.problem.smooth import SmoothBlock
 
 _STEPS = (1e-4, 1e-5)  # in the units of the parts
-
-
-def _last_catch(plan: Any) -> jax.Array:
-    return jnp.max(plan.robots.times)
-
-
 _TASKS = {  # the number of a plan, and the parts of a case
+    "hit": ("stroke.time", ("ball.vel", "limits.body_rate", "head_state")),
+    "catch": (lambda plan: jnp.max(plan.times), ("net.height", "limits.speed", "head_state")),
+    "rally": (lambda plan: plan.strokes.time[-1], ("ball.vel", "limits.body_rate", "places")),
+    "intercept": ("cost", ("limits.acceleration", "target.vel", "movers.centre", "speed")),
+    "block": ("contact_time", ("ball.pos",)),
+    "reach": ("cost", ("angles", "limits.acceleration")),
     "group": (
         "cost",
         ("shared.limits.acceleration", "shared.target.vel", "shared.movers.centre", "shared.speed"),
     ),
-    "team": (_last_catch, ("shared.limits.body_rate", "shared.net.height", "head_states")),
+    "team": (
+        lambda plan: jnp.max(plan.robots.times),
+        ("shared.limits.body_rate", "shared.net.height", "head_states"),
+    ),
 }
+_LONG = {"max_steps": 2000, "settled": 20}  # least squares that end at the minimum
 
 
 def differences(
@@ -49,13 +56,17 @@ def differences(
         cases, plans = with_type(cases, np.float64), with_type(plans, np.float64)
         smooth, started = planner.settle(cases, lambda *_: plans)
         started = with_type(started, np.float64)
+        smooth, problem = smooth.with_polish(), smooth.problem
+        if isinstance(problem, SmoothBlock):  # its least squares end early
+            solver = dataclasses.replace(problem.solver, **_LONG)
+            smooth = pj.SearchPlanner(dataclasses.replace(problem, solver=solver))
 
         def number(step: float) -> np.ndarray:
             moved = started
             for name, direction in away.items():
                 moved = replace_part(moved, name, part_of(started, name) + step * direction)
             found = pj.plan(smooth, jax.tree.map(np.asarray, moved))
-            value = getattr(found, of) if isinstance(of, str) else jax.vmap(of)(found)
+            value = part_of(found, of) if isinstance(of, str) else jax.vmap(of)(found)
             return np.where(pj.are_solved(found), value, np.nan)
 
         return [(number(step) - number(-step)) / (2.0 * step) for step in _STEPS]
@@ -74,22 +85,30 @@ def errors_of(
         )
         for k, each in away.items()
     )
-    expected = differences(planner, cases, found.plans, of, away)
-    return found, np.min([np.abs(slope - each) / np.abs(each) for each in expected], axis=0)
+    errors, solved = np.full(slope.shape, np.nan), np.flatnonzero(pj.are_solved(found.plans))
+    some = jax.tree.map(lambda leaf: np.asarray(leaf)[solved], (cases, found.plans))
+    expected = differences(planner, *some, of, away) if solved.size else [errors[solved]]
+    errors[solved] = np.min([abs(slope[solved] - each) / abs(each) for each in expected], axis=0)
+    return found, errors
 
 
 def main() -> None:
     parser = argument_parser("gradient_errors", __doc__, num=100, seed=31)
-    parser.add_argument("--task", choices=_TASKS, default="group", help="default: group")
+    parser.add_argument("--task", choices=_TASKS, default="hit", help="default: hit")
+    parser.add_argument("--suite", help="default: the first suite of the task")
+    parser.add_argument("--float64", action="store_true", help="differentiate in float64 too")
     parser.add_argument("--chunk", type=at_least(1), default=10, help="cases at once; default: 10")
     options = parser.parse_args()
     of, by = _TASKS[options.task]
     task = pj.task_named(options.task)
-    with begin(parser, options) as bench:
+    precise = jax.enable_x64 if options.float64 else contextlib.nullcontext
+    with begin(parser, options) as bench, precise(True):
         planner, errors, solved, began = task.planner(), [], 0, time.process_time()
         for first in range(0, options.num, options.chunk):
             num = min(options.chunk, options.num - first)
-            cases = jax.tree.map(np.asarray, task.draw(num, seed=options.seed, first=first))
+            named = {"suite": options.suite} if options.suite else {}
+            cases = task.draw(num, seed=options.seed, first=first, **named)
+            cases = with_type(cases, np.float64 if options.float64 else np.float32)
             found, error = errors_of(planner, cases, of, by, options.seed)
             is_solved = pj.are_solved(found.plans)
             solved += int(is_solved.sum())

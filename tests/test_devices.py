@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 import threading
+from unittest.mock import Mock
 
 import chex
 import jax
@@ -12,8 +13,9 @@ import pytest
 from test_solve import Well, WellProblem
 
 import planner_jax as pj
-from planner_jax.core.protocol import are_solved
+from planner_jax.core.protocol import BaseAttempt, are_solved
 from planner_jax.planning.plan import plan
+from planner_jax.planning.programs import sizes_of
 
 GOALS = np.linspace(-1.0, 5.0, 203).astype(np.float32)
 SOME = GOALS[::6][:32]
@@ -22,6 +24,13 @@ TASKS = ("hit", "catch", "rally", "team", "intercept", "group", "block", "reach"
 
 def test_two_devices_give_the_plans_of_one():
     run_on_devices(2, "compare_two()")
+
+
+def test_calls_on_gpus_have_less_padding_for_attempts_with_many_starts():
+    gpu, planner = Mock(spec=jax.Device, platform="gpu"), pj.intercept.planner()
+    few, many = (sizes_of(planner, BaseAttempt(starts=starts), None, gpu) for starts in (1, 128))
+    assert [few.next(num) for num in (1, 128, 129)] == [128, 128, 1024]
+    assert [list(many.cuts(num)) for num in (1, 64, 70)] == [[(0, 64)], [(0, 64)], [(0, 128)]]
 
 
 @pytest.mark.slow

@@ -54,12 +54,13 @@ class Sizes:
     def next(self, num: int) -> int:
         """Return how many lanes (cases) the next compiled call has if `num` lanes are unsolved.
 
-        It is the smallest size in `BUCKETS` that holds `num` lanes, at most the field `most`. If
-        the lanes fill at most half of it, the next smaller size is used, provided it is at least
-        the fields `busy` and `least`. Further calls then plan the remaining lanes.
+        It is the smallest size in `BUCKETS`, or the field `least`, that holds `num` lanes, at most
+        the field `most`. If the lanes fill at most half of it, the next smaller size is used,
+        provided it is at least the fields `busy` and `least`. Further calls then plan the remaining
+        lanes.
         """
-        needed = max(num, self.least)
-        fits = next((size for size in BUCKETS if needed <= size <= self.most), self.most)
+        needed, sizes = max(num, self.least), (self.least, *BUCKETS)
+        fits = next((size for size in sizes if needed <= size <= self.most), self.most)
         smaller = max((size for size in BUCKETS if size < fits), default=0)
         return smaller if smaller >= max(self.busy, self.least) and 2 * num <= fits else fits
 
@@ -84,7 +85,7 @@ def sizes_of(planner: Planner, attempt: BaseAttempt, chunk: int | None, device: 
     if chunk is not None:
         return Sizes(chunk, busy)
     if not is_cpu(device):
-        least = GPU_LEAST_PADDED if attempt.continues else _GPU_LEAST
+        least = GPU_LEAST_PADDED if attempt.continues else min(_GPU_LEAST, max(busy, BUCKETS[0]))
         many = least if attempt.continues and attempt.starts > 1 else _GPU_CHUNK // attempt.starts
         return Sizes(max(least, many), busy, least)
     # If a core solves cases one after another, small chunks of cases keep all cores busy. Small
