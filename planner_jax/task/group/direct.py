@@ -9,12 +9,13 @@ the remaining targets is improved from the car's state (`order`).
 """
 
 import dataclasses
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
+from jaxtyping import PyTree
 
 from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import BaseAttempt, Status, is_solved
@@ -70,7 +71,7 @@ class DirectGroup(Planner[InterceptGroup, GroupPlan]):
         table, count = make_table(case), jnp.sum(case.present)
         car = CarState(shared.start, shared.speed, shared.curvature)
 
-        def repeat(tree: Any, size: int) -> Any:
+        def repeat(tree: PyTree, size: int) -> PyTree:
             return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (size, *jnp.shape(leaf))), tree)
 
         def try_next(state: tuple) -> tuple:

@@ -4,7 +4,6 @@ import dataclasses
 import functools
 import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -84,7 +83,7 @@ def read_learned_starts(num: int = 0, joints: int = 6) -> tuple[np.ndarray, np.n
     return np.append(ranks, turns), every
 
 
-def settle_by(steps: int) -> dict[str, Any]:
+def settle_by(steps: int) -> dict[str, float]:
     """Return fields of a solver that continues at feasible points, for `steps` steps at most."""
     return {"max_steps": steps, "settled": 3, "tolerance": 2e-3}
 
