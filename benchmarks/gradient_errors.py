@@ -1,12 +1,12 @@
-"""Compare gradients of plans of groups and teams with differences of plans that are made anew.
+"""Compare gradients of plans of groups, teams and blocks with differences of new plans.
 
     python -m benchmarks.gradient_errors [--task group] [--num 100] [--chunk 10] [--out DIR]
 
-`pj.gradient` differentiates the time of the last meeting, or of the last catch, by several parts of
-the case. The reference moves all these parts along one random direction, forwards and backwards, by
-two step lengths, and minimises again in float64, from the same plan and with the same decisions.
-The error is relative, by the nearer of the two differences. The table has the number of solved
-cases, and how many of these have a gradient.
+`pj.gradient` differentiates the time of the last meeting, of the last catch, or of a block, by
+parts of the case. The reference moves all these parts along one random direction, forwards and
+backwards, by two step lengths, and minimises again in float64, from the same plan and with the same
+decisions. The error is relative, by the nearer of the two differences. The table has the number of
+solved cases, and how many of these have a gradient.
 """
 
 import time
@@ -29,12 +29,14 @@ def _last_catch(plan: Any) -> jax.Array:
     return jnp.max(plan.robots.times)
 
 
-_TASKS = {  # the number of a plan, and the parts of a case
+_TASKS = {  # the number of a plan, the parts of a case, and the suite; None: the usual one
     "group": (
         "cost",
         ("shared.limits.acceleration", "shared.target.vel", "shared.movers.centre", "shared.speed"),
+        None,
     ),
-    "team": (_last_catch, ("shared.limits.body_rate", "shared.net.height", "head_states")),
+    "team": (_last_catch, ("shared.limits.body_rate", "shared.net.height", "head_states"), None),
+    "block": ("contact_time", ("ball.pos",), "pole"),
 }
 
 
@@ -83,13 +85,13 @@ def main() -> None:
     parser.add_argument("--task", choices=_TASKS, default="group", help="default: group")
     parser.add_argument("--chunk", type=at_least(1), default=10, help="cases at once; default: 10")
     options = parser.parse_args()
-    of, by = _TASKS[options.task]
+    of, by, suite = _TASKS[options.task]
     task = pj.task_named(options.task)
     with begin(parser, options) as bench:
         planner, errors, solved, began = task.planner(), [], 0, time.process_time()
         for first in range(0, options.num, options.chunk):
             num = min(options.chunk, options.num - first)
-            cases = jax.tree.map(np.asarray, task.draw(num, seed=options.seed, first=first))
+            cases = jax.tree.map(np.asarray, task.draw(num, suite, options.seed, first=first))
             found, error = errors_of(planner, cases, of, by, options.seed)
             is_solved = pj.are_solved(found.plans)
             solved += int(is_solved.sum())
