@@ -21,14 +21,11 @@ from planner_jax.benchmarks.throughput import report
 from planner_jax.core import registry
 from planner_jax.core.errors import ArgumentError
 
-NEEDS = {"oracle_hit": "casadi"}  # not installed for the tests
 BENCHMARKS = sorted(Path(benchmarks.__path__[0]).glob("*.py"))
 
 
 @pytest.mark.parametrize("path", BENCHMARKS, ids=lambda path: path.stem)
 def test_what_a_benchmark_imports_is_there(path):
-    if path.stem in NEEDS:
-        pytest.importorskip(NEEDS[path.stem])
     importlib.import_module(f"planner_jax.benchmarks.{path.stem}")
 
 

@@ -32,11 +32,11 @@ def settle(problem):
 
 
 def move_to_optimum(smooth, case):
-    return dataclasses.replace(case, start_point=settle(smooth)(case))
+    return dataclasses.replace(case, known=settle(smooth)(case))
 
 
 def optimum_near_straight(planner, case):
-    smooth, case = planner.smooth_near(case, make_straight_plan(case, planner.pieces))
+    smooth, case = planner.smooth().near(case, make_straight_plan(case, planner.pieces))
     smooth = smooth.problem
     return smooth, move_to_optimum(smooth, case)
 
@@ -44,9 +44,7 @@ def optimum_near_straight(planner, case):
 @functools.cache
 def differentiate(problem, quantity, by, steps):
     options = {"steps": steps, "curvature": "whole"}
-    return jax.jit(
-        lambda case: gradient_at(problem, case, case.start_point, quantity, by, **options)
-    )
+    return jax.jit(lambda case: gradient_at(problem, case, case.known, quantity, by, **options))
 
 
 def move(case, name, by):

@@ -14,8 +14,8 @@ FREE = pj.reach.make_scene()
 
 
 def started(case, duration, goal=0):
-    known = {"goal": np.int32(goal), "duration": np.asarray(duration, case.angles.dtype)}
-    return StartedReach(**vars(case), **known)
+    known = np.int32(goal), np.asarray(duration, case.angles.dtype)
+    return StartedReach(**vars(case), known=known)
 
 
 def duration_of(case):

@@ -13,6 +13,7 @@ import planner_jax as pj
 from planner_jax.optimise.implicit import implicit_point, newton_refine, optimal_plan
 from planner_jax.optimise.inverse_kernel import inverse_kernel
 from planner_jax.optimise.multistart import minimise
+from planner_jax.optimise.near import Known, NearPlan
 from planner_jax.optimise.preconditioner import positive_inverse
 from planner_jax.optimise.sensitivity import gradient_at, part_of, replace_part
 from planner_jax.planning.decided import first_choice
@@ -120,6 +121,54 @@ def test_an_optimal_plan_has_the_same_gradient_forward_and_backward(bowls):
 
 def minimum(bowl):
     return jnp.linalg.solve(CURVED, bowl.b + bowl.k * jnp.eye(3)[0])
+
+
+@struct.dataclass
+class KnownBowl(Bowl, Known):
+    """A bowl, and the point (3,) of a known plan."""
+
+
+@jax.tree_util.register_static
+@dataclasses.dataclass(frozen=True)
+class NearBowl(NearPlan, BowlProblem):
+    """The bowl's cost, which one Newton step minimises from any known plan."""
+
+    case_type = KnownBowl
+
+    def prepare(self, case):
+        return {**super().prepare(case), "known": case.known}
+
+    def known_of(self, cases, plans):
+        return plans.point
+
+    def find_minimum(self, context):
+        slope = CURVED @ context["known"] - context["force"]
+        return context["known"] - jnp.linalg.solve(CURVED, slope)
+
+
+@jax.tree_util.register_static
+@dataclasses.dataclass(frozen=True)
+class Beside(pj.Planner):
+    """A planner whose plans are beside the minimum, at a distance that depends on the case."""
+
+    case_type = Bowl
+
+    def solve(self, case, attempt):
+        plan = BowlPlan(point=minimum(case) + 1.0 + case.k, **pj.pending(-jnp.ones(())))
+        return plan.replace(status=jnp.asarray(pj.Status.CONVERGED, jnp.int32))
+
+    def smooth(self):
+        return NearBowl()
+
+
+def test_a_planner_with_a_smooth_problem_has_the_gradients_of_the_minima_near_its_plans(bowls):
+    found = pj.gradient(Beside(), bowls, of=square, by=("b",), steps=3)
+    best = np.asarray(jax.vmap(minimum)(bowls))
+    np.testing.assert_allclose(found.plans.point, best, atol=1e-12)
+    np.testing.assert_allclose(found.by["b"], 2.0 * best @ np.linalg.inv(CURVED), atol=1e-9)
+    bowl = jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), bowls)
+    slopes = jax.jacrev(lambda b: optimal_plan(Beside(), bowl.replace(b=b)).point)(bowl.b)
+    np.testing.assert_allclose(slopes, np.linalg.inv(CURVED), atol=1e-9)
 
 
 def test_an_implicit_point_has_the_derivative_of_the_optimum(bowls):

@@ -7,12 +7,12 @@ kernel each thread integrates one ball, together with the requested derivatives.
 import dataclasses
 import functools
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 from jax.typing import ArrayLike
+from jaxtyping import PyTree
 
 from planner_jax.ball.flight import BallState, rk4_step
 from planner_jax.core.compiled import Treedef
@@ -92,7 +92,7 @@ def _call(
         numbers = drag[...], gravity[...]
         zero = jnp.zeros_like(numbers[0])
 
-        def full(values: Iterable[ArrayLike]) -> Any:  # a vector as a tuple of components
+        def full(values: Iterable[ArrayLike]) -> PyTree:  # a vector as a tuple of components
             return tuple(zero + value for value in values)
 
         def write(node: ArrayLike, ball: BallState, moved: list[BallState]) -> None:

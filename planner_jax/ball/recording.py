@@ -13,9 +13,10 @@ import functools
 import math
 from collections.abc import Callable
 from dataclasses import astuple, dataclass, fields
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
+from jaxtyping import PyTree
 from numpy.typing import ArrayLike
 from scipy.special import stdtrit
 
@@ -131,7 +132,8 @@ class FlightFit:
     stamp_noise: np.ndarray  # () [s], standard deviation of a time stamp
     outliers: np.ndarray  # () share of observations that are far from the flight
     covariance: np.ndarray  # (15, 15), of the unknowns, in the order of the module's docstring
-    _data: tuple[Any, ...]  # times of observations, origin, and inputs of the program of `predict`
+    # Times of observations, origin, and inputs of the program of `predict`.
+    _data: tuple[PyTree, ...]
 
     def predict(self, times: ArrayLike) -> Prediction:
         """Predict the ball at times (T,), or (B, T) for a batch, on the recording's clock [s].

@@ -5,18 +5,20 @@ The docstring of `planner_jax.ball.recording` lists the unknowns.
 
 import functools
 from collections.abc import Callable
-from typing import Any
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
+from jaxtyping import PyTree
 
 from planner_jax.ball.spin import SpinningBall, Surroundings, spin_acceleration, spin_flight
 from planner_jax.core.arithmetic import at_least
 from planner_jax.core.compiled import QUICK_OPTIONS
 
 _UNKNOWNS, _BEFORE = 15, 12  # numbers of unknowns, and of those with an effect before a bounce
+ArrayT = TypeVar("ArrayT", Array, np.ndarray)
 _OTHERS = 10  # number of further results of `estimate`
 _DRIFT = 4.0  # standard deviation of the drift of stamps, divided by the spread of their delays
 _TAIL = 4.0  # degrees of freedom of Student's t distribution of the errors
@@ -37,7 +39,7 @@ _MOST_NOISE = 0.1  # greatest error of an observation along the path, as a share
 _MOST_LIFT = 8.0  # greatest length of the lift vector, in standard deviations
 
 
-def unpack(fitted: Any) -> tuple[Any, Any, Any]:
+def unpack(fitted: ArrayT) -> tuple[ArrayT, ArrayT, ArrayT]:
     """Return the state, its covariance, and the other numbers of results of `estimate`."""
     square = fitted[..., _UNKNOWNS:-_OTHERS].reshape((*fitted.shape[:-1], _UNKNOWNS, _UNKNOWNS))
     return fitted[..., :_UNKNOWNS], square, fitted[..., -_OTHERS:]
@@ -82,7 +84,7 @@ def _positions(
     return pos, (pos, vel)
 
 
-def _linearise(num: int, state: Array, *others: Any) -> tuple[Array, tuple[Array, Array]]:
+def _linearise(num: int, state: Array, *others: PyTree) -> tuple[Array, tuple[Array, Array]]:
     """Return slopes (N, 3, num) by the first `num` unknowns, with positions and velocities."""
     whole = functools.partial(jnp.append, values=state[num:])
     return jax.jacfwd(lambda x: _positions(whole(x), *others), has_aux=True)(state[:num])

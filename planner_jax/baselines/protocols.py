@@ -6,7 +6,7 @@ module stands in the lowest package that prints one, and imports only the standa
 
 import csv
 import dataclasses
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from importlib import resources
 from statistics import fmean
 from typing import Any
@@ -34,7 +34,7 @@ class Published:
         return f"{self.bound} {self.value:g}{spread} {self.unit}".strip()
 
 
-def _rows(*protocol: Any, rows: dict[str, Any], bound: str = "") -> Iterator[Published]:
+def _rows(*protocol: object, rows: Mapping[str, object], bound: str = "") -> Iterator[Published]:
     for row, value in rows.items():
         pair = value if isinstance(value, tuple) else (value, None)
         fields: tuple[Any, ...] = (*protocol, row, *pair, bound)
@@ -56,7 +56,7 @@ def _rows_of_court() -> Iterator[Published]:
                 yield from _rows("Yu2023bat", table, *protocol, num, "-", _BAT, rows=rows)
 
 
-def _label(quantity: str, cases: Iterable[object], values: Iterable[Any]) -> dict[str, Any]:
+def _label(quantity: str, cases: Iterable[object], values: Iterable[object]) -> dict[str, object]:
     return {f"{quantity} {name}": value for name, value in zip(cases, values, strict=True)}
 
 

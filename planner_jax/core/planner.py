@@ -209,7 +209,22 @@ class Planner(Generic[CaseT, PlanT]):
 
         An open decision is, for example, the order of targets. `plan_of(planner, cases)` makes
         plans, from which the decisions are taken. Without it the planner's first proposals are
-        taken; the method is then pure and makes no plan. Derivatives treat decisions as constants.
+        taken, or `plan_once` makes the plans; the method is then pure. Derivatives treat decisions
+        as constants.
+
+        Raises:
+            TypeError: the planner does not minimise a cost.
+        """
+        smooth = self.smooth()
+        once = lambda _, cases: self.plan_once(lax.stop_gradient(cases))  # noqa: E731
+        return smooth.near(cases, (plan_of or once)(self, cases))
+
+    def plan_once(self, cases: CaseT) -> PyTree:
+        """Return the plans from which `settle` starts, by default of the first attempt; pure."""
+        return self.solve(cases, self.attempts[0])
+
+    def smooth(self) -> PyTree:
+        """Return the problem, with a method `near`, whose minima are near this planner's plans.
 
         Raises:
             TypeError: the planner does not minimise a cost.

@@ -23,7 +23,7 @@ from planner_jax.core.checks import (
 )
 from planner_jax.core.choices import require_size
 from planner_jax.core.errors import ArgumentError, ArgumentTypeError
-from planner_jax.core.rules import FINITE, NOT_NEGATIVE, POSITIVE, fields_of, has_rules, is_sound
+from planner_jax.core.rules import FINITE, NOT_NEGATIVE, POSITIVE, fields_of, is_sound
 
 
 class Status(enum.IntEnum):
@@ -308,8 +308,6 @@ def are_solved(plans: Plan) -> np.ndarray:
 
 def mark_bad_input(plans: PlanT, cases: PyTree) -> PlanT:
     """Return plans with status `BAD_INPUT` for cases with NaN or out-of-range numbers; pure."""
-    if not has_rules(cases):
-        return plans
     status = numpy_of(plans.status).where(is_sound(cases), plans.status, Status.BAD_INPUT)
     status = status.astype(np.int32)
     return dataclasses.replace(plans, status=status)  # type: ignore[type-var]

@@ -135,11 +135,6 @@ def part_at(tree: PyTree, name: str) -> PyTree:
     return tree
 
 
-def has_rules(cases: PyTree) -> bool:
-    """Return whether the class of the cases, or of a part of them, defines rules of its numbers."""
-    return any(True for _ in _parts(cases))
-
-
 def require_sound(cases: object, names: Mapping[str, str] | None = None) -> None:
     """Raise an error of one line for the first rule that a case breaks.
 
@@ -252,9 +247,12 @@ _KINDS = {
 
 
 def is_sound(cases: PyTree) -> PyTree:
-    """Return whether every number of each case keeps its rules, bool of the batch shape; pure."""
+    """Return whether every number of each case keeps its rules, bool of the batch shape; pure.
+
+    Cases whose class and parts have no `rules` are sound.
+    """
     batch = cases.batch_shape
-    held = [ruled.holds() for ruled in all_ruled(cases)]
+    held = [ruled.holds() for ruled in all_ruled(cases)] or [np.ones((*batch, 1), bool)]
     # Joining the arrays before the reduction compiles to one loop instead of one for each array.
     xp = numpy_of(*held)
     return xp.concatenate([each.reshape(*batch, -1) for each in held], axis=-1).all(axis=-1)

@@ -10,7 +10,6 @@ import functools
 import math
 import operator
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -296,7 +295,7 @@ def sample_excess(along: Along, unit: Vectors, duration: Array, given: PyTree) -
         tuple(value * power for value in vector)
         for vector, power in zip(unit[1:], rates, strict=True)
     )
-    parts: dict[str, Any] = {"height": unit[0][0], "vel": vel, "acc": acc, "jerk": jerk}
+    parts: dict[str, PyTree] = {"height": unit[0][0], "vel": vel, "acc": acc, "jerk": jerk}
     return along.excess(Motion(**parts), given)
 
 

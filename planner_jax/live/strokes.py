@@ -95,7 +95,7 @@ class Stroke(abc.ABC, Generic[CaseT, PlanT]):
 
     def again(self, plan: PlanT, elapsed: float, ball: BallState) -> PlanT:
         """Improve a plan flown for `elapsed` [s], given a newer estimate of the ball."""
-        since: Any = np.float32(elapsed)
+        since = np.asarray(elapsed, np.float32)
         task = Replanning(self._with_ball(ball), plan, since)
         return call_packed(self._solve_again, _AGAIN, self._replanner, task)
 

@@ -16,7 +16,7 @@ from jax import Array, lax
 from jaxtyping import PyTree
 
 from planner_jax.core.protocol import Score, is_better, is_solved, is_unsolved
-from planner_jax.core.rules import has_rules, is_sound
+from planner_jax.core.rules import is_sound
 from planner_jax.lanes import over_lanes
 from planner_jax.optimise.multistart import (
     Optimum,
@@ -68,8 +68,7 @@ class Search:
         index = jnp.broadcast_to(row.first, cases.batch_shape)
         _, plan = self.run(row, lanes, index, None)
         plans = put_lanes_first(plan)
-        is_usable = is_sound(cases) if has_rules(cases) else True
-        is_new = find_due(row, before, is_usable) & (row.is_first | is_better(plans, before))
+        is_new = find_due(row, before, is_sound(cases)) & (row.is_first | is_better(plans, before))
         choose = lambda new, old: jnp.where(is_new, new, old)  # noqa: E731
         return plans.replace(**vars(jax.tree.map(choose, Score.of(plans), before)))
 
@@ -176,7 +175,7 @@ def over(function: Callable) -> Callable:
     return call
 
 
-def find_due(row: Row, score: Score, is_usable: Array | bool) -> Array:
+def find_due(row: Row, score: Score, is_usable: Array) -> Array:
     """Return which cases need the attempt of a row, (B,) bool; padding of a batch needs none."""
     again = is_unsolved(score.status) & (score.violation <= row.within)
     again = (again | is_solved(score.status) & row.improves) & is_usable

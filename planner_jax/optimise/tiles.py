@@ -15,7 +15,7 @@ from jax import Array, lax
 from jaxtyping import PyTree
 
 from planner_jax.core.protocol import Score, is_better, is_solved
-from planner_jax.core.rules import has_rules, is_sound
+from planner_jax.core.rules import is_sound
 from planner_jax.lanes.kernels import is_on_gpu
 from planner_jax.lanes.packing import Packing
 from planner_jax.optimise import lbfgs
@@ -42,7 +42,7 @@ def solve_in_tiles(search: Search, cases: PyTree, before: Score) -> PyTree:
     item, plan = jax.eval_shape(functools.partial(_plan_guess, search), lane)
     packings = of_cases, of_items, of_plans = tuple(map(Packing, (lane, item, plan)))
     packed = of_cases.pack(put_lanes_last(cases))
-    is_usable = is_sound(cases) if has_rules(cases) else jnp.ones(num, bool)
+    is_usable = is_sound(cases)
 
     def take_row(state: tuple, row: Row) -> tuple[tuple, None]:
         found, due = state

@@ -6,13 +6,14 @@ target. Users may write classes of their own. World frame in the plane, SI units
 """
 
 import dataclasses
-from typing import Any, Protocol
+from typing import Protocol
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jax import Array
+from jaxtyping import PyTree
 
 
 @struct.dataclass
@@ -72,7 +73,7 @@ class PolynomialPath:
 class PositionPath:
     """A path whose velocity is the derivative of the positions that another path returns."""
 
-    path: Any  # a pytree whose method `at(time)` returns a position (2,) [m]
+    path: PyTree  # a pytree whose method `at(time)` returns a position (2,) [m]
 
     def at(self, time: Array) -> PointState:
         """Return position [m] and velocity [m/s] at one time () [s]."""

@@ -27,7 +27,7 @@ from planner_jax.core.protocol import (
     select,
     select_into,
 )
-from planner_jax.core.rules import Case, has_rules, require_shapes, require_sound
+from planner_jax.core.rules import Case, require_shapes, require_sound
 from planner_jax.host.compile_cache import keep_compiled_programs
 from planner_jax.planning.programs import BUCKETS, GPU_LEAST_PADDED, Device, is_cpu, solve_one
 
@@ -228,8 +228,7 @@ def require_batch(cases: Case) -> int:
         raise ArgumentError("cases", "a batch of at least one", shown=f"batch shape {batch}")
     for path, leaf in jax.tree_util.tree_leaves_with_path(cases):
         if np.shape(leaf)[:1] != batch:
-            if has_rules(cases):
-                require_shapes(cases)  # its error names the array of another batch
+            require_shapes(cases)  # its error names the array of another batch
             name = jax.tree_util.keystr(path)
             raise ArgumentError(
                 f"cases{name}", f"{batch[0]} lanes", verb="have", shown=f"shape {np.shape(leaf)}"

@@ -1,6 +1,7 @@
 """`pj.replan`: it plans again while an earlier plan is executed, for changed circumstances."""
 
-from typing import Any, Generic
+import dataclasses
+from typing import Any, ClassVar, Generic
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +16,7 @@ from planner_jax.core.checks import numbers_of, require_kind
 from planner_jax.core.compiled import with_own_precision
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.origin import Located, move, with_origin, without_origin
-from planner_jax.core.planner import CaseT, PlanT, require_planner
+from planner_jax.core.planner import CaseT, Planner, PlanT, require_planner
 from planner_jax.core.rules import Case
 from planner_jax.planning.plan import plan
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate, states_at
@@ -93,6 +94,28 @@ def resolve_argument(name: str, given: PyTree, own: PyTree, elapsed: Numbers) ->
     if given is not None and not isinstance(found, Tracer) and not np.isfinite(found).all():
         raise ArgumentError(name, "finite", given)
     return found
+
+
+def resolve_arguments(elapsed: Numbers, **arguments: tuple) -> dict[str, Numbers]:
+    """Return the values of named arguments, each a pair (given, own), by `resolve_argument`."""
+    pairs = arguments.items()
+    return {name: resolve_argument(name, given, own, elapsed) for name, (given, own) in pairs}
+
+
+class ReplanAround(Planner[Replanning, PlanT]):
+    """A re-planner that plans cases from scratch by the planner in its field `planner`."""
+
+    case_type: ClassVar[type] = Replanning
+    planner: PyTree  # a `Planner`, whose class subclasses state
+
+    @property
+    def inner(self) -> Planner:
+        """The planner that plans from scratch."""
+        return self.planner
+
+    def fit_shapes(self, tasks: Replanning) -> Replanning:
+        """Return the tasks with cases that the planner has padded to one of few shapes."""
+        return dataclasses.replace(tasks, case=self.planner.fit_shapes(tasks.case))
 
 
 @with_own_precision

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Iterator
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -172,6 +172,6 @@ def _arm_problem(case: PyTree, pieces: np.ndarray, times: np.ndarray) -> str:
 _clearances = jax.jit(lambda case, angles: case.clearances(angles))
 
 
-def _change(kind: type[PlanT], plan: PlanT, **fields: Any) -> PlanT:
+def _change(kind: type[PlanT], plan: PlanT, **fields: object) -> PlanT:
     values = {field.name: vars(plan)[field.name] for field in dataclasses.fields(kind)}
     return kind(**{**values, **fields})

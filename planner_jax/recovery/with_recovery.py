@@ -1,7 +1,6 @@
 """A planner that appends a recovery trajectory to each plan of a quadrotor."""
 
 import dataclasses
-from collections.abc import Callable
 from types import ModuleType
 
 import jax
@@ -31,9 +30,7 @@ class RecoveringPlanner(PlannerAround[CaseT, PlanT]):
     recovery_planner: SearchPlanner
     slower: tuple[float, ...] = struct.field(pytree_node=False, default=(0.8, 0.65, 0.5))
 
-    def settle(
-        self, cases: PyTree, plan_of: Callable[[Planner, PyTree], PyTree] | None = None
-    ) -> tuple[PyTree, PyTree]:
+    def smooth(self) -> PyTree:
         """Raise `TypeError`, since `pj.gradient` cannot differentiate plans with a recovery.
 
         The plan and its recovery trajectory are results of two separate minimisations.

@@ -124,7 +124,7 @@ def _of_urdf(model: ArmModel, others: Stated) -> Stated:
     return stated
 
 
-def _from_moveit(source: str, fields: Any, model: ArmModel) -> Stated:
+def _from_moveit(source: str, fields: object, model: ArmModel) -> Stated:
     stated: Stated = {}
     if not isinstance(fields, Mapping):
         raise ArgumentError(f"{source}: joint_limits", "fields with the names of joints", fields)

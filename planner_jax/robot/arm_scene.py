@@ -231,7 +231,7 @@ def _read_solids(kind: str, given: Any) -> list[tuple]:
     return [_read_solid(kind, entry, f"{kind}[{k}]") for k, entry in enumerate(entries)]
 
 
-def _read_solid(kind: str, entry: Any, place: str) -> tuple:
+def _read_solid(kind: str, entry: object, place: str) -> tuple:
     """Return the numbers of an obstacle; raise an error with its place unless they are sound."""
     shapes = SOLIDS[kind]
     if not isinstance(entry, list | tuple) or len(entry) != len(shapes):
@@ -254,7 +254,7 @@ def _read_solid(kind: str, entry: Any, place: str) -> tuple:
     return tuple(found.values())
 
 
-def read_numbers(name: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
+def read_numbers(name: str, value: object, shape: tuple[int, ...]) -> np.ndarray:
     """Return finite numbers of a shape as float64; raise an `ArgumentError` for all else."""
     try:
         found = np.array(value, float)

@@ -100,7 +100,7 @@ def _fields(name: str, source: str) -> dict[str, Any]:
         raise ArgumentError(source, str(error).removeprefix("must "), verb="", shown="") from None
 
 
-def _element(place: str, value: Any, kind: str, folder: str = "") -> tuple:
+def _element(place: str, value: object, kind: str, folder: str = "") -> tuple:
     """Return one obstacle's fields; the path of a file is relative to `folder`."""
     shapes = SOLIDS[kind]
     if not isinstance(value, dict) or {*value} - {*shapes} or "file" in {*shapes} - {*value}:

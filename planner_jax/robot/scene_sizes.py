@@ -5,7 +5,6 @@ kind of obstacle has sizes of its own, and a kind without obstacles stays withou
 """
 
 import dataclasses
-from typing import Any
 
 import numpy as np
 
@@ -17,7 +16,7 @@ BODIES = (1, 8, 64)  # numbers of capsules, boxes and cylinders
 _FAR = 1e3  # [m], height of an added box or cylinder, beyond the reach of every arm
 
 # Fields of the obstacles of each kind: the axis of the obstacles, and the entry that is added.
-_ADDED: tuple[dict[str, tuple[int, Any]], ...] = (
+_ADDED: tuple[dict[str, tuple[int, float | np.ndarray]], ...] = (
     {"capsule_ends": (-3, 0.0), "capsule_radius": (-1, ABSENT)},
     {
         "box_middle": (-2, np.array([0.0, 0.0, _FAR])),
@@ -38,7 +37,7 @@ def fit_scene(scene: Scene, batch: tuple[int, ...]) -> Scene:
     added boxes and cylinders are far away.
     """
     solids = {} if scene.meshes is None else scene.meshes.solids
-    fields: dict[str, Any] = {"meshes": None} if solids else {}
+    fields: dict[str, object] = {"meshes": None} if solids else {}
     for kind in _ADDED:
         for name, (axis, fill) in kind.items():
             leaf = getattr(scene, name)

@@ -25,11 +25,12 @@ Vectors are tuples of components here, so that XLA compiles one elementwise loop
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import Array, lax
+from jaxtyping import PyTree
 
 Vector = tuple[Array, ...]
 
@@ -80,7 +81,7 @@ class Approach(NamedTuple):
     moment: Vector  # three components () [m], p x direction for any point p of the line
 
 
-def nearest_points(distance: Callable, *bodies: Array) -> tuple[Array, Any]:
+def nearest_points(distance: Callable, *bodies: Array) -> tuple[Array, PyTree]:
     """Return a distance () [m], and the parameters of the nearest points for `approach`.
 
     A parameter is for example the fraction, from 0 to 1, at which the point lies along a segment.
@@ -97,7 +98,7 @@ def nearest_points(distance: Callable, *bodies: Array) -> tuple[Array, Any]:
     return _length(gap_of(nearest, *bodies)), nearest
 
 
-def approach(distance: Callable, nearest: Any, *bodies: Array) -> Approach:
+def approach(distance: Callable, nearest: PyTree, *bodies: Array) -> Approach:
     """Return the line through the nearest points of two bodies.
 
     If the first body rotates about an axis a through a point o, the derivative of the distance by
@@ -129,7 +130,7 @@ def _shortest(nearest: Callable, gap: Callable, bodies: tuple[Array, ...]) -> Ar
 
 
 @_shortest.defjvp
-def _shortest_jvp(nearest: Callable, gap: Callable, primals: Any, tangents: Any) -> Any:
+def _shortest_jvp(nearest: Callable, gap: Callable, primals: tuple, tangents: tuple) -> PyTree:
     (bodies,) = primals
     # Without the barrier XLA would compute the nearest points again for every derivative.
     fixed = lax.optimization_barrier(nearest(*bodies))
@@ -252,7 +253,7 @@ def _gap_to_cylinder(shares: tuple[Array], ends: Array, axis_ends: Array, radius
     return tuple(outside * x + beyond * a for x, a in zip(across, axis, strict=True))
 
 
-def _nearest_of_rectangle(ends: Array, middle: Array, edges: Array) -> Any:
+def _nearest_of_rectangle(ends: Array, middle: Array, edges: Array) -> PyTree:
     """Return the parameters of the nearest points of a segment and a rectangle.
 
     They are the fraction along the segment (0 to 1), the multiples of both half-edges (-1 to 1),
@@ -282,7 +283,7 @@ def _nearest_of_rectangle(ends: Array, middle: Array, edges: Array) -> Any:
     return share, of_edges, ~crosses
 
 
-def _gap_to_rectangle(nearest: Any, ends: Array, middle: Array, edges: Array) -> Vector:
+def _gap_to_rectangle(nearest: PyTree, ends: Array, middle: Array, edges: Array) -> Vector:
     share, (p, q), apart = nearest
     away = _minus(_point(ends, share), tuple(middle))
     e, f = _rows(edges)
@@ -401,12 +402,12 @@ def _gap_to_ground(lowest: Vector, *bodies: Array) -> Vector:
     return (jnp.zeros_like(lowest[0]), jnp.zeros_like(lowest[0]), jnp.ones_like(lowest[0]))
 
 
-def _point_of_rectangle(nearest: Any, middle: Array, edges: Array, *other: Array) -> Vector:
+def _point_of_rectangle(nearest: PyTree, middle: Array, edges: Array, *other: Array) -> Vector:
     (e, f), (p, q, *_) = _rows(edges), nearest
     return tuple(m + p * a + q * b for m, a, b in zip(middle, e, f, strict=True))
 
 
-def _point_of_segment(shares: Any, ends: Array, *other: Array) -> Vector:
+def _point_of_segment(shares: PyTree, ends: Array, *other: Array) -> Vector:
     return _point(ends, shares[0])
 
 

@@ -11,12 +11,11 @@ planner stores only the bumps.
 
 import dataclasses
 import functools
-from collections.abc import Callable
 from typing import TYPE_CHECKING, ClassVar, Self
 
 import jax
 import jax.numpy as jnp
-from jax import Array, lax
+from jax import Array
 
 from planner_jax.core.choices import EFFORTS, require_one_of
 from planner_jax.core.compiled import place_numbers
@@ -26,7 +25,6 @@ from planner_jax.core.protocol import require_settings
 from planner_jax.core.shapes import fit_resident
 from planner_jax.optimise import levenberg
 from planner_jax.optimise.levenberg import LevenbergConfig, Model
-from planner_jax.optimise.planner import SearchPlanner
 from planner_jax.robot import arm_motion
 from planner_jax.robot.arm_clearance import least_clearances
 from planner_jax.robot.scene_sizes import fit_scene
@@ -46,7 +44,6 @@ from planner_jax.task.block.search.attempts import (
     settle_by,
 )
 from planner_jax.task.block.search.least_squares import (
-    encode,
     rank_end_poses,
     refine_at_once,
     refine_in_turn,
@@ -55,7 +52,7 @@ from planner_jax.task.block.search.least_squares import (
 from planner_jax.task.block.search.straight import plan_straight
 
 if TYPE_CHECKING:
-    from planner_jax.task.block.problem.smooth import StartedBlock
+    from planner_jax.task.block.problem.smooth import SmoothBlock
     from planner_jax.task.block.replan import ReplanBlock
 
 _SETTLING = {"good": 24, "best": 48}  # effort -> number of steps that lower the cost
@@ -212,33 +209,19 @@ class OnlineBlock(Planner):
         gaps = least_clearances(case.arm, case.scene, angles)
         return make_plan(self, case, flight, point, steps, angles, gaps)
 
-    def settle(
-        self,
-        cases: BlockCase,
-        plan_of: Callable[[Planner, BlockCase], BlockPlan] | None = None,
-    ) -> "tuple[SearchPlanner, StartedBlock]":
-        """Plan cases; return a planner and cases by which `pj.gradient` differentiates the plans.
+    def plan_once(self, cases: BlockCase) -> BlockPlan:
+        """Return the plan of one case by a search from all starting points; pure."""
+        return self.solve(cases, self.load_attempt(Search(), cases))
 
-        `plan_of(self, cases)` makes the plans. By default `solve` makes one plan by a search from
-        all starting points.
-        """
-        from planner_jax.task.block.problem.smooth import (  # few plans need it
-            SmoothBlock,
-            StartedBlock,
-        )
+    def smooth(self) -> "SmoothBlock":
+        """Return the problem whose minima are near this planner's plans."""
+        from planner_jax.task.block.problem.smooth import SmoothBlock  # few plans need it
 
         if self.brisk:
             raise NotOffered(
                 "Plans of the planner brisk have no gradient: use online, whose plans are optima"
             )
-        if plan_of is None:
-            plans = self.solve(lax.stop_gradient(cases), self.load_attempt(Search(), cases))
-        else:
-            plans = plan_of(self, cases)
-        start = (encode if cases.batch_shape == () else jax.vmap(encode))(plans)
-        smooth = SmoothBlock(dataclasses.replace(self, worst=self.samples, settling=0))
-        start = lax.stop_gradient(start)
-        return SearchPlanner(smooth), StartedBlock(**vars(cases), start_point=start)
+        return SmoothBlock(dataclasses.replace(self, worst=self.samples, settling=0))
 
     def replanner(self) -> "ReplanBlock":
         """Return the planner by which `pj.replan` updates motions that are being executed."""

@@ -18,10 +18,10 @@ from planner_jax.ball.flight import BallState, drag_free_flight
 from planner_jax.core.arithmetic import host_leaf
 from planner_jax.core.checks import require_kind
 from planner_jax.core.paths import require_beginning
-from planner_jax.core.planner import Drive, Planner
+from planner_jax.core.planner import Drive
 from planner_jax.core.protocol import BaseAttempt, is_unsolved
 from planner_jax.optimise.levenberg import LevenbergConfig
-from planner_jax.planning.replan import Replanning, check_elapsed, resolve_argument
+from planner_jax.planning.replan import ReplanAround, Replanning, check_elapsed, resolve_arguments
 from planner_jax.robot.arm import shield_pose
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.default_planner import OnlineBlock
@@ -41,17 +41,12 @@ class Warm(BaseAttempt):
 
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
-class WarmBlock(Planner):
+class WarmBlock(ReplanAround[BlockPlan]):
     """Planner that refines the motion being executed; its cases come from `ReplanBlock.begin`."""
 
-    case_type: ClassVar[type] = Replanning
     is_sequential: ClassVar[bool] = True
     planner: OnlineBlock = OnlineBlock()  # its unknowns, limits and weights are used
     attempts: tuple[Warm, ...] = (Warm(),)  # pyright: ignore[reportIncompatibleMethodOverride]
-
-    def fit_shapes(self, tasks: Replanning) -> Replanning:
-        """Return the tasks with cases that the planner has padded to one of few shapes."""
-        return dataclasses.replace(tasks, case=self.planner.fit_shapes(tasks.case))
 
     def solve(self, task: Replanning, attempt: Warm) -> BlockPlan:
         """Return the plan of one case, refined from the remainder of the previous motion."""
@@ -81,7 +76,7 @@ class WarmBlock(Planner):
 
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
-class ReplanBlock(Planner):
+class ReplanBlock(ReplanAround[BlockPlan]):
     """Planner for `pj.replan` that starts from the motion being executed.
 
     `pj.block.planner().replanner()` returns it, and `pj.replan(pj.block.planner(), cases, plans,
@@ -91,15 +86,9 @@ class ReplanBlock(Planner):
     motion starts at the case's `delay`, which grows from one re-plan to the next.
     """
 
-    case_type: ClassVar[type] = Replanning
     plan_type: ClassVar[type] = BlockPlan
     warm: WarmBlock = WarmBlock()
     planner: OnlineBlock = OnlineBlock()  # for cases that `warm` does not solve
-
-    @property
-    def inner(self) -> OnlineBlock:
-        """Planner of the cases that are planned from scratch."""
-        return self.planner
 
     def begin(
         self,
@@ -123,17 +112,12 @@ class ReplanBlock(Planner):
         if ball is not None:
             require_kind("ball", ball, BallState)
             require_beginning("ball", ball, batch, f"the batch shape {batch}")
-        own = (_states if cases.batch_shape else _state)(cases, previous, elapsed)
-        angles, rates = (
-            resolve_argument(name, given, mine, elapsed)
-            for name, given, mine in zip(("angles", "rates"), (angles, rates), own, strict=True)
-        )
+        pose, turn = (_states if cases.batch_shape else _state)(cases, previous, elapsed)
         left = dataclasses.replace(
             cases,
             ball=cases.ball if ball is None else ball,
             delay=np.asarray(cases.delay) + elapsed,
-            angles=angles,
-            rates=rates,
+            **resolve_arguments(elapsed, angles=(angles, pose), rates=(rates, turn)),
         )
         return Replanning(case=left, previous=previous, elapsed=host_leaf(elapsed))
 

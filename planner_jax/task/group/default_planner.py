@@ -7,12 +7,11 @@ of a batch, in all proposed orders, are planned together, then all second legs, 
 """
 
 import dataclasses
-from collections.abc import Callable
 from typing import TYPE_CHECKING, ClassVar
 
 import jax
 import numpy as np
-from jax import Array, lax
+from jax import Array
 
 from planner_jax.core.planner import Drive, Planner
 from planner_jax.core.protocol import BaseAttempt, Status, is_unsolved
@@ -24,8 +23,7 @@ from planner_jax.task.intercept.default_planner import SpacetimeIntercept
 from planner_jax.task.intercept.plan import InterceptPlan
 
 if TYPE_CHECKING:
-    from planner_jax.optimise.planner import SearchPlanner
-    from planner_jax.task.group.smooth import StartedGroup
+    from planner_jax.task.group.smooth import SmoothGroup
 
 # Search for a leg (drive to one target): from 12 random paths instead of 32, as legs are many.
 _EARLY = dataclasses.replace(SpacetimeIntercept("early").attempts[0], paths=12)
@@ -60,21 +58,20 @@ class GroupIntercept(Planner):
         plans, _ = chain_legs(cases, plan_legs, is_pure=drive.is_pure)
         return plans if drive.is_pure else jax.device_get(plans)
 
-    def settle(
-        self,
-        cases: InterceptGroup,
-        plan_of: Callable[[Planner, InterceptGroup], GroupPlan] | None = None,
-    ) -> "tuple[SearchPlanner, StartedGroup]":
-        """Plan cases; return a planner and cases by which `pj.gradient` differentiates the plans.
+    def plan_once(self, cases: InterceptGroup) -> GroupPlan:
+        """Return the plans that `pj.solve` makes."""
+        from planner_jax.planning.plan import solve  # only gradients need it
 
-        `plan_of(self, cases)` makes the plans; by default `pj.solve` makes them. Every leg is
-        minimised as early, also where `patient` planned it.
+        return solve(self, cases)
+
+    def smooth(self) -> "SmoothGroup":
+        """Return the problem whose minima are near this planner's plans.
+
+        Every leg is minimised as early, also where `patient` planned it.
         """
-        from planner_jax.planning.plan import solve  # only gradients need these modules
-        from planner_jax.task.group.smooth import smooth_near
+        from planner_jax.task.group.smooth import smooth_legs  # only gradients need it
 
-        plans = solve(self, lax.stop_gradient(cases)) if plan_of is None else plan_of(self, cases)
-        return smooth_near(cases, plans, self.planner.problem)
+        return smooth_legs(self.planner.problem)
 
     def _plan_legs(self, drive: Drive, case: InterceptCase, needed: Array) -> InterceptPlan:
         patiently = lambda some: drive(self.patient, some)[0]  # noqa: E731

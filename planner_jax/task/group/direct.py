@@ -9,13 +9,13 @@ the remaining targets is improved from the car's state (`order`).
 """
 
 import dataclasses
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
+from jaxtyping import PyTree
 
 from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import BaseAttempt, Status, is_solved
@@ -34,8 +34,7 @@ from planner_jax.task.intercept.searches import Search, make_field, make_grid
 from planner_jax.task.intercept.units import enter_units, leave_units, units_of
 
 if TYPE_CHECKING:
-    from planner_jax.optimise.planner import SearchPlanner
-    from planner_jax.task.group.smooth import StartedGroup
+    from planner_jax.task.group.smooth import SmoothGroup
 
 # The pursuits that starting points 1 to 7 of a leg follow, and the direct motion 0: the greatest
 # speed divided by the car's, and the side of a detour, 1 to the left. The heading at the meeting is
@@ -72,7 +71,7 @@ class DirectGroup(Planner[InterceptGroup, GroupPlan]):
         table, count = make_table(case), jnp.sum(case.present)
         car = CarState(shared.start, shared.speed, shared.curvature)
 
-        def repeat(tree: Any, size: int) -> Any:
+        def repeat(tree: PyTree, size: int) -> PyTree:
             return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (size, *jnp.shape(leaf))), tree)
 
         def try_next(state: tuple) -> tuple:
@@ -126,23 +125,14 @@ class DirectGroup(Planner[InterceptGroup, GroupPlan]):
             legs=legs,
         )
 
-    def settle(
-        self,
-        cases: InterceptGroup,
-        plan_of: Callable[[Planner, InterceptGroup], GroupPlan] | None = None,
-    ) -> "tuple[SearchPlanner, StartedGroup]":
-        """Plan cases; return a planner and cases by which `pj.gradient` differentiates the plans.
+    def smooth(self) -> "SmoothGroup":
+        """Return the problem whose minima are near this planner's plans.
 
-        `plan_of(self, cases)` makes the plans; by default `solve` makes them. The legs of the
-        returned planner know all movers, and may meet their targets in any direction.
+        Its legs know all movers, and may meet their targets in any direction.
         """
-        from planner_jax.task.group.smooth import smooth_near  # only gradients need it
+        from planner_jax.task.group.smooth import smooth_legs  # only gradients need it
 
-        if plan_of is None:
-            plans = self.solve(lax.stop_gradient(cases), self.attempts[0])
-        else:
-            plans = plan_of(self, cases)
-        return smooth_near(cases, plans, _PROBLEM)
+        return smooth_legs(_PROBLEM)
 
     def _try_leg(
         self,

@@ -11,11 +11,12 @@ from typing import ClassVar
 import jax
 import jax.numpy as jnp
 from flax import struct
-from jax import Array, lax
+from jax import Array
 
 from planner_jax.optimise.composed import Composed
 from planner_jax.optimise.implicit import implicit_point
 from planner_jax.optimise.levenberg import LevenbergConfig
+from planner_jax.optimise.near import Known
 from planner_jax.optimise.planner import SearchPlanner
 from planner_jax.task.group.case import InterceptGroup
 from planner_jax.task.group.legs import chain_legs
@@ -23,17 +24,15 @@ from planner_jax.task.group.plan import GroupPlan
 from planner_jax.task.intercept.case import InterceptCase
 from planner_jax.task.intercept.plan import InterceptPlan
 from planner_jax.task.intercept.problem.motion_problem import MotionProblem
-from planner_jax.task.intercept.problem.smooth import SmoothIntercept, StartedCase, add_start
+from planner_jax.task.intercept.problem.smooth import SmoothIntercept, StartedCase
 
 # Most legs end after 100 to 600 steps; a leg that exceeds a limit would make all steps.
 _SOLVER = LevenbergConfig(1000, settled=12, tolerance=0.0)
 
 
 @struct.dataclass
-class StartedGroup(InterceptGroup):
-    """A group to plan, and the unknowns of the legs of a known plan."""
-
-    start_points: Array  # (N, n), in the sequence of `order`; treated as constants
+class StartedGroup(InterceptGroup, Known):
+    """A group to plan, and the unknowns (N, n) of the legs of a known plan, ordered by `order`."""
 
 
 @jax.tree_util.register_static
@@ -48,7 +47,15 @@ class SmoothGroup(Composed):
         """Return the number N of legs."""
         return case.num_targets
 
-    def find_minima(self, case: StartedGroup) -> Array:
+    def known_of(self, cases: InterceptGroup, plans: GroupPlan) -> Array:
+        """Return the unknowns (..., N, n) of the legs of plans."""
+        return self.leg.known_of(cases.shared, plans.legs)
+
+    def near(self, cases: InterceptGroup, plans: GroupPlan) -> tuple[SearchPlanner, StartedGroup]:
+        """Return a planner and cases, with the plans' order, by which plans are differentiated."""
+        return super().near(cases.with_choice(plans.choice), plans)
+
+    def find_minimum(self, context: StartedGroup) -> Array:
         """Minimise the costs of the legs, one after another; return the minima, (N n,)."""
 
         def minimise(leg: StartedCase, needed: Array, k: Array | int) -> Array:
@@ -57,7 +64,7 @@ class SmoothGroup(Composed):
             problem = dataclasses.replace(self.leg, solver=solver)
             return problem.guesses(problem.prepare(leg), 1)[0]
 
-        return self._drive(case, minimise)[0].ravel()
+        return self._drive(context, minimise)[0].ravel()
 
     def compose(self, point: Array, case: StartedGroup, meters: Array) -> GroupPlan:
         """Return the plan of the legs' minima `point` (N n,), with derivatives by the case."""
@@ -77,7 +84,7 @@ class SmoothGroup(Composed):
             legs: InterceptCase, needed: Array, k: Array | int
         ) -> tuple[InterceptPlan, Array]:
             def plan(leg: InterceptCase, needed: Array) -> tuple[InterceptPlan, Array]:
-                started = add_start(leg, case.start_points[k])
+                started = StartedCase(**vars(leg), known=case.known[k])
                 point = point_of(started, needed, k)
                 return self.leg.decode(point, self.leg.prepare(started)), point
 
@@ -88,16 +95,6 @@ class SmoothGroup(Composed):
         return points[:, 0], jax.tree.map(lambda leaf: leaf[0], plans)
 
 
-def smooth_near(
-    cases: InterceptGroup, plans: GroupPlan, problem: MotionProblem
-) -> tuple[SearchPlanner, StartedGroup]:
-    """Return a planner and cases by which `pj.gradient` differentiates existing plans.
-
-    Every leg is minimised from its plan, by the cost of `problem`. The order is the plans' order.
-    """
-    legs = plans.legs
-    start = problem.pack(legs.speed[..., 1:], legs.curvature[..., 1:], legs.time)
-    started = StartedGroup(
-        **vars(cases.with_choice(plans.choice)), start_points=lax.stop_gradient(start)
-    )
-    return SmoothGroup.planner(leg=SmoothIntercept(problem, _SOLVER)), started
+def smooth_legs(problem: MotionProblem) -> SmoothGroup:
+    """Return the problem that minimises every leg by the cost of `problem`."""
+    return SmoothGroup(SmoothIntercept(problem, _SOLVER))

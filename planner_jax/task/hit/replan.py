@@ -16,7 +16,7 @@ from planner_jax.ball.flight import BallState
 from planner_jax.core.checks import require_kind
 from planner_jax.core.paths import require_beginning
 from planner_jax.optimise.settings import Attempt, LbfgsConfig
-from planner_jax.planning.replan import Replanning, check_elapsed, planned_state, resolve_argument
+from planner_jax.planning.replan import Replanning, check_elapsed, planned_state, resolve_arguments
 from planner_jax.planning.replanner import TRIALS, Remaining
 from planner_jax.robot.quadrotor import add_drag, net_thrust, tangent_basis
 from planner_jax.task.hit.case import HitCase
@@ -46,11 +46,10 @@ def begin(
     """
     elapsed = check_elapsed(cases, elapsed)
     own = planned_state(previous.trajectory, elapsed)
-    head_state = resolve_argument("head_state", head_state, own, elapsed)
-    drag = resolve_argument("drag", drag, cases.drag, elapsed)
+    news = resolve_arguments(elapsed, head_state=(head_state, own), drag=(drag, cases.drag))
     require_kind("ball", ball, BallState)
     require_beginning("ball", ball, cases.batch_shape, f"the batch shape {cases.batch_shape}")
-    now = dataclasses.replace(cases, ball=ball, drag=drag, head_state=head_state)
+    now = dataclasses.replace(cases, ball=ball, **news)
     return Replanning(case=now, previous=previous, elapsed=elapsed)
 
 

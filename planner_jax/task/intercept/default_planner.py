@@ -17,7 +17,6 @@ All numbers are in the units of the case (`units`).
 
 import dataclasses
 import functools
-from collections.abc import Callable
 from typing import ClassVar, Literal, Self
 
 import jax
@@ -28,12 +27,11 @@ from planner_jax.core import protocol
 from planner_jax.core.choices import EFFORTS, require, require_one_of
 from planner_jax.core.planner import Planner
 from planner_jax.core.shapes import fit_resident
-from planner_jax.optimise.planner import SearchPlanner
 from planner_jax.task.intercept.case import InterceptCase
 from planner_jax.task.intercept.plan import InterceptPlan, explain, make_straight_plan
 from planner_jax.task.intercept.problem.motion_problem import Guess, MotionProblem
 from planner_jax.task.intercept.problem.shapes import fit_case
-from planner_jax.task.intercept.problem.smooth import SmoothIntercept, StartedCase, add_start
+from planner_jax.task.intercept.problem.smooth import SmoothIntercept
 from planner_jax.task.intercept.replan import ReplanIntercept
 from planner_jax.task.intercept.searches import (
     NARROW,
@@ -122,33 +120,9 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
         """Return the planner by which `pj.replan` updates a plan while it is being driven."""
         return ReplanIntercept(self, self.attempts[0], self.problem)
 
-    def smooth_near(
-        self, cases: InterceptCase, plans: InterceptPlan
-    ) -> tuple[SearchPlanner, StartedCase]:
-        """Return a planner and cases by which `pj.gradient` differentiates existing plans.
-
-        The planner minimises the cost by least squares. The minimisation starts at the plans, which
-        are near the minimum and are stored in the returned cases.
-        """
-        problem = self.problem
-        start = problem.pack(plans.speed[..., 1:], plans.curvature[..., 1:], plans.time)
-        return SmoothIntercept.planner(problem=problem), add_start(cases, start)
-
-    def settle(
-        self,
-        cases: InterceptCase,
-        plan_of: Callable[[Planner, InterceptCase], InterceptPlan] | None = None,
-    ) -> tuple[SearchPlanner, StartedCase]:
-        """Plan cases; return a planner and cases by which `pj.gradient` differentiates the plans.
-
-        `plan_of(self, cases)` makes the plans. By default `solve` makes them with the first entry
-        of `attempts`, the searches of this planner.
-        """
-        if plan_of is None:
-            plans = self.solve(lax.stop_gradient(cases), self.attempts[0])
-        else:
-            plans = plan_of(self, cases)
-        return self.smooth_near(cases, plans)
+    def smooth(self) -> SmoothIntercept:
+        """Return the problem whose minima are near this planner's plans."""
+        return SmoothIntercept(self.problem)
 
     def solve(self, case: InterceptCase, attempt: Search) -> InterceptPlan:
         """Plan one case by least squares from several starting points, up to the first solved plan.

@@ -1,11 +1,12 @@
 """Relaxations of an unsolved interception: limits for which the referee accepts a motion."""
 
 import dataclasses
-from typing import Any
+from collections.abc import Mapping
 
 import jax
 import numpy as np
 from jaxtyping import PyTree
+from numpy.typing import ArrayLike
 
 from planner_jax.core.checks import require_kind
 from planner_jax.core.choices import require
@@ -153,7 +154,7 @@ def _relax(case: InterceptCase, plan: InterceptPlan, verdict: PyTree) -> tuple[s
     return name, excess, {}
 
 
-def _replace(case: InterceptCase, fields: dict[str, Any]) -> InterceptCase:
+def _replace(case: InterceptCase, fields: Mapping[str, ArrayLike]) -> InterceptCase:
     dtype = np.asarray(case.time).dtype
     for path, value in fields.items():
         part, _, name = path.rpartition(".")

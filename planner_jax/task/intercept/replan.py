@@ -21,7 +21,7 @@ from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import BaseAttempt
 from planner_jax.plane.obstacles import Obstacles, move_on
 from planner_jax.plane.target import LaterPath, PlanePath
-from planner_jax.planning.replan import Replanning, check_elapsed, resolve_argument
+from planner_jax.planning.replan import ReplanAround, Replanning, check_elapsed, resolve_arguments
 from planner_jax.robot.car import pose_at
 from planner_jax.task.intercept.case import InterceptCase
 from planner_jax.task.intercept.plan import InterceptPlan
@@ -32,13 +32,12 @@ from planner_jax.task.intercept.units import enter_units, leave_units, units_of
 
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
-class ReplanIntercept(Planner[Replanning, InterceptPlan]):
+class ReplanIntercept(ReplanAround[InterceptPlan]):
     """Planner for `pj.replan` that continues interceptions from the plans that are being driven.
 
     If less than `shortest` [s] remains until the meeting, the remainder of the plan is returned.
     """
 
-    case_type: ClassVar[type] = Replanning
     is_sequential: ClassVar[bool] = True
     plan_type: ClassVar[type] = InterceptPlan
     planner: Planner[InterceptCase, InterceptPlan]  # plans from scratch, by a `Search`
@@ -51,11 +50,6 @@ class ReplanIntercept(Planner[Replanning, InterceptPlan]):
     def attempts(self) -> tuple[BaseAttempt, ...]:
         """The attempts at a new plan: from the previous plan, then by one search from scratch."""
         return (self.warm, self.search)
-
-    @property
-    def inner(self) -> Planner[InterceptCase, InterceptPlan]:
-        """The planner that plans from scratch."""
-        return self.planner
 
     def begin(
         self,
@@ -97,24 +91,21 @@ class ReplanIntercept(Planner[Replanning, InterceptPlan]):
                     shown = f"a {type(group).__name__}"
                     raise ArgumentTypeError(name, "made by pj.obstacles", shown=shown)
                 require_beginning(name, group, batch, f"the batch shape {batch}")
-        planned = (_states if cases.batch_shape else _state)(previous, elapsed)
-        given = {"start": start, "speed": speed, "curvature": curvature}
-        start, speed, curvature = (
-            resolve_argument(name, value, default, elapsed)
-            for (name, value), default in zip(given.items(), planned, strict=True)
+        pose, rate, bend = (_states if cases.batch_shape else _state)(previous, elapsed)
+        now = resolve_arguments(
+            elapsed, start=(start, pose), speed=(speed, rate), curvature=(curvature, bend)
         )
         limits = cases.limits
-        speed = np.clip(speed, limits.least_speed, limits.speed)
-        curvature = np.clip(curvature, -np.asarray(limits.curvature), limits.curvature)
+        now["speed"] = np.clip(now["speed"], limits.least_speed, limits.speed)
+        least = -np.asarray(limits.curvature)
+        now["curvature"] = np.clip(now["curvature"], least, limits.curvature)
         if movers is None:
             movers = move_on(cases.movers, elapsed)
         # If the meeting time is free, the new plan may meet the target later than the old plan.
         until = cases.time if self.problem.is_time_free else previous.time
         remainder = dataclasses.replace(
             cases,
-            start=start,
-            speed=speed,
-            curvature=curvature,
+            **now,
             target=target,
             time=np.maximum(np.asarray(until) - elapsed, 0.5 * self.shortest).astype(elapsed.dtype),
             earliest=np.maximum(np.asarray(cases.earliest) - elapsed, 0.0).astype(elapsed.dtype),
@@ -122,10 +113,6 @@ class ReplanIntercept(Planner[Replanning, InterceptPlan]):
             movers=movers,
         )
         return Replanning(case=remainder, previous=previous, elapsed=elapsed)
-
-    def fit_shapes(self, tasks: Replanning) -> Replanning:
-        """Return the tasks with cases that the planner has padded to one of few shapes."""
-        return dataclasses.replace(tasks, case=self.planner.fit_shapes(tasks.case))
 
     def load_attempt(self, attempt: Search | Warm, tasks: Replanning) -> PyTree:
         """Return settings of an attempt in the form of an argument of the compiled `solve`.

@@ -17,7 +17,7 @@ from planner_jax.core.arithmetic import Numbers, numpy_of, to_host
 from planner_jax.core.checks import require_kind
 from planner_jax.core.paths import require_beginning
 from planner_jax.optimise.chain_remainder import evaluate_pieces, fit_offsets
-from planner_jax.planning.replan import Replanning, check_elapsed, planned_state, resolve_argument
+from planner_jax.planning.replan import Replanning, check_elapsed, planned_state, resolve_arguments
 from planner_jax.planning.replanner import Remaining
 from planner_jax.robot.quadrotor import add_drag, net_thrust, tangent_basis
 from planner_jax.task.rally.case import RallyCase
@@ -62,16 +62,14 @@ def begin(
         known = to_host(boxes)
         return numpy_of(known, index).take_along_axis(known, index, axis=-2)
 
-    own = {
-        "drag": (drag, cases.drag),
-        "restitution": (restitution, cases.restitution),
-        "places": (places, later(cases.places)),
-        "place_range": (place_range, later(cases.place_range)),
-        "head_state": (head_state, planned_state(previous.trajectory, elapsed)),
-    }
-    news = {
-        name: resolve_argument(name, given, usual, elapsed) for name, (given, usual) in own.items()
-    }
+    news = resolve_arguments(
+        elapsed,
+        drag=(drag, cases.drag),
+        restitution=(restitution, cases.restitution),
+        places=(places, later(cases.places)),
+        place_range=(place_range, later(cases.place_range)),
+        head_state=(head_state, planned_state(previous.trajectory, elapsed)),
+    )
     start = 0.0 * cases.ball_time
     now = dataclasses.replace(cases, ball=ball, ball_time=start, **news)
     return Replanning(case=now, previous=previous, elapsed=elapsed)

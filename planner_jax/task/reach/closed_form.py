@@ -14,9 +14,8 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array, lax
 
-from planner_jax.optimise.efforts import NO_SEARCH
-from planner_jax.optimise.planner import Problem
-from planner_jax.optimise.settings import Attempts, Evaluation
+from planner_jax.optimise.near import Known, NearPlan
+from planner_jax.optimise.settings import Evaluation
 from planner_jax.robot.arm_clearance import clearances
 from planner_jax.robot.arm_motion import least_times
 from planner_jax.task.reach import motion
@@ -29,40 +28,39 @@ _EQUAL = 1e-4  # greatest relative difference of equal durations
 
 
 @struct.dataclass
-class StartedReach(ReachCase):
-    """A reach to plan, and the goal and duration of a known plan, which are constant."""
-
-    goal: Array  # () int32, index of the goal
-    duration: Array  # () [s]
+class StartedReach(ReachCase, Known):
+    """A reach to plan, and the index () of the goal and the duration () [s] of a known plan."""
 
 
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
-class ClosedReach(Problem):
+class ClosedReach(NearPlan):
     """The duration of a fastest or straight motion; its single variable is zero at the minimum."""
 
     case_type: ClassVar[type] = StartedReach
-    guesses_minima: ClassVar[bool] = True
-    attempts: ClassVar[Attempts] = NO_SEARCH
     own: "ReachPlanner"
 
     def prepare(self, case: StartedReach) -> StartedReach:
         """Return the case with the limits that plans use."""
         return dataclasses.replace(case, limits=self.own.strict_limits(case))
 
-    def guesses(self, context: StartedReach, num: int) -> Array:
-        """Return the minimum, (num, 1)."""
-        return jnp.zeros((num, 1), context.angles.dtype)
+    def known_of(self, cases: ReachCase, plans: "ReachPlan") -> tuple[Array, Array]:  # noqa: ARG002
+        """Return the goals and the durations of plans."""
+        return plans.goal, plans.cost
+
+    def find_minimum(self, context: StartedReach) -> Array:
+        """Return the minimum, (1,)."""
+        return jnp.zeros(1, context.angles.dtype)
 
     def _durations(self, case: StartedReach) -> tuple[Array, Array]:
         """Return the duration () of the plan's kind of motion, and whether it is a straight one."""
-        turn, limits = jnp.abs(case.goals[case.goal] - case.angles), case.limits
+        (goal, known), limits = lax.stop_gradient(case.known), case.limits
+        turn = jnp.abs(case.goals[goal] - case.angles)
         at_rest = jnp.zeros_like(turn)
         alone = least_times(turn, at_rest, limits.velocity, limits.acceleration, ends_at_rest=True)
-        points = jnp.stack([case.angles, case.goals[case.goal]])
+        points = jnp.stack([case.angles, case.goals[goal]])
         straight = jnp.sum(motion.straight_knots(points, limits)[0])
         fastest = jnp.max(alone[0])
-        known = lax.stop_gradient(case.duration)
         is_straight = jnp.abs(straight - known) < jnp.abs(fastest - known)
         duration = jnp.where(is_straight, straight, fastest)
         is_equal = jnp.abs(duration - known) <= _EQUAL * known
@@ -76,7 +74,8 @@ class ClosedReach(Problem):
     def decode(self, point: Array, context: StartedReach) -> "ReachPlan":  # noqa: ARG002
         """Return the plan of the motion to the case's goal."""
         _, is_straight = self._durations(context)
-        points = jnp.stack([context.angles, context.goals[context.goal]])
+        goal = context.known[0]
+        points = jnp.stack([context.angles, context.goals[goal]])
         both = (
             motion.quickest_knots(points[0], points[1], context.limits),
             motion.straight_knots(points, context.limits),
@@ -86,6 +85,6 @@ class ClosedReach(Problem):
         fixed, constant = lax.stop_gradient((context, knots))
         states = jnp.concatenate([fixed.angles[None], fixed.goals])
         rows = clearances(fixed.arm, fixed.scene, states)
-        plan = self.own.finish(fixed, rows, fixed.goal, *constant)
+        plan = self.own.finish(fixed, rows, goal, *constant)
         path = motion.join_knots(context.angles, knots[0], knots[1])
         return dataclasses.replace(plan, motion=path)

@@ -6,7 +6,6 @@ shortcuts in time then remove the stops and make the motion fast.
 """
 
 import dataclasses
-from collections.abc import Callable
 from typing import TYPE_CHECKING, ClassVar
 
 import jax
@@ -28,7 +27,6 @@ from planner_jax.core.protocol import (
     status_of,
 )
 from planner_jax.core.shapes import fit_resident, next_size, on_host, resize
-from planner_jax.optimise.planner import SearchPlanner
 from planner_jax.robot.arm import ArmLimits, ArmPlan
 from planner_jax.robot.arm_clearance import clearances
 from planner_jax.robot.arm_dynamics import measure_torques, stretch
@@ -38,7 +36,7 @@ from planner_jax.task.reach.case import ReachCase
 from planner_jax.task.reach.check import finite_bounds, floors_of, least_excess, levers
 
 if TYPE_CHECKING:
-    from planner_jax.task.reach.closed_form import StartedReach
+    from planner_jax.task.reach.closed_form import ClosedReach
 
 # Distances [m] between states of a motion that are checked: of plans, and of motions that shortcuts
 # make faster. If the coarse distance misses a collision, the shortcuts are repeated with the other.
@@ -266,25 +264,11 @@ class ReachPlanner(Planner):
         """Return the limits of a case, reduced by the fraction `slack`; plans keep these limits."""
         return jax.tree.map(lambda each: each * (1.0 - self.slack), case.limits)
 
-    def settle(
-        self, cases: ReachCase, plan_of: Callable[[Planner, ReachCase], ReachPlan] | None = None
-    ) -> "tuple[SearchPlanner, StartedReach]":
-        """Plan cases; return a planner and cases by which `pj.gradient` differentiates the plans.
+    def smooth(self) -> "ClosedReach":
+        """Return the problem whose minima are this planner's fastest and straight motions."""
+        from planner_jax.task.reach.closed_form import ClosedReach  # few plans need it
 
-        `plan_of(self, cases)` makes the plans. By default the first entry of `attempts` makes them.
-        """
-        from planner_jax.task.reach.closed_form import (  # few plans need it
-            ClosedReach,
-            StartedReach,
-        )
-
-        if plan_of is None:
-            plans = self.solve(lax.stop_gradient(cases), self.attempts[0])
-        else:
-            plans = plan_of(self, cases)
-        goal, duration = lax.stop_gradient((plans.goal, plans.cost))
-        started = StartedReach(**vars(cases), goal=goal, duration=duration)
-        return SearchPlanner(ClosedReach(self)), started
+        return ClosedReach(self)
 
     def _stand_still(self, case: ReachCase) -> ReachPlan:
         num, dtype = case.angles.shape[0], case.angles.dtype

@@ -63,7 +63,7 @@ class TeamCase:
         """Number N of robots."""
         return np.shape(self.head_states)[-3]
 
-    def of_robot(self, k: int, **fields: Any) -> CatchCase:
+    def of_robot(self, k: int, **fields: object) -> CatchCase:
         """Return the catch case, or the batch, of robot `k`, with other values of some fields."""
         return dataclasses.replace(self.shared, head_state=self.head_states[..., k, :, :], **fields)
 

@@ -4,7 +4,6 @@ import dataclasses
 import functools
 import itertools
 import operator
-from collections.abc import Callable
 from typing import TYPE_CHECKING, ClassVar
 
 import jax
@@ -35,8 +34,7 @@ from planner_jax.task.team.plan import TeamPlan
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
 
 if TYPE_CHECKING:
-    from planner_jax.optimise.planner import SearchPlanner
-    from planner_jax.task.team.smooth import StartedTeam
+    from planner_jax.task.team.smooth import SmoothTeam
 
 _NODES = 256  # number of nodes of the table of a robot's path
 _SPARE = 1.01  # planned least distance between robots, relative to the least distance of the case
@@ -68,23 +66,16 @@ class ExactTeam(Planner[TeamCase, TeamPlan]):
         """The planner of one robot's catches, behind its decision and its recovery."""
         return self.planner.inner.inner
 
-    def settle(
-        self,
-        cases: TeamCase,
-        plan_of: Callable[[Planner, TeamCase], TeamPlan] | None = None,
-    ) -> "tuple[SearchPlanner, StartedTeam]":
-        """Plan cases; return a planner and cases by which `pj.gradient` differentiates the plans.
+    def plan_once(self, cases: TeamCase) -> PyTree:
+        """Raise `TypeError`, because teams are planned on the host."""
+        raise NotOffered("ExactTeam works on the host, so that optimal_plan cannot plan teams")
 
-        `plan_of(self, cases)` makes the plans. `TypeError` is raised without `plan_of`, because
-        teams are planned on the host.
-        """
-        from planner_jax.task.team.smooth import smooth_near  # only gradients need it
+    def smooth(self) -> "SmoothTeam":
+        """Return the problem whose minima are near this planner's plans."""
+        from planner_jax.task.team.smooth import SmoothTeam  # only gradients need it
 
-        minimiser, _ = self.inner.settle(cases)
-        if plan_of is None:
-            raise NotOffered("ExactTeam works on the host, so that optimal_plan cannot plan teams")
-        recovery = self.planner.recovery_planner.problem
-        return smooth_near(cases, plan_of(self, cases), minimiser.problem, recovery)
+        catcher: PyTree = self.inner
+        return SmoothTeam(catcher.problem, self.planner.recovery_planner.problem)
 
     def plan_by(self, drive: Drive, cases: TeamCase) -> TeamPlan:
         """Return plans of teams, by the loop over searches `drive`."""

@@ -13,7 +13,7 @@ from typing import ClassVar
 import jax
 import jax.numpy as jnp
 from flax import struct
-from jax import Array, lax
+from jax import Array
 from jaxtyping import PyTree
 
 from planner_jax.core.origin import without_origin
@@ -21,7 +21,8 @@ from planner_jax.core.protocol import status_of
 from planner_jax.optimise.composed import Composed
 from planner_jax.optimise.implicit import implicit_point, newton_refine
 from planner_jax.optimise.multistart import minimise
-from planner_jax.optimise.planner import Problem, SearchPlanner
+from planner_jax.optimise.near import Known
+from planner_jax.optimise.planner import Problem
 from planner_jax.optimise.settings import Evaluation, LbfgsConfig
 from planner_jax.planning.replan import Replanning
 from planner_jax.recovery.planner import RecoveryProblem
@@ -44,11 +45,12 @@ _SLOPE = 1e-10  # norm of the gradient at which they end, divided by the cost
 
 
 @struct.dataclass
-class StartedTeam(TeamCase):
-    """A team to plan, and decisions and unknowns of the N robots in a known plan, as constants."""
+class StartedTeam(TeamCase, Known):
+    """A team to plan, and decisions and unknowns of the N robots in a known plan.
 
-    choices: CatchChoice  # leaves (N, M): which targets each robot catches, and when
-    start_points: Array  # (N, n), unknowns of the robots' catches
+    `known` is a pair: a `CatchChoice`, with leaves (N, M), tells which targets each robot catches
+    and when, and an array (N, n) has the unknowns of the robots' catches.
+    """
 
 
 @jax.tree_util.register_static
@@ -64,10 +66,15 @@ class SmoothTeam(Composed):
         """Return 2 N: the catches of N robots, then their recovery trajectories."""
         return 2 * case.num_robots
 
-    def find_minima(self, case: StartedTeam) -> Array:
+    def known_of(self, cases: TeamCase, plans: TeamPlan) -> tuple[CatchChoice, Array]:
+        """Return decisions and unknowns of the robots' plans, of one team or a batch."""
+        robots = dataclasses.replace(plans.robots, origin=None)
+        return robots.choice, _encode(self.catches, cases, robots)
+
+    def find_minimum(self, context: StartedTeam) -> Array:
         """Minimise the costs of all robots' catches and recoveries; return the minima, (n,)."""
-        own = robots_of(case)
-        points = jax.vmap(functools.partial(_minimise, self.catches))(own, case.start_points)
+        own = robots_of(context, context.known[0])
+        points = jax.vmap(functools.partial(_minimise, self.catches))(own, context.known[1])
         cases = recovery_cases(own, jax.vmap(functools.partial(_decode, self.catches))(own, points))
 
         def recover(case: PyTree) -> Array:
@@ -78,8 +85,8 @@ class SmoothTeam(Composed):
 
     def compose(self, point: Array, case: StartedTeam, meters: Array) -> TeamPlan:
         """Return the plan of the minima `point` (n,), with derivatives by the case."""
-        own, num = robots_of(case), case.num_robots
-        size = case.start_points.size
+        own, num = robots_of(case, case.known[0]), case.num_robots
+        size = case.known[1].size
         of_catches, of_recovery = (each.reshape(num, -1) for each in jnp.split(point, [size]))
         plans = _plan_all(self.catches, own, of_catches, meters[:num])
         recoveries = _plan_all(self.recovery, recovery_cases(own, plans), of_recovery, meters[num:])
@@ -103,13 +110,13 @@ class SmoothTeam(Composed):
         )
 
 
-def robots_of(case: StartedTeam) -> CatchCase:
-    """Return the catch cases of the N robots of one team, with a leading axis N."""
+def robots_of(case: TeamCase, choices: CatchChoice) -> CatchCase:
+    """Return the N robots' catch cases with their `choices`, all leaves with a leading axis N."""
     team = dataclasses.replace(case, shared=without_origin(case.shared))
     if case.num_robots > 1:
         team = with_stricter_limits(team)
     own = [
-        team.of_robot(k).with_choice(jax.tree.map(lambda leaf: leaf[k], case.choices))  # noqa: B023
+        team.of_robot(k).with_choice(jax.tree.map(lambda leaf: leaf[k], choices))  # noqa: B023
         for k in range(case.num_robots)
     ]
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *own)
@@ -139,27 +146,14 @@ def _plan_all(problem: Problem, cases: PyTree, points: Array, meters: Array) -> 
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _encode(catches: CatchProblem, started: StartedTeam, robots: CatchPlan) -> Array:
+def _encode(catches: CatchProblem, cases: TeamCase, robots: CatchPlan) -> Array:
     """Return the unknowns (N, n) of the robots' known plans, or (B, N, n) of a batch."""
 
     def of_robot(case: CatchCase, plan: CatchPlan) -> Array:
         task = Replanning(case, plan, jnp.zeros_like(case.gravity))
         return start_from(catches, task, catches.prepare(case))
 
-    def of_team(started: StartedTeam, robots: CatchPlan) -> Array:
-        return jax.vmap(of_robot)(robots_of(started), robots)
+    def of_team(case: TeamCase, robots: CatchPlan) -> Array:
+        return jax.vmap(of_robot)(robots_of(case, robots.choice), robots)
 
-    return (of_team if started.batch_shape == () else jax.vmap(of_team))(started, robots)
-
-
-def smooth_near(
-    cases: TeamCase, plans: TeamPlan, catches: CatchProblem, recovery: RecoveryProblem
-) -> tuple[SearchPlanner, StartedTeam]:
-    """Return a planner and cases by which `pj.gradient` differentiates existing plans."""
-    robots = dataclasses.replace(plans.robots, origin=None)
-    none = jnp.zeros((*cases.head_states.shape[:-2], 0), cases.head_states.dtype)
-    started = StartedTeam(**vars(cases), choices=robots.choice, start_points=none)
-
-    points = _encode(catches, started, robots)
-    started = dataclasses.replace(started, start_points=lax.stop_gradient(points))
-    return SmoothTeam.planner(catches=catches, recovery=recovery), started
+    return (of_team if cases.batch_shape == () else jax.vmap(of_team))(cases, robots)

@@ -12,27 +12,25 @@ from typing import TYPE_CHECKING, ClassVar, NamedTuple
 import jax
 import jax.numpy as jnp
 from flax import struct
-from jax import Array, lax
+from jax import Array
 from jaxtyping import PyTree
 
-from planner_jax.optimise.efforts import NO_SEARCH
 from planner_jax.optimise.levenberg import LevenbergConfig, Model, least_squares
-from planner_jax.optimise.planner import Problem
+from planner_jax.optimise.near import Known, NearPlan
 from planner_jax.optimise.preconditioner import positive_inverse
-from planner_jax.optimise.settings import Attempts, Curvature, Evaluation
+from planner_jax.optimise.settings import Curvature, Evaluation
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.plan import BlockPlan
 from planner_jax.task.block.problem.flight import Flight, flight_of
+from planner_jax.task.block.search.least_squares import encode
 
 if TYPE_CHECKING:
     from planner_jax.task.block.default_planner import OnlineBlock
 
 
 @struct.dataclass
-class StartedBlock(BlockCase):
-    """A block to plan, and the unknowns of a known plan, from which least squares start."""
-
-    start_point: Array  # (n,) unknowns, treated as constant when the case is differentiated
+class StartedBlock(BlockCase, Known):
+    """A block to plan, and the unknowns (n,) of a known plan, from which least squares start."""
 
 
 class _Context(NamedTuple):
@@ -42,7 +40,7 @@ class _Context(NamedTuple):
 
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
-class SmoothBlock(Problem):
+class SmoothBlock(NearPlan):
     """The cost that the planner `online` minimises by least squares, from a known plan.
 
     All samples of a motion contribute to the cost. The planner itself neglects all samples but the
@@ -50,9 +48,7 @@ class SmoothBlock(Problem):
     """
 
     case_type: ClassVar[type] = StartedBlock
-    guesses_minima: ClassVar[bool] = True
     needs_double: ClassVar[bool] = True
-    attempts: ClassVar[Attempts] = NO_SEARCH
     own: "OnlineBlock"
     solver: LevenbergConfig = LevenbergConfig(200, ease=0.1, settled=6, tolerance=0.0)
 
@@ -60,15 +56,14 @@ class SmoothBlock(Problem):
         """Return a case, and the times at which the ball may be met."""
         return _Context(case, flight_of(case))
 
-    def guesses(self, context: _Context, num: int) -> Array:
-        """Minimise the cost, from the plan stored in the case; return the n unknowns, (num, n).
+    def known_of(self, cases: BlockCase, plans: BlockPlan) -> Array:
+        """Return the unknowns (n,) of a plan, or (B, n) of a batch."""
+        return (encode if cases.batch_shape == () else jax.vmap(encode))(plans)
 
-        All rows are equal, because there is only one stored plan.
-        """
-        fixed = lax.stop_gradient(context)
-        model = lambda x: self._model(x, fixed)  # noqa: E731
-        end = least_squares(model, fixed.case.start_point, self.solver)
-        return jnp.broadcast_to(end.point, (num, *end.point.shape))
+    def find_minimum(self, context: _Context) -> Array:
+        """Minimise the cost, from the plan stored in the case; return the n unknowns, (n,)."""
+        model = lambda x: self._model(x, context)  # noqa: E731
+        return least_squares(model, context.case.known, self.solver).point
 
     def _model(self, point: Array, context: _Context) -> Model:
         return self.own.model(point, context.case, context.flight)

@@ -6,12 +6,11 @@ from typing import ClassVar
 import jax
 import jax.numpy as jnp
 from flax import struct
-from jax import Array, lax
+from jax import Array
 
-from planner_jax.optimise.efforts import NO_SEARCH
 from planner_jax.optimise.levenberg import LevenbergConfig, Model, least_squares
-from planner_jax.optimise.planner import Problem
-from planner_jax.optimise.settings import Attempts, Evaluation
+from planner_jax.optimise.near import Known, NearPlan
+from planner_jax.optimise.settings import Evaluation
 from planner_jax.plane.distance_field import DistanceField
 from planner_jax.plane.obstacles import join_obstacles
 from planner_jax.task.intercept.case import InterceptCase
@@ -25,10 +24,8 @@ _EARLY = 80.0
 
 
 @struct.dataclass
-class StartedCase(InterceptCase):
-    """An interception to plan, and the unknowns of a known plan, from which least squares start."""
-
-    start_point: Array  # (n,) unknowns, treated as constant when the case is differentiated
+class StartedCase(InterceptCase, Known):
+    """An interception to plan, and the unknowns (n,) from which least squares start."""
 
 
 @struct.dataclass
@@ -41,13 +38,11 @@ class _Context:
 
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
-class SmoothIntercept(Problem):
+class SmoothIntercept(NearPlan):
     """The cost of a `MotionProblem`, minimised from a plan; used by `pj.gradient`."""
 
     case_type: ClassVar[type] = StartedCase
     adjoint: ClassVar[str] = "whole"
-    guesses_minima: ClassVar[bool] = True
-    attempts: ClassVar[Attempts] = NO_SEARCH
     problem: MotionProblem = MotionProblem()
     solver: LevenbergConfig = LevenbergConfig(2000, settled=12, tolerance=0.0)
 
@@ -69,15 +64,14 @@ class SmoothIntercept(Problem):
             ),
         )
 
-    def guesses(self, context: _Context, num: int) -> Array:
-        """Minimise the cost, from the plan stored in the case; return the n unknowns, (num, n).
+    def known_of(self, cases: InterceptCase, plans: InterceptPlan) -> Array:  # noqa: ARG002
+        """Return the unknowns (n,) of a plan, or (B, n) of a batch."""
+        return self.problem.pack(plans.speed[..., 1:], plans.curvature[..., 1:], plans.time)
 
-        All rows are equal, because there is only one stored plan.
-        """
-        fixed = lax.stop_gradient(context)
-        start = self.problem.enter_units(fixed.case.start_point, fixed.units)
-        end = least_squares(lambda x: self._exact_model(x, fixed), start, self.solver)
-        return jnp.broadcast_to(end.point, (num, *end.point.shape))
+    def find_minimum(self, context: _Context) -> Array:
+        """Minimise the cost, from the plan stored in the case; return the n unknowns, (n,)."""
+        start = self.problem.enter_units(context.case.known, context.units)
+        return least_squares(lambda x: self._exact_model(x, context), start, self.solver).point
 
     def _model(self, point: Array, context: _Context) -> Model:
         problem = self.problem
@@ -102,8 +96,3 @@ class SmoothIntercept(Problem):
         problem = self.problem
         plan = problem.decode(context.moving, point, jnp.zeros((), jnp.int32))
         return leave_units(plan, context.case, context.units, is_early=problem.meet == "early")
-
-
-def add_start(case: InterceptCase, point: Array) -> StartedCase:
-    """Add to a case, or a batch, the unknowns `point` from which least squares start."""
-    return StartedCase(**vars(case), start_point=lax.stop_gradient(point))
