@@ -27,7 +27,8 @@ Classes for parts of cases and plans:
   `target_at`; in the plane: `TurningPath`, `PolynomialPath`
 * `ball.fit`: estimates and predicts the flight of a ball from a recording
 * obstacles of a car: `Obstacles`, made by `obstacles`
-* trajectories: `PiecewisePolynomial`, `evaluate`
+* trajectories: `PiecewisePolynomial`, `evaluate`, `snap_energy`; `minco`, the spline of least
+  energy for waypoints and durations of its pieces; `durations_of`, durations as free variables
 * base classes and settings for planners and tasks that a user writes: `Planner`, `Plan`, `Attempt`,
   `outcome`, `Problem`, `SearchPlanner`, `pending`, `LbfgsConfig`, `NewtonConfig`, `Verdict`, `Task`
 

@@ -27,6 +27,7 @@ from planner_jax.ball.flight import BallState
 from planner_jax.ball.linear_drag import linear_drag_flight
 from planner_jax.cost import penalty
 from planner_jax.plane.target import PolynomialPath, TurningPath
+from planner_jax.trajectory.minco import minco
 
 TIME, GRAVITY, DRAG, WIDTH = 0.7, 9.81, 0.3, 0.2
 POS, VEL = np.array([0.3, -0.2, 2.0]), np.array([3.0, -4.0, 12.0])  # a speed of 13 m/s
@@ -164,6 +165,7 @@ THREE = np.zeros(3)
         (flight.solve_impact, (np.ones((2, 3)), np.zeros((2, 3)), 0.5)),
         (lambda values: penalty.greatest_by_parabolas(values, NODES), (np.ones((6, 1)),)),
         (penalty.greatest_by_tangents, (np.ones(6), np.ones((6, 1)), 0.1)),
+        (minco, (np.eye(3), np.eye(3), np.ones((1, 3)), np.ones(1))),
     ],
 )
 def test_shapes_that_would_broadcast_are_refused(function, arguments):
