@@ -35,7 +35,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from planner_jax.baselines.intercept.bezier import BezierCurve, bernstein, hodograph
 from planner_jax.baselines.intercept.qp import solve_qp
 from planner_jax.baselines.intercept.speed import (
     SPEED_PLANNERS,
@@ -50,6 +49,7 @@ from planner_jax.benchmarks.qp_peers import INSTALL, PEERS, is_installed
 from planner_jax.benchmarks.run import Bench, argument_parser, at_least, begin
 from planner_jax.benchmarks.speed_problems import speed_problems
 from planner_jax.core.protocol import Status
+from planner_jax.trajectory.bezier import BezierCurve, bernstein, hodograph
 
 PIECES = (10, 20)  # Numbers of polynomial pieces of the planned curve.
 CONSTANT = "constant speed"

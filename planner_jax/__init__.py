@@ -26,8 +26,10 @@ Classes for parts of cases and plans:
 * targets in space: `BallState`, `fly`, `BallPath`, `HarmonicPath`, `table_path`, `predict_path`,
   `target_at`; in the plane: `TurningPath`, `PolynomialPath`
 * `ball.fit`: estimates and predicts the flight of a ball from a recording
+* `penalties`: the penalties of the published planners, as pure functions
 * obstacles of a car: `Obstacles`, made by `obstacles`
-* trajectories: `PiecewisePolynomial`, `evaluate`
+* trajectories: `PiecewisePolynomial`, `evaluate`, `snap_energy`; `minco`, the spline of least
+  energy for waypoints and durations of its pieces; `durations_of`, durations as free variables
 * base classes and settings for planners and tasks that a user writes: `Planner`, `Plan`, `Attempt`,
   `outcome`, `Problem`, `SearchPlanner`, `pending`, `LbfgsConfig`, `NewtonConfig`, `Verdict`, `Task`
 

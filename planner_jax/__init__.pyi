@@ -1,5 +1,6 @@
 from . import ball as ball
 from . import live as live
+from . import penalties as penalties
 from .ball.flight import BallState as BallState
 from .ball.flight import fly as fly
 from .ball.prediction import predict_path as predict_path
@@ -67,5 +68,8 @@ from .task import intercept as intercept
 from .task import rally as rally
 from .task import reach as reach
 from .task import team as team
+from .trajectory.minco import durations_of as durations_of
+from .trajectory.minco import minco as minco
 from .trajectory.polynomial import PiecewisePolynomial as PiecewisePolynomial
 from .trajectory.polynomial import evaluate as evaluate
+from .trajectory.polynomial import snap_energy as snap_energy

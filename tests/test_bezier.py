@@ -3,8 +3,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from planner_jax.baselines.intercept import bezier
-from planner_jax.baselines.intercept.bezier import BezierCurve, bernstein, hodograph
+from planner_jax.trajectory import bezier
+from planner_jax.trajectory.bezier import BezierCurve, bernstein, hodograph
 
 PIECES, DEGREE, HORIZON = 4, 5, 3.0
 POINTS = np.random.default_rng(0).normal(size=(PIECES, DEGREE + 1))

@@ -5,11 +5,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import planner_jax as pj
-from planner_jax.baselines.catch.paper import steep_hinge, thrust_band_excess
 from planner_jax.cost import quadrotor
-from planner_jax.cost.penalty import join_trapezoid_weights, smooth_hinge, trapezoid_weights
-from planner_jax.task.hit.context import apex_excess, hitting_speed_excess
+from planner_jax.cost.penalty import (
+    apex_excess,
+    hitting_speed_excess,
+    join_trapezoid_weights,
+    smooth_hinge,
+    trapezoid_weights,
+)
+from planner_jax.penalties import steep_hinge, thrust_band_excess
 
 WIDTH = 0.1
 GRAVITY = 9.8
@@ -94,24 +98,19 @@ def test_joined_weights_are_those_of_the_pieces_with_shared_ends_added():
     np.testing.assert_allclose(join_trapezoid_weights(4, shares), separate, rtol=1e-15)
 
 
-def limits():
-    values = {"speed": 5.0, "acceleration": 15.0, "body_rate": 4.0, "min_height": 0.25}
-    return pj.QuadrotorLimits(**{name: np.array(value) for name, value in values.items()})
-
-
 # Functions that scale a motion by k and return how far it exceeds a limit: 0 at k = 1.
 ACC, JERK = np.array([10.0, -5.0, 10.0]), np.array([0.0, 4.0 * GRAVITY, 0.0])
 AT_LIMIT = {
-    "speed": lambda k: quadrotor.speed_excess(k * np.array([3.0, 0.0, 4.0]), limits()),
-    "acceleration": lambda k: quadrotor.acceleration_excess(k * ACC, limits()),
+    "speed": lambda k: quadrotor.speed_excess(k * np.array([3.0, 0.0, 4.0]), 5.0),
+    "acceleration": lambda k: quadrotor.acceleration_excess(k * ACC, 15.0),
     # 2 sin^2(theta / 2) = 1 - cos(theta) = k^2 / 2, and the limit is 60 degrees.
     "tilt": lambda k: quadrotor.tilt_excess(
         3.0 * jnp.array([jnp.sqrt(k**2 - 0.25 * k**4), 0.0, 1.0 - 0.5 * k**2])
         - np.array([0.0, 0.0, GRAVITY]),
         GRAVITY,
-        limits().replace(max_tilt=np.array(np.pi / 3.0)),
+        np.pi / 3.0,
     ),
-    "body rate": lambda k: quadrotor.body_rate_excess(np.zeros(3), k * JERK, GRAVITY, limits()),
+    "body rate": lambda k: quadrotor.body_rate_excess(np.zeros(3), k * JERK, GRAVITY, 4.0),
 }
 
 
@@ -125,7 +124,7 @@ def test_the_excess_is_zero_at_the_limit_and_the_square_of_the_share_less_one(na
 
 
 def test_the_ground_is_exceeded_in_metres_from_below():
-    excess = quadrotor.ground_excess(np.array([1.0, 0.25, 0.0, -1.0]), limits())
+    excess = quadrotor.ground_excess(np.array([1.0, 0.25, 0.0, -1.0]), 0.25)
     np.testing.assert_allclose(excess, [-0.75, 0.0, 0.25, 1.25])
 
 
@@ -134,9 +133,8 @@ def test_gradients_are_finite_at_zero_speed_in_hover_and_near_free_fall():
     fall = np.array([0.0, 0.0, -GRAVITY], np.float32)
 
     def total(vel, acc, jerk):
-        bounds = limits()
-        squares = [quadrotor.speed_excess(vel, bounds), quadrotor.acceleration_excess(acc, bounds)]
-        squares.append(quadrotor.body_rate_excess(acc, jerk, GRAVITY, bounds))
+        squares = [quadrotor.speed_excess(vel, 5.0), quadrotor.acceleration_excess(acc, 15.0)]
+        squares.append(quadrotor.body_rate_excess(acc, jerk, GRAVITY, 4.0))
         return sum(squares) + sum(map(quadrotor.relative, squares))
 
     gradient = jax.jit(jax.grad(total, argnums=(0, 1, 2)))

@@ -1,4 +1,4 @@
-"""One table of pure functions of balls, of targets in the plane and of costs.
+"""One table of pure functions of balls, of targets in the plane, of penalties and of costs.
 
 Each has a value in closed form, which it returns compiled or not, of arrays on the host or on the
 device. Its derivatives agree with finite differences, and its results have its arguments' types.
@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from absl.testing import parameterized
 
+from planner_jax import penalties
 from planner_jax.ball import flight
 from planner_jax.ball.estimation import (
     EkfModel,
@@ -27,6 +28,7 @@ from planner_jax.ball.flight import BallState
 from planner_jax.ball.linear_drag import linear_drag_flight
 from planner_jax.cost import penalty
 from planner_jax.plane.target import PolynomialPath, TurningPath
+from planner_jax.trajectory.minco import minco
 
 TIME, GRAVITY, DRAG, WIDTH = 0.7, 9.81, 0.3, 0.2
 POS, VEL = np.array([0.3, -0.2, 2.0]), np.array([3.0, -4.0, 12.0])  # a speed of 13 m/s
@@ -67,6 +69,16 @@ def observe(pos, vel, seen):
     return ekf_update(ekf_init(pos, vel, pos_std=0.1, vel_std=1.0), seen, MODEL).mean
 
 
+def both(function, *numbers):  # the usual form and the form in SI units, or as printed
+    return lambda *arrays: tuple(function(*arrays, *numbers, flag) for flag in (False, True))
+
+
+def hinges(x):
+    smooth = penalties.smooth_hinge(x, WIDTH)
+    return smooth, *(penalties.steep_hinge(x, WIDTH, printed) for printed in (True, False))
+
+
+CORNER = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0]])
 DECAY = np.exp(-DRAG * TIME)
 FALLING = np.array([2.0, 1.0, -3.0])
 ROWS = {
@@ -85,11 +97,6 @@ ROWS = {
         lambda pos, vel: flight.rk4_step(BallState(pos, vel), TIME, 0.0, GRAVITY),
         (POS, VEL),
         BallState(POS + VEL * TIME + 0.5 * DOWN * TIME**2, VEL + DOWN * TIME),
-    ),
-    "apex": Row(
-        lambda pos, vel: flight.drag_free_apex(BallState(pos, vel), GRAVITY),
-        (POS, VEL),
-        2.0 + 144.0 / (2.0 * GRAVITY),
     ),
     "impact": Row(
         lambda before, after: flight.solve_impact(before, after, 0.5),
@@ -110,13 +117,87 @@ ROWS = {
         (np.array([[1.0, 2.0], [3.0, 4.0], [0.5, 1.0]]), np.array(2.0)),
         np.array([9.0, 14.0]),
     ),
-    "below a limit": Row(lambda x: penalty.smooth_hinge(x, WIDTH), (np.array(-0.3),), 0.0),
-    "above a limit": Row(lambda x: penalty.smooth_hinge(x, WIDTH), (np.array(0.5),), 0.4),
-    "at a limit": Row(  # (mu - x / 2) (x / mu)^3 at x = mu / 2
-        lambda x: penalty.smooth_hinge(x, WIDTH), (np.array(0.1),), 0.75 * WIDTH / 8.0
-    ),
+    "below a limit": Row(hinges, (np.array(-0.3),), (0.0, 0.0, 0.0)),
+    "above a limit": Row(hinges, (np.array(0.5),), (0.4, 28.133, 28.169)),
+    # (mu - x / 2) (x / mu)^3 and x^3 at x = mu / 2
+    "at a limit": Row(hinges, (np.array(0.1),), (0.75 * WIDTH / 8.0, 1e-3, 1e-3)),
     "parabola": Row(after_parabola, (np.array(2.6), np.array(2.0)), 2.6**2 / 8.0),
     "roof": Row(after_lines, (np.array(1.4), np.array(3.0)), 1.4),
+}
+# Excesses and costs of `pj.penalties`, in both forms where there are two.
+ROWS |= {
+    "speed": Row(both(penalties.speed_excess, 10.0), (VEL,), (0.69, 69.0)),
+    "acceleration limit": Row(both(penalties.acceleration_excess, 10.0), (VEL,), (0.69, 69.0)),
+    "body rate": Row(  # at hover, jerk / gravity = 4 rad/s
+        both(penalties.body_rate_excess, GRAVITY, 2.0),
+        (np.zeros(3), np.array([0.0, 4.0 * GRAVITY, 0.0])),
+        (3.0, 12.0),
+    ),
+    "thrust": Row(  # 5 m/s^2
+        both(penalties.thrust_excess, GRAVITY, 4.0, 10.0),
+        (DOWN + [3.0, 0.0, 4.0],),
+        ((1.0 - 25.0 / 16.0, -0.75), (-9.0, -75.0)),
+    ),
+    "thrust band": Row(
+        lambda acc: penalties.thrust_band_excess(acc, GRAVITY, 4.0, 10.0),
+        (DOWN + [3.0, 0.0, 4.0],),
+        (5.0 - 4.0) * (5.0 - 10.0),
+    ),
+    "tilt": Row(  # 60 degrees
+        lambda acc: penalties.tilt_excess(acc, GRAVITY, np.pi / 6.0),
+        (DOWN + [np.sqrt(3.0), 0.0, 1.0],),
+        0.5 / (1.0 - np.sqrt(0.75)) - 1.0,
+    ),
+    "ground": Row(both(penalties.ground_excess, 0.5), (np.array(0.1),), (0.4, 0.24)),
+    "trapezoid": Row(
+        penalties.trapezoid, (np.array([1.0, 2.0, 4.0]), np.array(0.5)), 0.25 * (0.5 + 2.0 + 2.0)
+    ),
+    "time": Row(lambda tau: penalties.time_cost(tau, 10.0), (np.log([2.0, 3.0]),), 50.0),
+    "apex": Row(
+        both(penalties.apex, GRAVITY),
+        (POS, VEL),
+        (2.0 + 144.0 / (2.0 * GRAVITY), 2.0 + 9.0 / (2.0 * GRAVITY)),
+    ),
+    "apex limits": Row(
+        both(penalties.apex_excess, 2.0, 6.0),
+        (np.array(3.0),),
+        (np.array([-0.5, -0.5]), np.array([-1.0, -3.0])),
+    ),
+    "hitting speed": Row(
+        both(penalties.hitting_speed_excess),
+        (VEL, np.array([2.0, 8.0, 6.0])),
+        (np.array([1.25, -0.75, 3.0]), np.array([1.0, -4.0, 6.0])),
+    ),
+    "net distance": Row(
+        lambda pos, axis, ball: penalties.net_distance(pos, axis, ball, 0.5),
+        (np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, 1.0]), np.array([0.3, 0.4, 1.5])),
+        0.5,
+    ),
+    "net angle": Row(
+        lambda axis, vel: penalties.net_angle_excess(axis, vel, np.pi / 3.0),
+        (np.array([0.0, 0.0, 1.0]), np.array([3.0, 0.0, -4.0])),
+        0.5 - 0.8,
+    ),
+    "obstacles": Row(
+        both(penalties.obstacle_cost, 0.5, 0.1), (np.array([0.1, 0.6, 0.3]),), (20.0, 21.0)
+    ),
+    "curvature": Row(
+        both(penalties.curvature_cost, 0.5, 1.0),
+        (CORNER,),
+        ((0.5 * np.pi - 0.5) ** 2, 0.5 * np.pi - 0.5),
+    ),
+    "smoothness": Row(lambda points: penalties.smoothness_cost(points, 2.0), (CORNER,), 0.5),
+    # The station t^2 during 2 s, with two pieces.
+    "speed energy": Row(
+        lambda points: (penalties.speed_energy(points, 2.0), penalties.end_error(points, 3.0)),
+        (np.array([[0.0, 0.0, 1.0], [1.0, 2.0, 4.0]]),),
+        (8.0, 1.0),
+    ),
+    "spline": Row(
+        lambda points: penalties.spline_cost(penalties.polyline_length(points), 2.0),
+        (np.array([[0.0, 0.0], [3.0, 4.0], [3.0, 9.0]]),),
+        3.0,
+    ),
 }
 each = parameterized.named_parameters(*((name, name) for name in ROWS))
 
@@ -154,6 +235,41 @@ class TestPureFunctions(chex.TestCase):
 
 
 THREE = np.zeros(3)
+# Points at which a length is zero or a limit is met: the ball in the net, free fall, standstill.
+EDGES = {
+    "net distance": (THREE, THREE, THREE),
+    "net angle": (THREE, THREE),
+    "body rate": (DOWN, THREE),
+    "thrust": (DOWN,),
+    "thrust band": (DOWN,),
+    "tilt": (DOWN,),
+    "curvature": (np.zeros((4, 2)),),
+    "spline": (np.zeros((3, 6)),),
+    "obstacles": (np.array([0.5, 0.5, 0.5]),),
+    "above a limit": (np.array(0.0),),
+    "at a limit": (np.array(WIDTH),),
+}
+
+
+@pytest.mark.parametrize("name", EDGES)
+def test_gradients_are_finite_where_lengths_vanish_or_limits_are_met(name):
+    total = lambda arrays: sum(map(jnp.sum, jax.tree.leaves(ROWS[name].function(*arrays))))  # noqa: E731
+    value, slopes = jax.jit(jax.value_and_grad(total))(as_type(EDGES[name], np.float32))
+    assert all(np.isfinite(leaf).all() for leaf in (value, *slopes))
+
+
+def test_penalties_and_their_slopes_are_zero_within_limits():
+    straight = np.array([[0.0, 0.0], [1.0, 0.5], [2.0, 1.0]], np.float32)
+
+    @jax.jit
+    @jax.value_and_grad
+    def total(parts):
+        x, distances, points = parts
+        cost = penalties.obstacle_cost(distances, 0.5) + penalties.curvature_cost(points, 0.1)
+        return sum(hinges(x)) + cost + penalties.smoothness_cost(points)
+
+    value, slopes = total((np.float32(-0.1), np.float32([0.6, 2.0]), straight))
+    assert value == 0.0 and not any(map(np.any, slopes))
 
 
 @pytest.mark.parametrize(
@@ -164,6 +280,7 @@ THREE = np.zeros(3)
         (flight.solve_impact, (np.ones((2, 3)), np.zeros((2, 3)), 0.5)),
         (lambda values: penalty.greatest_by_parabolas(values, NODES), (np.ones((6, 1)),)),
         (penalty.greatest_by_tangents, (np.ones(6), np.ones((6, 1)), 0.1)),
+        (minco, (np.eye(3), np.eye(3), np.ones((1, 3)), np.ones(1))),
     ],
 )
 def test_shapes_that_would_broadcast_are_refused(function, arguments):

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from derivatives import assert_gradient_matches_differences
 
-from planner_jax.baselines.intercept.bezier import bernstein, hodograph
 from planner_jax.baselines.intercept.speed import (
     SPEED_PLANNERS,
     plan_speed,
@@ -17,6 +16,7 @@ from planner_jax.baselines.intercept.speed import (
 from planner_jax.benchmarks.qp_peers import clarabel_solver
 from planner_jax.benchmarks.speed_problems import speed_problems
 from planner_jax.core.protocol import Status
+from planner_jax.trajectory.bezier import bernstein, hodograph
 
 NUM = 32
 TRAPEZOID = SPEED_PLANNERS["trapezoid"]

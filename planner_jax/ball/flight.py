@@ -130,7 +130,7 @@ def drag_free_apex(ball: BallState, gravity: Array) -> Array:
     """Return the greatest future height [m] of a drag-free ball [Yu2023bat, eq. 22].
 
     The height is z + v_z^2 / (2 g) for a rising ball, and its present height z for a falling ball.
-    The paper prints v_z^2 / (2 g) alone.
+    The paper prints v_x for v_z.
     """
     return ball.pos[2] + jnp.maximum(ball.vel[2], 0.0) ** 2 / (2.0 * gravity)
 

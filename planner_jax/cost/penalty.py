@@ -90,3 +90,13 @@ def greatest_by_tangents(values: Array, slopes: Array, step: Array) -> Array:
     there = (bend > 0.0) & (place > 0.0) & (place < bend * step)
     place, bend = jnp.where(there, place, 0.0), jnp.where(there, bend, 1.0)
     return jnp.maximum(jnp.max(values), jnp.max(first + slopes[:-1] * place / bend))
+
+
+def apex_excess(apex: Array, min_apex: Array, max_apex: Array) -> Array:
+    """Return relative excesses 1 - H / H_min, H / H_max - 1 of the apex H [Yu2023bat, eq. 21]."""
+    return jnp.stack([1.0 - apex * reciprocal(min_apex), apex * reciprocal(max_apex) - 1.0])
+
+
+def hitting_speed_excess(vel: Array, limit: Array) -> Array:
+    """Return v_j^2 / v_max,j^2 - 1, (3,), of velocity v and limit v_max [Yu2023bat, eq. 24a]."""
+    return (vel * reciprocal(limit)) ** 2 - 1.0

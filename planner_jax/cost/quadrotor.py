@@ -37,28 +37,24 @@ def _size_squared(vector: Components) -> Array:
     return x * x + y * y + z * z
 
 
-def speed_excess(vel: Components, limits: QuadrotorLimits) -> Array:
+def speed_excess(vel: Components, most: Array) -> Array:
     """Return |v|^2 / v_max^2 - 1 for velocities (..., 3) [m/s] [Yu2023bat, eq. 18a]."""
-    return _size_squared(vel) * reciprocal(limits.speed) ** 2 - 1.0
+    return _size_squared(vel) * reciprocal(most) ** 2 - 1.0
 
 
-def acceleration_excess(acc: Components, limits: QuadrotorLimits) -> Array:
-    """Return |a|^2 / a_max^2 - 1 [Yu2023bat, eq. 18a], or -1 if acceleration has no limit."""
-    if limits.acceleration is None:
-        return 0.0 * components(acc)[0] - 1.0
-    return _size_squared(acc) * reciprocal(limits.acceleration) ** 2 - 1.0
+def acceleration_excess(acc: Components, most: Array) -> Array:
+    """Return |a|^2 / a_max^2 - 1 for accelerations (..., 3) [m/s^2] [Yu2023bat, eq. 18a]."""
+    return _size_squared(acc) * reciprocal(most) ** 2 - 1.0
 
 
-def body_rate_excess(
-    acc: Components, jerk: Components, gravity: Array, limits: QuadrotorLimits
-) -> Array:
+def body_rate_excess(acc: Components, jerk: Components, gravity: Array, most: Array) -> Array:
     """Return |omega|^2 / omega_max^2 - 1 for the body rates omega [rad/s] [Yu2023bat, eq. 18a]."""
-    return body_rate_squared(acc, jerk, gravity) * reciprocal(limits.body_rate) ** 2 - 1.0
+    return body_rate_squared(acc, jerk, gravity) * reciprocal(most) ** 2 - 1.0
 
 
-def ground_excess(height: Array, limits: QuadrotorLimits) -> Array:
+def ground_excess(height: Array, least: Array) -> Array:
     """Return z_min - z [m] for heights z [m] [Yu2023catch, eq. 28, without its square]."""
-    return limits.min_height - height
+    return least - height
 
 
 def limits_along(
@@ -86,16 +82,15 @@ def thrust_excess(
     return 1.0 - squared * reciprocal(least) ** 2, squared * reciprocal(most) ** 2 - 1.0
 
 
-def tilt_excess(acc: Components, gravity: Array, limits: QuadrotorLimits) -> Array:
+def tilt_excess(acc: Components, gravity: Array, most: Array) -> Array:
     """Return sin^2(theta / 2) / sin^2(theta_max / 2) - 1 for the tilt theta of the thrust.
 
     The cosine of the tilt is  z_z = tau_z / |tau| , and  2 sin^2(theta / 2) = 1 - z_z .
     """
-    assert limits.max_tilt is not None
     x, y, z = components(acc)
     up = z + gravity
     cosine = up * inverse_sqrt(at_least(_size_squared((x, y, up)), 1e-4))
-    return (1.0 - cosine) * reciprocal(1.0 - jnp.cos(limits.max_tilt)) - 1.0
+    return (1.0 - cosine) * reciprocal(1.0 - jnp.cos(most)) - 1.0
 
 
 _OVERTURN_NODES = 4  # intervals of a piece, at whose ends `overturn_excess` evaluates the motion
@@ -183,7 +178,7 @@ def _load(motion: Motion, limits: QuadrotorLimits) -> Motion:
 
 def _rate_excess(motion: Motion, gravity: Array, limits: QuadrotorLimits) -> tuple[Array]:
     load = _load(motion, limits)
-    return (body_rate_excess(load.acc, load.jerk, gravity, limits),)
+    return (body_rate_excess(load.acc, load.jerk, gravity, limits.body_rate),)
 
 
 def _thrust_excess(motion: Motion, gravity: Array, limits: QuadrotorLimits) -> tuple[Array, Array]:
@@ -199,28 +194,31 @@ def _thrust_excess(motion: Motion, gravity: Array, limits: QuadrotorLimits) -> t
 class _Kind:
     field: str  # field of `QuadrotorLimits` that is None for a quadrotor without these limits
     measures: tuple[Measure, ...]  # one for each excess
-    excess: Callable[[Motion, Array, QuadrotorLimits], tuple[Array, ...]]  # takes motion, gravity
+    excess: Callable[[Motion, Array, PyTree], tuple[Array, ...]]  # of motion, gravity and limits
     orders: tuple[int, ...]  # orders of the motion's derivatives on which the excess depends
 
 
 _ABOVE, _BELOW, _PLAIN = Measure
 _KINDS = (
-    _Kind("speed", (_ABOVE,), lambda motion, _, own: (speed_excess(motion.vel, own),), (1,)),
+    _Kind("speed", (_ABOVE,), lambda motion, _, own: (speed_excess(motion.vel, own.speed),), (1,)),
     _Kind(
         "acceleration",
         (_ABOVE,),
-        lambda motion, _, own: (acceleration_excess(motion.acc, own),),
+        lambda motion, _, own: (acceleration_excess(motion.acc, own.acceleration),),
         (2,),
     ),
     _Kind("body_rate", (_ABOVE,), _rate_excess, (2, 3)),
     _Kind("max_thrust", (_BELOW, _ABOVE), _thrust_excess, (2,)),
     _Kind(
-        "min_height", (_PLAIN,), lambda motion, _, own: (ground_excess(motion.height, own),), (0,)
+        "min_height",
+        (_PLAIN,),
+        lambda motion, _, own: (ground_excess(motion.height, own.min_height),),
+        (0,),
     ),
     _Kind(
         "max_tilt",
         (_ABOVE,),
-        lambda motion, gravity, own: (tilt_excess(_load(motion, own).acc, gravity, own),),
+        lambda motion, gravity, own: (tilt_excess(_load(motion, own).acc, gravity, own.max_tilt),),
         (2,),
     ),
     _Kind("rotors", (_PLAIN,) * 2, _rotor_excess, (2, 3, 4)),  # of one rotor; the last

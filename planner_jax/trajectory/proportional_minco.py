@@ -80,7 +80,11 @@ class ProportionalMinco:
 
 
 @functools.cache
-def _hermite_map(order: int) -> np.ndarray:
+def hermite_map(order: int) -> np.ndarray:
+    """Return the map (2s, 2s) from derivatives at both ends of a piece of 1 s to its coefficients.
+
+    The derivatives have the orders 0 to s - 1, at the start and then at the end, with s = `order`.
+    """
     size = 2 * order
     ends = np.zeros((size, size))
     for d in range(order):
@@ -119,7 +123,7 @@ def proportional_minco(
     s, m = order, len(proportions)
     shares = np.array(proportions) * m / np.sum(proportions)
     units = np.tile(shares[:, None] ** np.arange(s), 2)
-    hermite = _hermite_map(s)
+    hermite = hermite_map(s)
     # Energy of a piece of duration 1, as a quadratic form in the derivatives at its ends.
     piece_energy = hermite.T @ polynomial.energy_form(2 * s - 1, s)[0] @ hermite
     total = np.zeros(((m + 1) * s, (m + 1) * s))

@@ -135,6 +135,8 @@ pj.require_sound(5) | cases must be a case or a batch, got a int
 pj.are_solved(hits.drag) | plans must be
 pj.task_named('x') | task must be one of
 pj.target_at('x', 0.1) | table must
+pj.durations_of((0.0, 1.0), 'log') | kind must be one of exp, rational, got 'log'
+pj.minco(np.eye(5, 3), np.eye(5, 3), np.ones((1, 3)), np.ones(2)) | head must be of 2, 3 or 4 rows
 pj.table_path(**{**TABLE, **dict(times=(0, 1, 1))}) | times must be finite and rise
 pj.obstacles([SQUARE], velocities=(1, 2, 3)) | velocities must have the shape
 """

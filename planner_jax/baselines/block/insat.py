@@ -42,13 +42,13 @@ from planner_jax.baselines.block.free_space import FreeSpace
 from planner_jax.baselines.block.pose_by_pose import Clock, Goal, HostMotion, PoseByPose
 from planner_jax.core.arithmetic import host_leaf
 from planner_jax.optimise import lbfgs
+from planner_jax.penalties.paths import polyline_length, spline_cost
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.plan import BlockPlan
 
 DEGREE = 3  # degree of the splines
 CONTROL_POINTS = 7  # number of control points of a spline
 ANCESTORS = 8  # number of splines optimised at once: from the start and the nearest ancestors
-TIME_WEIGHT, LENGTH_WEIGHT = 1.0, 0.1  # [1/s], [1/rad]: weights of duration and length (eq. 4a)
 LEAST_TIME = 0.1  # [s], least duration of a spline
 _SHARES = np.linspace(0.0, 1.0, 33)  # sample times, as fractions of a spline's duration
 _OUTSIDE = 100.0  # [1/rad^2], penalty weight of control points beyond the position limits
@@ -169,7 +169,7 @@ class InsatBlock(PoseByPose):
                 )
         last = good.shape[1] - 1 - np.argmax(good[:, ::-1], axis=1)
         each = np.arange(len(before))
-        cost = TIME_WEIGHT * splines.time + LENGTH_WEIGHT * splines.length
+        cost = spline_cost(splines.length, splines.time)
         cost = np.where(good[each, last], cost[each, last], np.inf)
         for k in np.argsort(cost)[: np.isfinite(cost).sum()]:
             place = k, last[k]
@@ -246,8 +246,7 @@ def _optimise(
 
     def length_of(points: Array) -> tuple[Array, Array]:
         angles = product(of_points, points)
-        steps = jnp.sum(jnp.diff(angles, axis=0) ** 2, axis=1)
-        return angles, jnp.sum(jnp.sqrt(jnp.maximum(steps, 1e-10)))
+        return angles, polyline_length(angles)
 
     def objective(x: Array) -> lbfgs.Evaluation:
         points = points_of(x)
@@ -256,7 +255,7 @@ def _optimise(
         total = jnp.sum((squares / most) ** (_NORM // 2))
         time = jnp.sqrt(most) * total ** (1.0 / _NORM)
         beyond = jnp.maximum(jnp.maximum(points - bounds.upper, bounds.lower - points), 0.0)
-        cost = TIME_WEIGHT * time + LENGTH_WEIGHT * length_of(points)[1]
+        cost = spline_cost(length_of(points)[1], time)
         return lbfgs.Evaluation(cost + _OUTSIDE * jnp.sum(beyond**2), jnp.zeros((), dtype))
 
     def of_one(guess: Array) -> Splines:

@@ -16,10 +16,10 @@ from planner_jax.core.choices import require
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import BaseAttempt, outcome, require_settings, take
-from planner_jax.cost.quadrotor import (
+from planner_jax.cost.quadrotor import relative
+from planner_jax.penalties.flight import (
     body_rate_excess,
     ground_excess,
-    relative,
     speed_excess,
     thrust_excess,
 )
@@ -212,12 +212,14 @@ class MppCatch(Planner):
         motion = sample_pieces(segment, self.nodes)
         weak, strong = thrust_excess(motion.acc, case.gravity, *limits.thrust_bounds)
         squared = [
-            speed_excess(motion.vel, limits),
-            body_rate_excess(motion.acc, motion.jerk, case.gravity, limits),
+            speed_excess(motion.vel, limits.speed),
+            body_rate_excess(motion.acc, motion.jerk, case.gravity, limits.body_rate),
             strong,
         ]
         parts = [relative(jnp.max(jnp.stack(squared))), -relative(-jnp.max(weak))]
-        return jnp.max(jnp.stack([*parts, jnp.max(ground_excess(motion.height, limits))]))
+        return jnp.max(
+            jnp.stack([*parts, jnp.max(ground_excess(motion.height, limits.min_height))])
+        )
 
 
 def _end_state(segment: PiecewisePolynomial) -> Array:

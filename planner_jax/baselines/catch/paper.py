@@ -9,18 +9,23 @@ from flax import struct
 from jax import Array
 
 from planner_jax.baselines.parts.minimum_jerk import minimum_jerk
-from planner_jax.core.arithmetic import components
 from planner_jax.core.choices import require, require_size
 from planner_jax.core.protocol import require_settings
 from planner_jax.cost.along import Along, integrate_along
-from planner_jax.cost.quadrotor import ground_excess, speed_excess
 from planner_jax.optimise.planner import Problem, pending
 from planner_jax.optimise.settings import Attempt, Evaluation, LbfgsConfig, Stage
-from planner_jax.robot.quadrotor import QuadrotorLimits, body_rate_squared, body_z
+from planner_jax.penalties.catches import length, net_angle_excess
+from planner_jax.penalties.flight import (
+    body_rate_excess,
+    ground_excess,
+    speed_excess,
+    thrust_band_excess,
+)
+from planner_jax.penalties.hinges import steep_hinge
+from planner_jax.robot.quadrotor import QuadrotorLimits, body_z
 from planner_jax.task.catch.case import CatchCase
 from planner_jax.task.catch.context import (
     CatchContext,
-    facing_cosine,
     is_too_far,
     order_targets,
     targets_at,
@@ -54,36 +59,11 @@ def limits_excess(motion: Motion, given: tuple[Array, QuadrotorLimits]) -> tuple
     """
     gravity, limits = given
     return (
-        speed_excess(motion.vel, limits) * limits.speed**2,
-        body_rate_squared(motion.acc, motion.jerk, gravity) - limits.body_rate**2,
+        speed_excess(motion.vel, limits.speed, in_si=True),
+        body_rate_excess(motion.acc, motion.jerk, gravity, limits.body_rate, in_si=True),
         thrust_band_excess(motion.acc, gravity, *limits.thrust_bounds),
-        ground_excess(motion.height, limits),
+        ground_excess(motion.height, limits.min_height),
     )
-
-
-def steep_hinge(x: Array, width: float | Array) -> Array:
-    """Return the penalty L_eps(x) for eps = width [Yu2023catch, eq. 23].
-
-    L_eps is 0 below 0, and x^3 from 0 to eps. Above eps it is eps^3 + (x - eps)^2 x / eps^4, as
-    printed in the paper. The value is continuous at eps, but the slope drops from 3 eps^2 to 0.
-    """
-    inside = jnp.clip(x, 0.0, width)
-    beyond = jnp.maximum(x - width, 0.0)
-    return inside**3 + beyond**2 * (beyond + width) / width**4 * (x > width).astype(x.dtype)
-
-
-def thrust_band_excess(acc: Array, gravity: Array, least: Array, most: Array) -> Array:
-    """Return the excess of thrusts over their limits, (...) [m^2/s^4]; <= 0 within the limits.
-
-    The excess is (f - middle)^2 - half^2, as in the code published with [Yu2023catch]. f is the
-    thrust per unit mass for accelerations `acc` (..., 3). `middle` is the mean of the limits
-    `least` and `most` [m/s^2], and `half` is half of their difference.
-    """
-    x, y, z = components(acc)
-    z = z + gravity
-    thrust = jnp.sqrt(jnp.maximum(x * x + y * y + z * z, 1e-6))
-    middle, half = 0.5 * (most + least), 0.5 * (most - least)
-    return (thrust - middle) ** 2 - half**2
 
 
 @struct.dataclass
@@ -217,15 +197,12 @@ class PaperCatch(Problem):
         last = jnp.sum(context.active) - 1
         flying = jnp.arange(times.size) != last
         jerk = jnp.where(flying[:, None], natural[:, 10:13], 0.0)
-        facing, moving = facing_cosine(axis, ball.vel)
-        miss_squared = jnp.sum(miss**2, axis=1)
-        missing = miss_squared > 0.0
         return Catch(
             times=times,
             durations=durations,
             tail_states=jnp.stack([pos, natural[:, 4:7], acc, jerk], axis=1),
-            miss=jnp.where(missing, jnp.sqrt(jnp.where(missing, miss_squared, 1.0)), 0.0),
-            angle_excess=jnp.where(moving, jnp.cos(net.max_angle) - facing, -1.0),
+            miss=length(miss),
+            angle_excess=net_angle_excess(axis, ball.vel, net.max_angle),
         )
 
     def _unpack(self, point: Array, context: CatchContext) -> tuple[Chain, Catch]:

@@ -18,9 +18,11 @@ from planner_jax.baselines.hit.decoupled import aim_at_angle, solve_decoupled_hi
 from planner_jax.baselines.parts.minimum_jerk import minimum_jerk
 from planner_jax.core.choices import require, require_size
 from planner_jax.core.protocol import require_settings
-from planner_jax.cost.penalty import join_trapezoid_weights, smooth_hinge
+from planner_jax.cost.penalty import join_trapezoid_weights
 from planner_jax.optimise.planner import Problem, SearchPlanner, pending
 from planner_jax.optimise.settings import Attempt, Evaluation, LbfgsConfig
+from planner_jax.penalties.hinges import smooth_hinge
+from planner_jax.penalties.hits import apex_excess, hitting_speed_excess
 from planner_jax.task.hit.case import HitCase
 from planner_jax.task.hit.context import HitContext, Impact, is_too_far, prepare_hit
 from planner_jax.task.hit.plan import HitPlan
@@ -255,12 +257,9 @@ class BatHit(Problem):
     def _terminal_penalty(self, impact: Impact, defect: Array, case: HitCase) -> Array:
         """Return the penalty of apex and hitting velocity [Yu2023bat, eqs 21 and 24a]."""
         limits = case.hit_limits
-        excess = jnp.concatenate(
-            [
-                jnp.stack([limits.min_apex - impact.apex, impact.apex - limits.max_apex]),
-                jnp.abs(impact.tail_state[1]) - limits.hitting_speed,
-            ]
-        )
+        apex = apex_excess(impact.apex, limits.min_apex, limits.max_apex, in_si=True)
+        speed = hitting_speed_excess(impact.tail_state[1], limits.hitting_speed, in_si=True)
+        excess = jnp.concatenate([apex, speed])
         return self.terminal_weight * (jnp.sum(smooth_hinge(excess, self.hinge_width)) + defect)
 
     def _penalty(self, motion: Motion, duration: Array, case: HitCase) -> Array:

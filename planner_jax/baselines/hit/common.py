@@ -5,16 +5,17 @@ from jax import Array
 
 from planner_jax.ball.flight import BallState, drag_free_apex, gravity_vector
 from planner_jax.core.errors import ArgumentError
-from planner_jax.cost.quadrotor import (
+from planner_jax.cost.quadrotor import relative
+from planner_jax.penalties.flight import (
     acceleration_excess,
     body_rate_excess,
     ground_excess,
-    relative,
     speed_excess,
 )
+from planner_jax.penalties.hits import apex_excess, hitting_speed_excess
 from planner_jax.robot.quadrotor import QuadrotorLimits
 from planner_jax.task.hit.case import HitCase
-from planner_jax.task.hit.context import Impact, apex_excess, hitting_speed_excess
+from planner_jax.task.hit.context import Impact
 from planner_jax.task.hit.plan import Stroke
 from planner_jax.trajectory.polynomial import Motion
 
@@ -85,10 +86,12 @@ def motion_excess(motion: Motion, gravity: Array, limits: QuadrotorLimits) -> tu
     """Return the excess (N,) of N samples over each of four limits [Yu2023bat, eq. 18a].
 
     An excess is (value / limit)^2 - 1 for speed, acceleration and body rate, z_min - z for height.
+    It is -1 for acceleration without a limit.
     """
+    bound, free = limits.acceleration, 0.0 * motion.height - 1.0
     return (
-        speed_excess(motion.vel, limits),
-        acceleration_excess(motion.acc, limits),
-        body_rate_excess(motion.acc, motion.jerk, gravity, limits),
-        ground_excess(motion.height, limits),
+        speed_excess(motion.vel, limits.speed),
+        free if bound is None else acceleration_excess(motion.acc, bound),
+        body_rate_excess(motion.acc, motion.jerk, gravity, limits.body_rate),
+        ground_excess(motion.height, limits.min_height),
     )

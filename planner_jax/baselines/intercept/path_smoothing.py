@@ -31,6 +31,7 @@ from flax import struct
 from jax import Array, lax
 
 from planner_jax.core.errors import ArgumentError
+from planner_jax.penalties.paths import curvature_cost, obstacle_cost, smoothness_cost
 from planner_jax.plane.obstacles import Obstacles, distances, separation
 
 _FINE = 8  # number of samples per piece of the spline, for the computation of its length
@@ -185,16 +186,10 @@ def smoothing_cost(
         curvature: () [1/m], greatest curvature.
         settings: weights, and `reach` [m], the distance up to which obstacles add to the cost.
     """
-    steps = (points[1:] - points[:-1]) / unit
-    before, after = steps[:-1], steps[1:]
-    cross = before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]
-    turn = jnp.abs(jnp.arctan2(cross, jnp.sum(before * after, axis=1)))
-    excess = turn / jnp.linalg.norm(before, axis=1) - curvature * unit
-    close = (settings.reach - _nearest(points, walls)) / unit
     return (
-        settings.obstacle * jnp.sum(jnp.maximum(close, 0.0) ** 2)
-        + settings.curvature * jnp.sum(jnp.maximum(excess, 0.0) ** 2)
-        + settings.smoothness * jnp.sum((after - before) ** 2)
+        settings.obstacle * obstacle_cost(_nearest(points, walls), settings.reach, unit)
+        + settings.curvature * curvature_cost(points, curvature, unit)
+        + settings.smoothness * smoothness_cost(points, unit)
     )
 
 

@@ -15,15 +15,6 @@ import numpy as np
 from flax import struct
 from jax import Array
 
-from planner_jax.baselines.intercept.bezier import (
-    BezierCurve,
-    bernstein,
-    bounds_of_pieces,
-    energy_of_pieces,
-    hodograph,
-    joints,
-    rows_of_pieces,
-)
 from planner_jax.baselines.intercept.qp import QpConfig, QpTemplate, qp_template, solve_qp
 from planner_jax.baselines.intercept.station_time import (
     ReferenceLine,
@@ -33,6 +24,15 @@ from planner_jax.baselines.intercept.station_time import (
     reference_line,
 )
 from planner_jax.core.protocol import Plan, Status
+from planner_jax.trajectory.bezier import (
+    BezierCurve,
+    bernstein,
+    bounds_of_pieces,
+    energy_of_pieces,
+    hodograph,
+    joints,
+    rows_of_pieces,
+)
 
 
 @struct.dataclass

@@ -44,14 +44,6 @@ def targets_at(targets: TargetPath, times: Array) -> BallState:
     return jax.vmap(state_at)(targets, times)
 
 
-def facing_cosine(axis: Array, vel: Array) -> tuple[Array, Array]:
-    """Return cosines (N,) of angles between net axes and -`vel`, and whether `vel` is not zero."""
-    speed_squared = jnp.sum(vel**2, axis=1)
-    moving = speed_squared > 1e-12
-    speed = jnp.sqrt(jnp.where(moving, speed_squared, 1.0))
-    return -jnp.sum(axis * vel, axis=1) / speed, moving
-
-
 def nearest_upright(vel: Array, lean: Array) -> Array:
     """Return the axes (N, 3) of the net that are nearest to upright and still face N targets.
 

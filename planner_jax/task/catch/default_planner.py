@@ -17,11 +17,11 @@ from planner_jax.optimise.chain import ChainEnds, ChainProblem
 from planner_jax.optimise.planner import SearchPlanner, pending
 from planner_jax.optimise.settings import Attempt, Attempts, LbfgsConfig, Stage
 from planner_jax.optimise.shipped import StartNetwork, load_network
+from planner_jax.penalties.catches import facing_cosine
 from planner_jax.robot.quadrotor import add_drag, body_z, tangent_basis
 from planner_jax.task.catch.case import CatchCase
 from planner_jax.task.catch.context import (
     CatchContext,
-    facing_cosine,
     is_too_far,
     nearest_upright,
     order_targets,

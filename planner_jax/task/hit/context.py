@@ -5,7 +5,6 @@ from flax import struct
 from jax import Array, lax
 
 from planner_jax.ball.flight_table import FlightTable, longest_flight, tabulate_flight
-from planner_jax.core.arithmetic import reciprocal
 from planner_jax.robot.quadrotor import ALLOWED, beyond_reach, greatest_speed
 from planner_jax.task.hit.case import HitCase
 from planner_jax.task.hit.plan import Stroke
@@ -81,13 +80,3 @@ def is_too_far(context: HitContext) -> Array:
     # sinking and below the least height of an impact.
     is_down = (pos[-1, 2] < lowest) & (vel[-1, 2] < 0.0)
     return jnp.all(apart > moved) & is_down
-
-
-def apex_excess(apex: Array, min_apex: Array, max_apex: Array) -> Array:
-    """Return relative excesses 1 - H / H_min, H / H_max - 1 of the apex H [Yu2023bat, eq. 21]."""
-    return jnp.stack([1.0 - apex * reciprocal(min_apex), apex * reciprocal(max_apex) - 1.0])
-
-
-def hitting_speed_excess(vel: Array, limit: Array) -> Array:
-    """Return v_j^2 / v_max,j^2 - 1, (3,), of velocity v and limit v_max [Yu2023bat, eq. 24a]."""
-    return (vel * reciprocal(limit)) ** 2 - 1.0

@@ -16,6 +16,7 @@ from jax import Array
 
 from planner_jax.ball.aim import aim_drag_free, aim_with_drag, apex_with_drag
 from planner_jax.ball.flight import BallState, drag_free_apex, gravity_vector, solve_impact
+from planner_jax.cost.penalty import apex_excess, hitting_speed_excess
 from planner_jax.cost.quadrotor import Measure
 from planner_jax.optimise.chain import ChainEnds, ChainProblem
 from planner_jax.optimise.planner import SearchPlanner, pending
@@ -23,14 +24,7 @@ from planner_jax.optimise.settings import Attempt, LbfgsConfig, Stage
 from planner_jax.optimise.shipped import StartNetwork, load_network
 from planner_jax.robot.quadrotor import tangent_basis, velocity_in_air
 from planner_jax.task.hit.case import HitCase
-from planner_jax.task.hit.context import (
-    HitContext,
-    Impact,
-    apex_excess,
-    hitting_speed_excess,
-    is_too_far,
-    prepare_hit,
-)
+from planner_jax.task.hit.context import HitContext, Impact, is_too_far, prepare_hit
 from planner_jax.task.hit.plan import HitPlan, Stroke
 from planner_jax.trajectory.polynomial import PiecewisePolynomial
 from planner_jax.trajectory.proportional_minco import ProportionalMinco, proportional_minco

@@ -19,19 +19,14 @@ from jaxtyping import PyTree
 from planner_jax.ball.arc import fly_between
 from planner_jax.ball.flight import BallState, drag_free_fall_time, solve_impact
 from planner_jax.core.arithmetic import reciprocal
+from planner_jax.cost.penalty import apex_excess, hitting_speed_excess
 from planner_jax.cost.quadrotor import Measure
 from planner_jax.optimise.chain import ChainEnds, ChainProblem
 from planner_jax.optimise.planner import SearchPlanner, pending
 from planner_jax.optimise.settings import Attempt, Curvature, LbfgsConfig
 from planner_jax.optimise.shipped import load_scale
 from planner_jax.robot.quadrotor import tangent_basis
-from planner_jax.task.hit.context import (
-    HitContext,
-    apex_excess,
-    hitting_speed_excess,
-    is_too_far,
-    prepare_hit,
-)
+from planner_jax.task.hit.context import HitContext, is_too_far, prepare_hit
 from planner_jax.task.hit.default_planner import state_at_impact
 from planner_jax.task.hit.plan import Stroke
 from planner_jax.task.rally.case import RallyCase
