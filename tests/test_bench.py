@@ -181,7 +181,7 @@ def test_costs_without_rounds_are_compared_with_those_of_the_tasks_yardstick():
 
 def test_a_yardstick_for_cases_of_another_class_is_none():
     cases = pj.hit.draw(2)
-    plans = pj.plan(pj.hit.planner("bat"), cases)  # test_baselines compiles it, too.
+    plans = pj.plan(pj.hit.planner("bat-fitted"), cases)  # test_baselines compiles it, too.
     assert cost_gaps(Half(), cases, plans, card=registry.task_named("intercept")) is None
 
 
