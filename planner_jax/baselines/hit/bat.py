@@ -16,7 +16,7 @@ from jax import Array, lax
 from planner_jax.ball.flight import BallState, drag_free_fall_time, fly, solve_impact
 from planner_jax.baselines.hit.common import largest_violation, make_impact, motion_excess
 from planner_jax.baselines.hit.decoupled import aim_at_angle, solve_decoupled_hit
-from planner_jax.baselines.parts.lbfgs_lite import LitePlanner
+from planner_jax.baselines.parts.lbfgs_lite import LitePlanner, LiteRule
 from planner_jax.baselines.parts.minimum_jerk import minimum_jerk
 from planner_jax.core.choices import require, require_size
 from planner_jax.core.protocol import require_settings
@@ -318,15 +318,14 @@ class BatHit(Problem):
         ).with_heading(case)
 
 
-def bat(**options: Any) -> LitePlanner:
+def bat(rule: LiteRule = LiteRule(), **options: Any) -> LitePlanner:  # noqa: B008
     """Make the planner `bat`: a `BatHit`, minimised as by LBFGS-Lite in the paper's variables.
 
-    `options` are fields of `BatHit`.
+    `rule` stops the search, and `options` are fields of `BatHit`.
     """
     problem = BatHit(**options)
-    return LitePlanner(
-        dataclasses.replace(problem, scale=(1.0,) * len(problem.scale)), cost_unit=_COST_UNIT
-    )
+    plain = dataclasses.replace(problem, scale=(1.0,) * len(problem.scale))
+    return LitePlanner(plain, _COST_UNIT, rule)
 
 
 # The same planners without the state at which a swing starts.
