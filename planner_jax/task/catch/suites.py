@@ -179,8 +179,8 @@ def _paper_throws(uniform: PyTree) -> tuple[BallPath, PyTree]:
     low = _fly(launch, vel, top, throw.drag)[0][:, 2] <= _CEILING
     good = has_come(late) & low & (flight - late <= _LONGEST_LEFT)
     first = xp.argmax(good.reshape(-1, _DRAWS), axis=1) + _DRAWS * np.arange(len(uniform))
-    chosen = (each[first] for each in (vel, flight, late))
-    pos, vel, horizon = (each[:, None] for each in _await(*chosen, throw.drag))
+    chosen = _await(vel[first], flight[first], late[first], throw.drag)
+    pos, vel, horizon = (each[:, None] for each in chosen)
     drag, gravity = np.full(pos.shape, throw.drag), np.full(horizon.shape, GRAVITY)
     return BallPath(BallState(pos=pos, vel=vel), host_leaf(drag), host_leaf(gravity)), horizon
 
