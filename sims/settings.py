@@ -31,6 +31,7 @@ _FLIGHT_BYTES, _FLOWN_BYTES = 1_000_000, 4_000
 _FASTEST = 10_000.0  # [Hz], greatest replanning rate
 # Greatest number of balls of a flight, chosen because compile time grows with every ball.
 _MOST_BALLS = 12
+LATEST_PLAN = 1.0  # [s], greatest time from a serve to its first plan
 INTERVAL = 0.8  # [s], time between two throws [Yu2023catch, Fig. 1]
 
 
@@ -233,6 +234,7 @@ class HitFly(BallFly):
     replan: float | None = option(None, "HZ", _REPLAN.format(50, "exact"))
     planner: str = option("exact", "NAME", "planner of plans from scratch")
     suite: str = option("S.1", "NAME", "suite of serves")
+    seen: float = option(0.25, "S", "time for which a ball is observed before its first plan")
 
     TASK: ClassVar[Task] = HIT
     FLIGHT: ClassVar[str] = "planner_jax.sims.tasks.hit:HitFlight"
@@ -242,6 +244,7 @@ class HitFly(BallFly):
     def __post_init__(self) -> None:
         super().__post_init__()
         require_one_of(HIT.suites, "suite", self.suite)
+        require(0.0 < self.seen <= LATEST_PLAN, "seen", f"> 0 and <= {LATEST_PLAN:g}", self.seen)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -22,7 +22,7 @@ import planner_jax as pj
 
 NUM, SEED = 16, 12  # cases of a row, and their seed
 PLANNERS = {  # of each task, the default one first
-    "hit": ("exact", "bat", "bat-lite", "juggle"),
+    "hit": ("exact", "bat", "bat-lite", "bat-fitted", "bat-lite-fitted", "juggle"),
     "catch": ("exact", "catch", "mpp"),
     "intercept": ("spacetime", "quick", "best", "lattice", "paper", "em", "constant"),
     "group": ("spacetime",),

@@ -15,6 +15,7 @@ import planner_jax as pj
 from planner_jax.baselines.block.library.planner import LibraryBlock
 from planner_jax.baselines.intercept.projection import Projection
 from planner_jax.baselines.intercept.static_paths import PathSource
+from planner_jax.baselines.parts.lbfgs_lite import LiteRule
 from planner_jax.core.planner import Kind
 from planner_jax.core.protocol import BaseAttempt, Plan, outcome
 from planner_jax.optimise.levenberg import LevenbergConfig
@@ -172,8 +173,13 @@ BY_NET = {"of": lambda plan: plan.times[-1], "by": "net"}
 ONE_SEARCH = (Search(12, lattice=Lattice(layers=22)),)
 ENTRIES = {
     "hit exact": hit("exact", {"of": "cost", "by": "racket_height", "steps": 0}, **SHORT, **NONE),
-    "hit bat": hit("bat", {"of": "cost", "by": ["target", "gravity"]}, nodes=6, **NONE),
-    "hit bat-lite": hit("bat-lite", {"of": "stroke.time", "by": "limits"}, nodes=6, **NONE),
+    "hit bat": hit(
+        "bat", {"of": "cost", "by": ["target", "gravity"]}, nodes=6, rule=LiteRule(max_steps=0)
+    ),
+    "hit bat-fitted": hit("bat-fitted", {"of": "cost", "by": "target"}, nodes=6, **NONE),
+    "hit bat-lite-fitted": hit(
+        "bat-lite-fitted", {"of": "stroke.time", "by": "limits"}, nodes=6, **NONE
+    ),
     "hit juggle": hit("juggle", None, nodes=6),
     "catch exact": catch("exact", "throws", BY_NET, decide="greedy", nodes=3, **FEW),
     "catch catch": catch(

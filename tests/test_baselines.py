@@ -12,6 +12,7 @@ from derivatives import assert_gradient_matches_differences
 import planner_jax as pj
 from planner_jax.ball.flight import BallState, drag_free_flight, fly
 from planner_jax.baselines.hit.bat import BatHit, serve_origin, transition_point
+from planner_jax.baselines.hit.comparison import choose_reference
 from planner_jax.baselines.hit.decoupled import aim_at_angle, solve_decoupled_hit
 from planner_jax.baselines.hit.juggle import JuggleHit
 from planner_jax.baselines.parts.minimum_jerk import minimum_jerk, minimum_jerk_after_ramp
@@ -275,10 +276,15 @@ def test_degenerate_cases_stay_finite_and_leave_other_lanes_unchanged(make, case
 
 
 def test_every_published_planner_has_its_name():
-    assert {"exact", *court.PLANNERS} == set(TASK.planners)
+    fitted = {"bat-fitted", "bat-lite-fitted"}
+    assert {"exact", *court.PLANNERS} | fitted == set(TASK.planners)
     assert pj.hit.planner("juggle") == JUGGLE
-    assert pj.hit.planner("bat") == BAT
-    assert pj.hit.planner("bat-lite", nodes=8) == BatHit.planner(transition=False, nodes=8)
+    assert pj.hit.planner("bat-fitted") == BAT
+    lite = pj.hit.planner("bat-lite-fitted", nodes=8)
+    assert lite == BatHit.planner(transition=False, nodes=8)
+    published = pj.hit.planner("bat-lite", nodes=8)
+    assert published.problem == BatHit(transition=False, nodes=8, scale=(1.0,) * 14)
+    assert {choose_reference(name) for name in TASK.planners} == set(court.PLANNERS)
 
 
 def test_planners_with_one_piece_or_two_starts_are_rejected():

@@ -1,6 +1,7 @@
 import dataclasses
 import importlib
 import json
+import time
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -16,6 +17,7 @@ from planner_jax.benchmarks.cost_gap import cost_gaps, gap_figures
 from planner_jax.benchmarks.first_plan import ROWS as FIRST_PLANS
 from planner_jax.benchmarks.first_plan import plan_in_new_process
 from planner_jax.benchmarks.flown_by_rotorpy import model_of, track
+from planner_jax.benchmarks.real_time import measure as measure_real_time
 from planner_jax.benchmarks.run import Bench
 from planner_jax.benchmarks.throughput import report
 from planner_jax.core import registry
@@ -133,6 +135,16 @@ class Third(Half):
         return dataclasses.replace(plan, cost=plan.cost / 1.5)
 
 
+@jax.tree_util.register_static
+@dataclasses.dataclass(frozen=True)
+class Slow(Half):
+    """A planner that sleeps for 50 ms before it plans the case with the number 1."""
+
+    def solve_on_host(self, cases, attempt):
+        time.sleep(0.05 * float(np.max(cases.value == 1.0)))
+        return jax.tree.map(np.asarray, jax.vmap(lambda case: self.solve(case, attempt))(cases))
+
+
 def planner(name="half", **options):
     return {"half": Half, "third": Third}[name](**options)
 
@@ -150,6 +162,15 @@ def judge(cases, plans):
 def halving(monkeypatch):
     card = registry.Task("halve", "halves numbers", __name__, {"half": ""}, {"counted": ""})
     monkeypatch.setattr(registry, "all_tasks", lambda: {"halve": card})
+
+
+def test_a_case_counts_in_real_time_if_its_own_plan_is_good_and_soon():
+    cases = jax.tree.map(np.asarray, draw(4))
+    good, soon, times = measure_real_time(Slow(), judge, cases, np.inf)
+    assert good.tolist() == [True, True, True, False] and soon.all() and (times > 0.0).all()
+    good, soon, times = measure_real_time(Slow(), judge, cases, 45.0)
+    assert good.tolist() == [True, True, True, False] and not soon[1] and times[1] >= 50.0
+    assert not measure_real_time(Slow(), judge, cases, 0.0)[1].any()
 
 
 def test_throughput_is_measured_of_any_task(halving, tmp_path, capsys):
@@ -178,7 +199,7 @@ def test_costs_without_rounds_are_compared_with_those_of_the_tasks_yardstick():
 
 def test_a_yardstick_for_cases_of_another_class_is_none():
     cases = pj.hit.draw(2)
-    plans = pj.plan(pj.hit.planner("bat"), cases)  # test_baselines compiles it, too.
+    plans = pj.plan(pj.hit.planner("bat-fitted"), cases)  # test_baselines compiles it, too.
     assert cost_gaps(Half(), cases, plans, card=registry.task_named("intercept")) is None
 
 

@@ -69,6 +69,34 @@ def test_shapes_and_setting(name):
 
 
 @float64
+def test_the_first_ball_of_the_paper_is_planned_when_it_has_flown_2_m_and_is_above_2_8_m():
+    cases = draw_doubles("paper-throws", 500)
+    times = jnp.asarray(np.tile(np.arange(-0.01, 1.7, 2e-3), (500, 1, 1)))
+    flown = np.asarray(states(cases.targets, times).pos)[:, 0]
+    far, height = np.linalg.norm(flown - np.array(LAUNCH), axis=2), flown[..., 2]
+    now = 5  # index of time 0
+    assert (far[:, now] >= 2.0 - 1e-9).all() and (height[:, now] >= 2.8 - 1e-9).all()
+    assert ((far[:, 0] < 2.0) | (height[:, 0] < 2.8)).all(), "10 ms before one rule is not met"
+    assert (height.max(axis=1) <= 4.2 + 1e-9).all() and height.max() > 4.1
+    down = (height <= 0.0).argmax(axis=1)
+    assert (down > 0).all() and times[0, 0][down].max() <= 1.602
+    landing = np.abs(flown[np.arange(500), down, :2])
+    assert (landing <= [1.02, 0.42]).all() and (landing.max(axis=0) > [0.9, 0.36]).all()
+    assert len(np.unique(np.asarray(cases.horizon))) == 500
+
+
+@float64
+def test_targets_swing_by_the_formula_of_the_paper():
+    cases, times = draw_doubles("paper-harmonic2"), np.array([0.0, 0.5, 1.7])
+    path = cases.targets
+    pos = states(path, jnp.asarray(np.tile(times, (NUM, 2, 1)))).pos
+    expected = np.asarray(path.pos)[:, :, None] + np.sin(
+        np.asarray(path.rate)[..., None, None] * times[:, None]
+    ) * np.array([0.0, 0.0, 1.0])
+    np.testing.assert_allclose(pos, expected, atol=1e-12)
+
+
+@float64
 @pytest.mark.parametrize("name", THROWS)
 def test_a_throw_leaves_the_machine_lands_in_its_rectangle_and_flies_as_long_as_it_says(name):
     cases = draw_doubles(name)

@@ -12,6 +12,7 @@ import pytest
 from jaxpr import assert_full_precision
 
 import planner_jax as pj
+from planner_jax.baselines.parts.lbfgs_lite import LitePlanner
 from planner_jax.core import planner as planner_module
 from planner_jax.core.protocol import BaseAttempt, Plan, is_solved, outcome
 from planner_jax.core.rules import is_sound
@@ -23,7 +24,8 @@ from tests.trees import assert_same
 # Planners that only slow tests include. They use the same solver as another tested planner, or the
 # test module of their task makes the same checks.
 LIKE_OTHERS = (
-    *("hit bat", "hit bat-lite", "hit juggle", "catch exact", "catch catch"),
+    *("hit bat", "hit bat-fitted", "hit bat-lite-fitted", "hit juggle"),
+    *("catch exact", "catch catch"),
     *("intercept lattice", "intercept em", "intercept constant"),
     *("block online", "block brisk", "block direct", "block insat"),
 )
@@ -226,7 +228,9 @@ def test_a_derivative_is_refused_with_the_names_of_what_has_one(entry, call):
 @entries(slow=(*LIKE_OTHERS, *OF_THEIR_OWN))
 def test_a_gradient_is_there_where_it_is_promised_and_refused_elsewhere(entry):
     planner = entry.planner.inner
-    searches_first = isinstance(planner, SpacetimeIntercept)  # plans are then settled anew
+    searches_first = isinstance(
+        planner, SpacetimeIntercept | LitePlanner
+    )  # plans are then settled anew
     if not (isinstance(planner, SearchPlanner) or searches_first):
         with pytest.raises(TypeError, match=rf"\A{type(planner).__name__} minimises nothing.*\Z"):
             pj.gradient(entry.planner, entry.batch, of="cost", by=entry.broken)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from planner_jax.baselines.protocols import BY_ROW, PUBLISHED
-from planner_jax.benchmarks.hit_agreement import kappa
+from planner_jax.benchmarks.hit_published import agreement, kappa, rates_by_scenario
 from planner_jax.task.hit import court
 from tests.citations import read_words
 from tests.tracked import ROOT, tracked_files
@@ -88,6 +88,18 @@ def test_numbers_are_printed_with_their_sign_spread_and_unit():
         ("Natarajan2024", "Table II", "RRT-Connect joint 2"): "130.2 ± 49 N m",
     }
     assert {key: str(BY_ROW[key]) for key in printed} == printed
+
+
+def test_outcomes_are_compared_by_scenario():
+    scenario = np.array([0, 0, 3, 3])
+    ours, theirs = np.array([[1, 1, 1, 0], [1, 0, 0, 0]], bool)
+    rates = rates_by_scenario(ours, scenario)
+    assert rates.shape == (36,) and rates[0] == 1.0 and rates[3] == 0.5 and np.isnan(rates[1])
+    found = agreement(ours, theirs, scenario)
+    assert found["same"] == 0.5 and found["correlation"] == pytest.approx(1.0)
+    assert np.isnan(agreement(ours, theirs, np.zeros(4, int))["correlation"])
+    nobody = np.zeros(4, bool)
+    assert agreement(nobody, nobody, scenario)["kappa"] == 0.0
 
 
 def test_kappa_is_one_for_equal_outcomes_and_zero_for_independent_ones():

@@ -215,6 +215,21 @@ def test_a_plan_from_scratch_is_flown_if_it_violates_less_or_costs_less(fresh, w
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("seen", [0.25, 0.6])
+def test_a_hit_planned_once_without_noise_lands_on_the_target(seen):
+    served = volleys(4, REAL_SCENARIOS["S.4"], seen=seen)
+    flights = fly_hits(Loop(HIT_WORLD), served)
+    assert flights.miss.max() < 0.05
+    # The first plan starts when the ball has been observed for `seen` seconds.
+    np.testing.assert_allclose(flights.flown.began, seen, atol=1e-3)
+
+
+def test_a_serve_without_time_for_observations_is_rejected():
+    with pytest.raises(ValueError, match="seen must be > 0 and <= 1, got 0"):
+        volleys(1, seen=0.0)
+
+
+@pytest.mark.slow
 def test_a_replanned_hit_lands_on_the_target():
     served = volleys(4, REAL_SCENARIOS["S.4"])
     assert fly_hits(Loop(HIT_WORLD, replan=50.0), served).miss.max() < 0.05

@@ -12,6 +12,7 @@ import numpy as np
 from jax import Array
 
 from planner_jax.ball.flight import BallState
+from planner_jax.core.choices import require
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.planner import Planner
 from planner_jax.optimise.planner import SearchPlanner
@@ -44,7 +45,7 @@ from planner_jax.sims.recording import Launches
 from planner_jax.sims.robots.quadrotor.robot import Quadrotor
 from planner_jax.sims.scenery import Part
 from planner_jax.sims.scoring import Contact, passage, racket_impact
-from planner_jax.sims.settings import HitFly
+from planner_jax.sims.settings import LATEST_PLAN, HitFly
 from planner_jax.sims.task import BallFlightTask, FlightCases, Flights
 from planner_jax.task.hit import court
 from planner_jax.task.hit.api import planner as hit_planner
@@ -56,8 +57,8 @@ from planner_jax.task.hit.replan import REMAINDER
 from planner_jax.task.hit.spec import REAL_SCENARIOS
 from planner_jax.task.hit.suites import DEPTH, GRAVITY, SERVE_HEIGHT, generate_serves, to_cases
 
-# [s], time from a serve to the first plan; the ball flies more than 2 m [Yu2023catch, VII-A].
-SEEN = 0.25
+# [s], usual time from a serve to the first plan; the ball flies more than 2 m [Yu2023catch, VII-A].
+SEEN = HitFly.seen
 _AFTER = 0.1  # [s], simulated time after the last planned impact
 _LONGEST = 1.9  # [s], duration of the longest flight of a serve
 _NEAR, _FAR = 0.5, 1.0  # [m], distances from the target: the two success radii of [Yu2023bat]
@@ -170,6 +171,7 @@ class Volleys(FlightCases):
 
     cases: HitCase  # leaves (B, ...), with the true ball and drag
     believed: np.ndarray  # (B,), initial estimate of K_D [1/m]
+    seen: float = SEEN  # [s], time from a serve to its first plan
 
 
 def volleys(
@@ -180,8 +182,9 @@ def volleys(
     drag_error: float = 0.0,
     robot: QuadrotorModel = PAPER_HITTER,
     wind: tuple[float, ...] | None = None,
+    seen: float = SEEN,
 ) -> Volleys:
-    """Draw serves, and return them at the start of their plans, `SEEN` seconds after the serve.
+    """Draw serves, and return them at the start of their plans, `seen` seconds after the serve.
 
     Args:
         num: B >= 1, number of serves.
@@ -190,14 +193,16 @@ def volleys(
         drag_error: relative error of the initial estimate of K_D, of random sign.
         robot: a quadrotor with a racket.
         wind: (3,) [m/s], velocity of the air, for a robot with drag.
+        seen: [s], > 0 and <= 1.
     """
     if not 0.0 <= drag_error < 1.0:
         raise ArgumentError("drag_error", ">= 0 and < 1", drag_error)
-    cases = to_cases(generate_serves(num, seed, names), delay=SEEN, robot=robot, wind=wind)
+    require(0.0 < seen <= LATEST_PLAN, "seen", f"> 0 and <= {LATEST_PLAN:g}", seen)
+    cases = to_cases(generate_serves(num, seed, names), delay=seen, robot=robot, wind=wind)
     sign = np.random.default_rng([seed, 1]).choice([-1.0, 1.0], num)
     true = np.asarray(cases.drag)
     believed = (true * (1.0 + drag_error * sign)).astype(np.float32)
-    return Volleys(np.arange(num), jax.tree.map(np.asarray, cases), believed)
+    return Volleys(np.arange(num), jax.tree.map(np.asarray, cases), believed, seen)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -271,7 +276,7 @@ def fly_hits(
     compiled = begin_compiling(loop, pilot, flight, truth, drag)
     balls = jax.tree.map(lambda leaf: leaf[:, None], truth.ball)
     guess = jnp.asarray(cases.believed)[:, None]
-    flight = launch_ball(loop, flight, balls, drag, guess, ball=0, seen=SEEN)
+    flight = launch_ball(loop, flight, balls, drag, guess, ball=0, seen=cases.seen)
     known = jax.block_until_ready(_predict_cases(loop, flight, truth))
     clock = time.perf_counter()
     first = jax.block_until_ready(plan_all(planner, known)) if plan is None else plan
@@ -281,7 +286,7 @@ def fly_hits(
     # arrays of later plans would not, and JAX would compile the programs twice.
     begun = jax.tree.map(jnp.asarray, jax.device_get(first))
     flight = dataclasses.replace(flight, plan=begun, began=flight.time, present=flight.launched)
-    periods = loop.num_periods(_LONGEST - SEEN + _AFTER)
+    periods = loop.num_periods(_LONGEST - cases.seen + _AFTER)
     compiled()
     flight, records = fly_leg(loop, pilot, flight, known, drag, num_periods=periods)
     back, truth = _reflect_balls(flight.contact, truth), cases.cases
@@ -325,6 +330,7 @@ class HitFlight(BallFlightTask):
             drag_error=settings.drag_error,
             robot=self.robot,
             wind=settings.wind,
+            seen=settings.seen,
         )
 
     def fly(self, cases: Volleys, record: bool) -> HitFlights:
@@ -339,7 +345,7 @@ class HitFlight(BallFlightTask):
         back = _reflect_balls(flown.contact, truth)
         balls = jax.tree.map(lambda leaf: leaf[:, None], truth.ball)
         drag = truth.drag[:, None]
-        return Launches(balls, drag, np.zeros(1), SEEN, returned=back, target=truth.target)
+        return Launches(balls, drag, np.zeros(1), cases.seen, returned=back, target=truth.target)
 
     @property
     def suite(self) -> str:

@@ -53,6 +53,7 @@ fly catch --balls 13                         | --balls must be <=
 fly catch --redecide 7                       | --redecide must be
 fly intercept --latency nan                  | --latency must
 fly block --torque 0                         | --torque must
+fly hit --seen 0                             | --seen must be > 0 and <= 1, got 0
 fly hit --replan 1e300                       | --replan must be <=
 fly hit --video a/b.gif                      | --video must be a file name
 fly catch --noise x                          | --noise must

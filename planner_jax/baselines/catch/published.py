@@ -14,8 +14,9 @@ SOURCE = (
 
 def find_number(quantity: str, suite: str) -> Published | None:
     """Return a number of [Yu2023catch] for a suite: "success", "OTR" or "MPP success"."""
-    table = "Table I" if suite == "throws" else "Table III"
-    return BY_ROW.get(("Yu2023catch", table, f"{quantity} {suite}"))
+    name = suite.removeprefix("paper-")
+    table = "Table I" if name == "throws" else "Table III"
+    return BY_ROW.get(("Yu2023catch", table, f"{quantity} {name}"))
 
 
 def make_table(manifest: Entries) -> RateTable:

@@ -4,6 +4,7 @@ The transition is a state before the hit at which the quadrotor starts its swing
 """
 
 import dataclasses
+import functools
 import math
 from typing import Any
 
@@ -15,11 +16,12 @@ from jax import Array, lax
 from planner_jax.ball.flight import BallState, drag_free_fall_time, fly, solve_impact
 from planner_jax.baselines.hit.common import largest_violation, make_impact, motion_excess
 from planner_jax.baselines.hit.decoupled import aim_at_angle, solve_decoupled_hit
+from planner_jax.baselines.parts.lbfgs_lite import LitePlanner, LiteRule
 from planner_jax.baselines.parts.minimum_jerk import minimum_jerk
 from planner_jax.core.choices import require, require_size
 from planner_jax.core.protocol import require_settings
 from planner_jax.cost.penalty import join_trapezoid_weights
-from planner_jax.optimise.planner import Problem, SearchPlanner, pending
+from planner_jax.optimise.planner import Problem, pending
 from planner_jax.optimise.settings import Attempt, Evaluation, LbfgsConfig
 from planner_jax.penalties.hinges import smooth_hinge
 from planner_jax.penalties.hits import apex_excess, hitting_speed_excess
@@ -115,6 +117,8 @@ class BatHit(Problem):
       start to the hit (eqs 18c and 18d). The variable log T keeps T positive (eq. 18b). The cost is
       a weighted sum of the squared snap, T and smooth penalties (eqs 18a, 20-22 and 24a).
     - L-BFGS runs from one start. Its last iterate is returned even if this iterate breaks limits.
+      The planner `bat` has the stopping rule and line search of LBFGS-Lite (`LitePlanner`), and
+      the paper's variables without other units.
 
     Two misprints are corrected. Eq. 18a compares the square of a quantity with its limit; here it
     is compared with the limit's square. Eq. 22 computes the ball's apex from the x component of its
@@ -127,10 +131,11 @@ class BatHit(Problem):
     - `transition_point` interprets the ray of Fig. 4, and `transition_state` the thrust of Fig. 4b.
     - The jerk at the impact is zero.
     - Bat-Lite's initial guess is one primitive straight to the impact, of duration T_0.
-    - Weights, numbers of pieces and nodes, and the stopping rule are usual values.
+    - Weights and numbers of pieces and nodes are usual values.
 
-    The number of L-BFGS iterations, 80, is fitted to the mean success rates of the published
-    trials, but the published planners succeed on other serves (docs/lab/hit.md).
+    The planner `bat-fitted` stops after 80 iterations of the library's L-BFGS (`attempts`). This
+    number is fitted to the mean success rates of the published trials, but the published planners
+    succeed on other serves (docs/lab/hit.md).
 
     This planner ignores the additional limits of a case (`extras`); the referee checks them.
     """
@@ -312,9 +317,16 @@ class BatHit(Problem):
         ).with_heading(case)
 
 
-def bat_lite(**options: Any) -> SearchPlanner:
-    """Make the planner `bat-lite`, of a `BatHit` without the state at which a swing starts.
+def bat(rule: LiteRule = LiteRule(), **options: Any) -> LitePlanner:  # noqa: B008
+    """Make the planner `bat`: a `BatHit`, minimised as by LBFGS-Lite in the paper's variables.
 
-    `options` are other fields of `BatHit`.
+    `rule` stops the search, and `options` are fields of `BatHit`.
     """
-    return BatHit.planner(transition=False, **options)
+    problem = BatHit(**options)
+    plain = dataclasses.replace(problem, scale=(1.0,) * len(problem.scale))
+    return LitePlanner(plain, _COST_UNIT, rule)
+
+
+# The same planners without the state at which a swing starts.
+bat_lite = functools.partial(bat, transition=False)
+bat_lite_fitted = functools.partial(BatHit.planner, transition=False)

@@ -17,12 +17,20 @@ class Suite:
 
 SUITES = {
     "throws": Suite(1, 1.42, "The paper's throws: with drag, to within 2 m x 0.8 m."),
+    "paper-throws": Suite(
+        1,
+        1.48,
+        "Throws that are planned after 2 m of flight above 2.8 m, as the paper's first ball.",
+    ),
     "hard": Suite(1, 1.22, "Throws to within 4 m x 3 m, planned for 0.2 s later."),
     "parabola1": Suite(
         1, 1.66, "A throw without drag, to a height that follows from its flight time."
     ),
     "parabola2": Suite(2, 1.96, "Two throws without drag, in the air together."),
     "harmonic2": Suite(2, 7.0, "Two targets that swing in height and drift across."),
+    "paper-harmonic2": Suite(
+        2, 7.0, "Two targets that swing by the paper's formula: amplitude 1 m, no drift, phase 0."
+    ),
     "triangle3": Suite(3, 6.0, "Three targets along the sides of a triangle."),
     "hexagon6": Suite(6, 10.0, "Six targets in parallel, on a hexagon."),
     "square4": Suite(4, 10.0, "Four targets in parallel, on a square."),

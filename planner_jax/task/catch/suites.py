@@ -52,6 +52,12 @@ _THROWS = {
         _Throw(flight=(1.7, 2.0), drag=0.0, delay=0.0),
     ),
 }
+# [Yu2023catch, Section VII-A] states the machine, the landing rectangle, the longest flight, the
+# height of the hall, and the rules of when planning starts.
+_PAPER_THROW = _Throw(flight=(1.4, 1.9))
+_CEILING, _FLOWN, _PLANNED_ABOVE = 4.2, 2.0, 2.8  # [m]: apex, distance and height of a ball
+_LONGEST_LEFT = 1.6  # [s], greatest time from the plan to the landing
+_DRAWS = 12  # throws that are drawn for a case; three of four are valid
 
 
 def draw(
@@ -144,6 +150,43 @@ def _throws(uniform: PyTree, throws: tuple[_Throw, ...]) -> tuple[BallPath, PyTr
 
 
 def _throw(uniform: PyTree, throw: _Throw) -> tuple[PyTree, PyTree, PyTree]:
+    vel, flight = _launch(uniform, throw)
+    return _await(vel, flight, np.full(len(flight), throw.delay), throw.drag)
+
+
+def _paper_throws(uniform: PyTree) -> tuple[BallPath, PyTree]:
+    """Return throws that follow the rules of [Yu2023catch, Section VII-A] for the first ball.
+
+    Planning starts when the ball has flown 2 m and is above 2.8 m. Of `_DRAWS` throws, the first
+    one is returned that does so before its apex, whose apex is at most 4.2 m high, and that lands
+    at most 1.6 s after planning starts.
+    """
+    xp, throw = _module(uniform), _PAPER_THROW
+    vel, flight = _launch(uniform.reshape(-1, 3), throw)
+    launch = np.broadcast_to(LAUNCH, vel.shape)
+    top = xp.log1p(throw.drag / GRAVITY * vel[:, 2]) / throw.drag  # when the ball is at its apex
+
+    def has_come(time: PyTree) -> PyTree:
+        pos, _ = _fly(launch, vel, time, throw.drag)
+        far = xp.sum((pos - launch) ** 2, axis=1) >= _FLOWN**2
+        return far & (pos[:, 2] >= _PLANNED_ABOVE)
+
+    early, late = xp.zeros_like(top), top
+    for _ in range(_BISECTIONS):
+        middle = 0.5 * (early + late)
+        come = has_come(middle)
+        early, late = xp.where(come, early, middle), xp.where(come, middle, late)
+    low = _fly(launch, vel, top, throw.drag)[0][:, 2] <= _CEILING
+    good = has_come(late) & low & (flight - late <= _LONGEST_LEFT)
+    first = xp.argmax(good.reshape(-1, _DRAWS), axis=1) + _DRAWS * np.arange(len(uniform))
+    chosen = _await(vel[first], flight[first], late[first], throw.drag)
+    pos, vel, horizon = (each[:, None] for each in chosen)
+    drag, gravity = np.full(pos.shape, throw.drag), np.full(horizon.shape, GRAVITY)
+    return BallPath(BallState(pos=pos, vel=vel), host_leaf(drag), host_leaf(gravity)), horizon
+
+
+def _launch(uniform: PyTree, throw: _Throw) -> tuple[PyTree, PyTree]:
+    """Return launch velocities (B, 3) [m/s] and flight times (B,) [s] of random throws."""
     xp = _module(uniform)
     level = (2.0 * uniform[:, :2] - 1.0) * xp.asarray(throw.land)
     land = xp.concatenate([level, xp.zeros_like(level[:, :1])], axis=1)
@@ -152,14 +195,21 @@ def _throw(uniform: PyTree, throw: _Throw) -> tuple[PyTree, PyTree, PyTree]:
     # The landing point is an affine function of the launch velocity: solve for the velocity.
     without, _ = _fly(launch, xp.zeros_like(land), flight, throw.drag)
     share, _ = _fly(xp.zeros_like(land), xp.ones_like(land), flight, throw.drag, gravity=0.0)
-    delay = np.full(len(land), throw.delay)
-    pos, vel = _fly(launch, (land - without) / share, delay, throw.drag)
+    return (land - without) / share, flight
+
+
+def _await(
+    vel: PyTree, flight: PyTree, delay: PyTree, drag: float
+) -> tuple[PyTree, PyTree, PyTree]:
+    """Return balls a time `delay` after their launch, and the latest times of their catches."""
+    xp = _module(vel)
+    pos, vel = _fly(np.broadcast_to(LAUNCH, vel.shape), vel, delay, drag)
     # Bisection for the latest time of a catch, at which the ball falls below `CATCH_HEIGHT`.
     rise = xp.maximum(vel[:, 2], 0.0) / GRAVITY
     early, late = xp.minimum(0.5 * rise, flight - delay), flight - delay
     for _ in range(_BISECTIONS):
         middle = 0.5 * (early + late)
-        above = _fly(pos, vel, middle, throw.drag)[0][:, 2] > CATCH_HEIGHT
+        above = _fly(pos, vel, middle, drag)[0][:, 2] > CATCH_HEIGHT
         early, late = xp.where(above, middle, early), xp.where(above, late, middle)
     return pos, vel, early
 
@@ -197,13 +247,19 @@ def _lines(pos: PyTree, vel: PyTree) -> BallPath:
     return BallPath(ball, drag=drag, gravity=gravity)
 
 
-def _harmonic(uniform: PyTree) -> tuple[HarmonicPath, PyTree]:
+def _harmonic(
+    uniform: PyTree,
+    *,
+    speed: tuple[float, float] = (1.0, 1.5),
+    amplitude: tuple[float, float] = (0.6, 1.0),
+    turn: float = 2.0 * np.pi,
+) -> tuple[HarmonicPath, PyTree]:
     u = uniform.reshape(len(uniform), 2, 9)
-    drift = _between(u[..., :1], 1.0, 1.5) * _unit(2.0 * np.pi * u[..., 1])
+    drift = _between(u[..., :1], *speed) * _unit(2.0 * np.pi * u[..., 1])
     xp, level = _module(u), _between(u[..., 2:3], 0.0, 1.5) * _unit(2.0 * np.pi * u[..., 3])
     near = xp.concatenate([level[..., :2], _between(u[..., 4:5], 2.0, 2.5)], axis=-1)
-    swing = xp.concatenate([xp.zeros_like(u[..., :2]), _between(u[..., 5:6], 0.6, 1.0)], axis=-1)
-    rate, phase = _between(u[..., 6], 1.5, 2.5), 2.0 * np.pi * u[..., 7]
+    swing = xp.concatenate([xp.zeros_like(u[..., :2]), _between(u[..., 5:6], *amplitude)], axis=-1)
+    rate, phase = _between(u[..., 6], 1.5, 2.5), turn * u[..., 7]
     when = _between(u[..., 8:9], 2.0, 5.0)
     leaves: tuple[PyTree, ...] = (near - drift * when, drift, swing, rate, phase)
     return HarmonicPath(*leaves), np.full(when.shape[:2], SUITES["harmonic2"].horizon)
@@ -255,7 +311,12 @@ _PATHS: dict[str, tuple[int, Callable[[PyTree], tuple[TargetPath, PyTree]]]] = {
     **{
         name: (3 * len(throws), partial(_throws, throws=throws)) for name, throws in _THROWS.items()
     },
+    "paper-throws": (3 * _DRAWS, _paper_throws),
     "harmonic2": (18, _harmonic),
+    "paper-harmonic2": (
+        18,
+        partial(_harmonic, speed=(0.0, 0.0), amplitude=(1.0, 1.0), turn=0.0),
+    ),
     "triangle3": (7, _triangle),
     "hexagon6": (8, _hexagon),
     "square4": (8, partial(_polygon, num=4)),

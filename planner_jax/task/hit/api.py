@@ -76,6 +76,7 @@ def planner(
     * `exact`: recommended; every plan satisfies the equations of contact, impact and landing.
     * `bat`: the planner of [Yu2023bat], which optimises impact and trajectory together.
     * `bat-lite`: `bat` without its extra state before the impact, at which the swing starts.
+    * `bat-fitted` and `bat-lite-fitted`: the same with 80 iterations, fitted to published rates.
     * `juggle`: the baseline of [Yu2023bat]: a motion primitive to a fixed impact, not optimised.
 
     Args:
@@ -86,9 +87,9 @@ def planner(
         **options: `attempts`, and fields of the problem's dataclass, such as `margin`.
 
     Returns:
-        A planner for `pj.plan`: a `JuggleHit`, or a `SearchPlanner` of a `HitProblem` or `BatHit`
-        (`bat` and `bat-lite`). With a `recovery` the result is a planner whose field `planner`
-        holds this planner.
+        A planner for `pj.plan`: a `JuggleHit`, a `SearchPlanner` of a `HitProblem` or `BatHit`
+        (the fitted planners), or a `LitePlanner` of a `BatHit`. With a `recovery` the result is a
+        planner whose field `planner` holds this planner.
 
     Raises:
         ValueError: no planner has the requested name, or it does not support the effort.

@@ -26,8 +26,10 @@ TASK = Task(
     home="planner_jax.task.hit",
     planners={
         "exact": "planner_jax.task.hit.default_planner:HitProblem.planner",
-        "bat": "planner_jax.baselines.hit.bat:BatHit.planner",
+        "bat": "planner_jax.baselines.hit.bat:bat",
         "bat-lite": "planner_jax.baselines.hit.bat:bat_lite",
+        "bat-fitted": "planner_jax.baselines.hit.bat:BatHit.planner",
+        "bat-lite-fitted": "planner_jax.baselines.hit.bat:bat_lite_fitted",
         "juggle": "planner_jax.baselines.hit.juggle:JuggleHit",
     },
     suites={
