@@ -24,7 +24,7 @@ Classes for parts of cases and plans:
 * extra limits and costs that a user adds to a case as its `extras`: `KeepOut`, `KeepOutBox`,
   `Plane`, `Geofence`, `SpeedZone`, `Dislike`, or any class with the same methods
 * targets in space: `BallState`, `fly`, `BallPath`, `HarmonicPath`, `table_path`, `predict_path`,
-  `target_at`; in the plane: `TurningPath`, `PolynomialPath`
+  `target_at`; in the plane: `TurningPath`, `PolynomialPath`, `ControlledPath`
 * `ball.fit`: estimates and predicts the flight of a ball from a recording
 * `penalties`: the penalties of the published planners, as pure functions
 * obstacles of a car: `Obstacles`, made by `obstacles`

@@ -38,6 +38,7 @@ from .optimise.settings import LbfgsConfig as LbfgsConfig
 from .optimise.settings import NewtonConfig as NewtonConfig
 from .plane.make_obstacles import obstacles as obstacles
 from .plane.obstacles import Obstacles as Obstacles
+from .plane.target import ControlledPath as ControlledPath
 from .plane.target import PolynomialPath as PolynomialPath
 from .plane.target import TurningPath as TurningPath
 from .planning.gradient import gradient as gradient

@@ -9,6 +9,7 @@ from closed_forms import positions_on
 from planner_jax.core.protocol import take
 from planner_jax.referee.clearance import clearances
 from planner_jax.referee.intercept import referee_intercepts
+from planner_jax.sims.prediction.polynomial_fit import fit_polynomial
 from planner_jax.task.intercept import suites
 from planner_jax.task.intercept.api import draw, observe
 from planner_jax.task.intercept.plan import InterceptPlan
@@ -17,7 +18,7 @@ from planner_jax.task.intercept.spec import SUITES
 from tests.trees import as_numpy
 
 NUM, SEED = 24, 3
-PLAIN = [name for name, suite in SUITES.items() if not suite.is_maze]
+PLAIN = [name for name, suite in SUITES.items() if not (suite.is_maze or suite.wall_boxes)]
 
 each_suite = pytest.mark.parametrize("name", SUITES)
 
@@ -46,7 +47,7 @@ def test_a_case_is_the_same_in_every_batch(name):
     for a, b in zip(*map(jax.tree.leaves, (whole, again)), strict=True):
         np.testing.assert_array_equal(a[2:5], b)
         assert a.dtype in (np.float32, bool)
-    assert (whole.target.pos != np.asarray(draw(7, name, 6).target.pos)).all()
+    assert (whole.start[:, 1] != np.asarray(draw(7, name, 6).start)[:, 1]).all()
 
 
 def test_a_suite_depends_on_its_name_and_the_seed_alone():
@@ -102,7 +103,7 @@ def test_polygons_are_convex_and_their_sizes_in_range(batches, name):
         assert np.ptp(around) > 0.8 * (radius[1] - radius[0])
 
 
-@each_suite
+@pytest.mark.parametrize("name", [name for name in SUITES if not SUITES[name].mover_boxes])
 def test_movers_cross_the_straight_line_at_the_time_of_a_drive_at_constant_speed(batches, name):
     cases, suite = batches[name].cases, SUITES[name]
     present, velocity = cases.movers.present, cases.movers.velocity
@@ -123,6 +124,10 @@ def test_targets_stay_on_the_map_and_off_the_walls(batches, name):
     path = positions_on(cases.target, np.linspace(0.0, suite.time, 400))
     assert path.min() >= -1e-3 and path.max() <= suites.SIZE + 1e-3
     assert least_distance(cases.walls, path).min() > 0.0
+    if any(suite.control):
+        mean = np.linalg.norm(path[:, -1] - path[:, 0], axis=1) / suite.time
+        assert 0.2 <= mean.min() and mean.max() <= 0.5
+        return
     speed = np.linalg.norm(cases.target.vel, axis=1)
     assert 0.2 <= speed.min() and speed.max() <= 0.5
     rate = np.abs(cases.target.turn_rate)
@@ -169,6 +174,31 @@ def test_a_car_that_brakes_at_once_stops_before_every_wall(batches, name):
     verdict = referee_intercepts(cases, plans)
     assert verdict.wall_clearance.min() > 0.0
     assert set(verdict.failed_limit) <= {"mover", "meeting"}
+
+
+def test_controls_change_the_velocity_by_0_4_m_per_s_from_the_first_observation(batches, float64):
+    cases = batches["qu-curve"].cases
+    times, positions = observe(cases, 0, noise=0.0, until=10.0)
+    changes = np.diff(positions, 2, axis=1)
+    np.testing.assert_allclose(changes, np.tile([0.0, 0.4], (NUM, 23, 1)), atol=1e-9)
+    # A polynomial of degree 2 is through the whole seconds, and between them at most u / 8 apart.
+    with jax.numpy_dtype_promotion("standard"):
+        fit = jax.vmap(lambda seen: fit_polynomial(times[:15], seen, 2))(positions[:, :15])
+    for ahead, error in ((10.0, 0.0), (9.5, 0.05)):
+        found = jax.vmap(lambda path, t=ahead: path.at(t).pos)(fit)
+        off = np.abs(found - positions_on(cases.target, np.array([ahead]))[:, 0])
+        np.testing.assert_allclose(off, np.tile([0.0, error], (NUM, 1)), atol=1e-6)
+
+
+def test_the_map_has_the_same_walls_and_movers_in_every_case(batches):
+    cases, suite = batches["qu-map"].cases, SUITES["qu-map"]
+    for group, boxes in ((cases.walls, suite.wall_boxes), (cases.movers, suite.mover_boxes)):
+        for number, (*box, velocity_x, velocity_y) in enumerate((*b, 0.0, 0.0)[:6] for b in boxes):
+            corners = group.centre[:, number, None] + group.corners[:, number]
+            np.testing.assert_allclose(corners.min(axis=1), np.tile(box[:2], (NUM, 1)))
+            np.testing.assert_allclose(corners.max(axis=1), np.tile(box[2:], (NUM, 1)))
+            velocity = np.tile([velocity_x, velocity_y], (NUM, 1))
+            np.testing.assert_array_equal(group.velocity[:, number], velocity)
 
 
 def test_a_mazes_walls_have_one_gap_each_and_dead_ends_before_them(batches):

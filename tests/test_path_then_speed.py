@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import json
 from typing import Any
 
 import jax
@@ -15,6 +16,8 @@ from planner_jax.baselines.intercept import path_then_speed
 from planner_jax.baselines.intercept import projection as projections
 from planner_jax.baselines.intercept.path import path_along, path_beside, path_of_drive
 from planner_jax.baselines.intercept.static_paths import count_turns
+from planner_jax.benchmarks import intercept_stages
+from planner_jax.benchmarks.run import Bench
 from planner_jax.plane.make_obstacles import obstacles
 from planner_jax.plane.obstacles import separation
 from planner_jax.plane.reach import Lattice
@@ -262,3 +265,30 @@ def test_the_paper_s_planner_searches_smooths_and_drives(scenes):
     assert plans.status.tolist() == [status for _, status in SCENES.values()]
     verdict = pj.intercept.judge(scenes[0], plans)
     np.testing.assert_array_equal(verdict.success, plans.status == pj.Status.CONVERGED)
+
+
+@pytest.mark.slow
+def test_searched_paths_leave_curvature_for_the_path_without_jumps():
+    pytest.importorskip("numba", reason="the extra `baselines` is not installed")
+    planner, case = pj.intercept.planner("paper"), pj.take(pj.intercept.draw(1, "qu-map", 0), 0)
+    poses, curvature, length, is_found = planner.search_path(case)
+    assert is_found and 0.69 * 2.0 < np.abs(curvature).max() <= 0.7 * 2.0 + 1e-6
+    path = jax.jit(planner.path)(case, poses, curvature, length)
+    assert np.abs(path.curvature).max() <= 2.0
+
+
+@pytest.mark.slow
+def test_stages_lose_the_cases_that_the_referee_does_not_accept(tmp_path):
+    pytest.importorskip("numba", reason="the extra `baselines` is not installed")
+    planner, num = pj.intercept.planner("paper"), 4
+    with Bench("intercept_stages", {}, tmp_path / "run") as bench:
+        intercept_stages.run(bench, planner, "qu-map", num, 0)
+    rows = json.loads((tmp_path / "run" / "rows.json").read_text())
+    times = {row["stage"]: row["mean"] for row in rows if row["table"] == "times"}
+    assert 0.0 < sum(times[part] for part in intercept_stages.PARTS[:-1]) < 1.001 * times["total"]
+    losses = [row for row in rows if row["table"] == "losses"]
+    assert [row["stage"] for row in losses] == list(intercept_stages.PASSED)
+    cases = pj.intercept.draw(num, "qu-map", 0)
+    accepted = pj.intercept.judge(cases, pj.plan(planner, cases)).success.sum()
+    assert num - sum(row["lost"] for row in losses) == losses[-1]["cases"] == accepted > 0
+    assert intercept_stages.count_passed(np.array([[True, False, True], [True] * 3])) == [2, 1, 1]

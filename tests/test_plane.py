@@ -4,6 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from closed_forms import recursion
+from derivatives import assert_gradient_matches_differences
 
 import planner_jax as pj
 from planner_jax.plane import reach
@@ -99,6 +101,40 @@ def test_a_turning_path_is_a_circle_and_a_line_without_turning(float64):
     for path in (circle, pj.PolynomialPath(jnp.array([pos, vel, vel**2]), jnp.array(0.5))):
         ahead, behind = path.at(1.0 + 1e-6).pos, path.at(1.0 - 1e-6).pos
         np.testing.assert_allclose((ahead - behind) / 2e-6, path.at(1.0).vel, rtol=1e-7)
+
+
+def test_a_controlled_path_is_the_recursion_and_straight_between_its_steps(float64):
+    random = np.random.default_rng(3)
+    state, controls = random.uniform(-1.0, 1.0, 4), random.uniform(-0.4, 0.4, (6, 2))
+    path = pj.ControlledPath(*map(jnp.asarray, (state, controls, 0.5)))
+    states, at = recursion(state, controls, 0.5), jax.jit(jax.vmap(path.at))
+    for time, share in ((0.5 * np.arange(7), 0.0), (0.5 * np.arange(7) + 0.2, 0.2)):
+        found = at(jnp.asarray(time))
+        np.testing.assert_allclose(found.pos, states[:, :2] + share * states[:, 2:], atol=1e-14)
+        np.testing.assert_allclose(found.vel, states[:, 2:], atol=1e-14)
+    before, after = path.at(-2.0), path.at(9.0)
+    np.testing.assert_allclose(before.pos, state[:2] - 2.0 * state[2:], atol=1e-14)
+    np.testing.assert_allclose(after.pos, states[-1, :2] + 6.0 * states[-1, 2:], atol=1e-14)
+    still = pj.ControlledPath(path.state, jnp.zeros((0, 2)), path.step).at(3.0)
+    np.testing.assert_allclose(still.pos, state[:2] + 3.0 * state[2:], atol=1e-14)
+
+
+def test_derivatives_of_a_controlled_path_are_its_velocity_and_differences(float64):
+    path = pj.ControlledPath(jnp.arange(4.0), jnp.array([[0.0, 0.4], [0.3, -0.1]]), jnp.array(1.0))
+    for time in (-0.5, 0.7, 1.0, 1.6, 2.0, 5.0):  # at a step the velocity after it
+        moved, state = jnp.asarray(time), path.at(time)
+        _, vel = jax.jvp(lambda t: path.at(t).pos, (moved,), (jnp.ones(()),))
+        np.testing.assert_array_equal(vel, state.vel)
+    assert_gradient_matches_differences(lambda path: jnp.sum(path.at(2.3).pos ** 2), path)
+
+
+def test_a_case_far_from_the_world_s_origin_moves_a_controlled_path():
+    path = pj.ControlledPath(jnp.zeros(4), jnp.ones((2, 2)), jnp.array(1.0))
+    case = pj.intercept.case(path, origin=(1000.0, -500.0), start=(1000.8, -496.0, 0.0))
+    for time in (0.0, 1.5):
+        np.testing.assert_array_equal(
+            case.target.at(time).pos - path.at(time).pos, [-1000.0, 500.0]
+        )
 
 
 LATTICE = reach.Lattice(layers=20)

@@ -12,7 +12,13 @@ from flax import struct
 from referees import add, checks, edit, failure, tree
 from scipy.integrate import solve_ivp
 
-from planner_jax.plane.target import LaterPath, PointState, PolynomialPath, TurningPath
+from planner_jax.plane.target import (
+    ControlledPath,
+    LaterPath,
+    PointState,
+    PolynomialPath,
+    TurningPath,
+)
 from planner_jax.referee.clearance import clearances
 from planner_jax.referee.intercept import InterceptVerdict, referee_intercepts, target_positions_of
 from planner_jax.task.intercept.api import position_setting
@@ -376,10 +382,11 @@ def test_referee_and_planner_agree_where_a_target_is():
         return random.standard_normal((num, *shape))
 
     rates = np.where(np.arange(num) < 10, 0.0, 0.1 * draw())
-    make: list[Any] = [TurningPath, PolynomialPath, LaterPath]
+    make: list[Any] = [TurningPath, PolynomialPath, LaterPath, ControlledPath]
     turning = make[0](pos=draw(2), vel=draw(2), turn_rate=rates)
     polynomial = make[1](coeffs=0.1 * draw(4, 2), origin=draw())
-    paths = [turning, polynomial]
+    controlled = make[3](state=draw(4), controls=draw(5, 2), step=random.uniform(0.5, 2.0, num))
+    paths = [turning, polynomial, controlled]
     paths += [make[2](path=path, begin=random.uniform(0.0, 5.0, num)) for path in paths]
     for path in paths:
         assert position_setting(path) == {}

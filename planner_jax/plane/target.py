@@ -70,6 +70,29 @@ class PolynomialPath:
 
 
 @struct.dataclass
+class ControlledPath:
+    """A target whose velocity changes by a control input at equal steps in time [Qu2022, eq. 3].
+
+    With the position x_k, the velocity v_k and the control u_k at the time k h, the recursion is
+    x_{k+1} = x_k + h v_k and v_{k+1} = v_k + u_k. The path is straight between these times, before
+    time 0, and after the last of the K controls.
+    """
+
+    state: Array  # (4,) x, y [m] and their derivatives [m/s], at time 0
+    controls: Array  # (K, 2) [m/s], u_0 to u_{K-1}
+    step: Array  # () h [s], > 0
+
+    def at(self, time: Array) -> PointState:
+        """Return position [m] and velocity [m/s], right-continuous, at one time () [s]."""
+        numbers = jnp.arange(1, len(self.controls) + 1, dtype=self.controls.dtype)
+        passed = (time - self.step * numbers)[:, None]
+        changes = jnp.where(passed >= 0.0, self.controls, 0.0)
+        start, vel = self.state[:2], self.state[2:]
+        pos = start + time * vel + jnp.sum(passed * changes, axis=0)
+        return PointState(pos=pos, vel=vel + jnp.sum(changes, axis=0))
+
+
+@struct.dataclass
 class PositionPath:
     """A path whose velocity is the derivative of the positions that another path returns."""
 
@@ -156,9 +179,9 @@ def move_path(path: PlanePath, by: np.ndarray) -> PlanePath:
     The vector is added in float64. Paths of other classes are returned unchanged.
     """
 
-    def add(leaf: Array, index: tuple = ()) -> Array:
+    def add(leaf: Array, *index: int | slice) -> Array:
         moved = np.array(leaf, np.float64)
-        moved[(..., *index, slice(None))] += by
+        moved[(..., *(index or (slice(None),)))] += by
         return jnp.asarray(moved.astype(np.result_type(np.asarray(leaf).dtype, np.float32)))
 
     if isinstance(path, LaterPath):
@@ -166,7 +189,9 @@ def move_path(path: PlanePath, by: np.ndarray) -> PlanePath:
     if isinstance(path, TurningPath | FadingPath):
         return dataclasses.replace(path, pos=add(path.pos))
     if isinstance(path, PolynomialPath):
-        return dataclasses.replace(path, coeffs=add(path.coeffs, (0,)))
+        return dataclasses.replace(path, coeffs=add(path.coeffs, 0, slice(None)))
+    if isinstance(path, ControlledPath):
+        return dataclasses.replace(path, state=add(path.state, slice(2)))
     return path
 
 

@@ -126,7 +126,8 @@ def referee_intercepts(
     not end before the case's earliest time, also if its planner does not choose the time.
 
     Target positions are computed in float64 for paths with the fields of `TurningPath` (recognised
-    by `turn_rate`), `PolynomialPath` (`coeffs`), or a `LaterPath` (`path` and `begin`) of either.
+    by `turn_rate`), `PolynomialPath` (`coeffs`), `ControlledPath` (`controls`), or a `LaterPath`
+    (`path` and `begin`) of one of them.
     For other classes `pj.intercept.judge` calls the target's own method `at`, as planners do.
 
     Args:
@@ -242,6 +243,16 @@ def target_positions_of(target: object, times: np.ndarray) -> np.ndarray:
             raise ValueError(f"target.coeffs must be ({len(times)}, n + 1, 2), got {shape}")
         powers = (times - leaf("origin"))[:, None] ** np.arange(shape[1])
         return np.einsum("bk,bki->bi", powers, leaf("coeffs", shape[1], 2))
+    if "controls" in fields:
+        shape = np.shape(fields["controls"])
+        if len(shape) != 3:
+            raise ValueError(f"target.controls must be ({len(times)}, K, 2), got {shape}")
+        state, controls = leaf("state", 4)[:, None], leaf("controls", shape[1], 2)
+        velocities = state[..., 2:] + np.pad(np.cumsum(controls, axis=1), [(0, 0), (1, 0), (0, 0)])
+        step, k = leaf("step")[:, None], np.arange(shape[1] + 1)
+        longest = np.where(k == shape[1], np.inf, step)
+        spent = np.clip(times[:, None] - k * step, np.where(k == 0, -np.inf, 0.0), longest)
+        return state[:, 0, :2] + np.einsum("bk,bki->bi", spent, velocities)
     raise ValueError(f"a target of class {type(target).__name__} needs target_positions")
 
 

@@ -34,11 +34,14 @@ _PACE = 1.2  # the path must be drivable, within the steering rate limit, at 1.2
 def paper_speed_step(end_weight: float | None = None) -> SpeedStep:
     """Return the settings with which [Qu2022] plans the speed along a path.
 
+    The paper does not state the number of pieces, which is 20 here.
+
     Args:
         end_weight: weight of the squared distance from the path's end at the meeting time, 300 in
             [Qu2022] for a meeting after 10 s. By default the path's end is reached exactly.
     """
-    speed = dataclasses.replace(SPEED_PLANNERS["trapezoid-edges"], end_weight=end_weight)
+    lines = SPEED_PLANNERS["trapezoid-edges"]
+    speed = dataclasses.replace(lines, pieces=20, end_weight=end_weight)
     return SpeedStep(speed=speed)
 
 
@@ -51,6 +54,9 @@ class PaperIntercept(Planner):
     smoothing: Smoothing = Smoothing()
     follow: FollowConfig = FollowConfig()
     step: SpeedStep = paper_speed_step()
+    # Greatest curvature of searched and smoothed paths, as a fraction of the car's limit. Beside
+    # them a path without curvature jumps turns more sharply, within the whole limit.
+    curvature_share: float = 0.7
     attempts: ClassVar[tuple[Search, ...]] = (Search(1),)  # pyright: ignore[reportIncompatibleMethodOverride]
 
     def solve_on_host(self, cases: InterceptCase, attempt: Search) -> InterceptPlan:
@@ -89,7 +95,7 @@ class PaperIntercept(Planner):
             case.start,
             goal,
             case.walls,
-            curvature=float(case.limits.curvature),
+            curvature=self.curvature_share * float(case.limits.curvature),
             body=(behind, ahead, half),
             lower=case.lower,
             upper=case.upper,
@@ -104,7 +110,7 @@ class PaperIntercept(Planner):
             curvatures,
             length,
             case.walls,
-            curvature=case.limits.curvature,
+            curvature=self.curvature_share * case.limits.curvature,
             body=ends_of(case.body),
             lower=case.lower,
             upper=case.upper,

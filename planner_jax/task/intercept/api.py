@@ -21,7 +21,13 @@ from planner_jax.plane.maps import read_map as read_map
 from planner_jax.plane.maps import walls_of_grid as walls_of_grid
 from planner_jax.plane.prediction import Prediction as Prediction
 from planner_jax.plane.prediction import predict as predict
-from planner_jax.plane.target import LaterPath, PlanePath, PolynomialPath, TurningPath
+from planner_jax.plane.target import (
+    ControlledPath,
+    LaterPath,
+    PlanePath,
+    PolynomialPath,
+    TurningPath,
+)
 from planner_jax.referee.intercept import InterceptVerdict, referee_intercepts
 from planner_jax.task.arguments import judge_by
 from planner_jax.task.intercept.case import InterceptCase
@@ -41,7 +47,8 @@ def draw(
     """Draw a batch of interception cases from a suite, a named family of random cases.
 
     "easy" (default), "medium" and "hard" have ever more obstacles, "storm" and "gale" many moving
-    ones, "maze" long walls with gaps, and "rush" little time. Suites of other packages are also
+    ones, "maze" long walls with gaps, and "rush" little time. The targets of "qu-curve" accelerate,
+    and "qu-map" has the walls of one map, both as in [Qu2022]. Suites of other packages are also
     accepted. The batch has the cases number `first` to `first` + `num` - 1 of suite and `seed`.
     """
     suite = suite_named(suite, "easy")
@@ -131,8 +138,9 @@ def planner(
 def judge(cases: InterceptCase, plans: InterceptPlan, **settings: object) -> InterceptVerdict:
     """Judge one plan, or a batch, by the referee, a check that is independent of the planners.
 
-    The referee computes the positions of targets of the classes `TurningPath`, `PolynomialPath` and
-    `LaterPath` itself. For other classes it calls the target's method `at` in float64.
+    The referee computes the positions of targets of the classes `TurningPath`, `PolynomialPath`,
+    `ControlledPath` and `LaterPath` itself. For other classes it calls the target's method `at` in
+    float64.
 
     The verdict has for each plan whether it is a `success`, the reason as text by `sentence(k)`,
     and the measured quantities. The settings are keyword arguments of `referee_intercepts`, such as
@@ -158,7 +166,8 @@ def position_setting(target: PlanePath) -> dict[str, object]:
     """
     while isinstance(target, LaterPath):
         target = target.path
-    return {} if type(target) in (TurningPath, PolynomialPath) else {"target_positions": positions}
+    known = TurningPath, PolynomialPath, ControlledPath
+    return {} if type(target) in known else {"target_positions": positions}
 
 
 def positions(target: PlanePath, times: Float[np.ndarray, " B"]) -> Float[np.ndarray, "B 2"]:

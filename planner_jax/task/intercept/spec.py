@@ -24,6 +24,12 @@ class Suite:
     wall_room: tuple[int, int] = (12, 6)  # sizes of the array of walls: polygons, corners of each
     mover_room: tuple[int, int] = (4, 6)  # sizes of the array of moving obstacles, as for walls
     num_targets: tuple[int, int] = (1, 1)  # least and greatest number of targets
+    # [m/s], change of the targets' velocity each second. With (0, 0) half of the targets turn.
+    control: tuple[float, float] = (0.0, 0.0)
+    # Rectangles x, y, x, y [m] (two opposite corners) of all walls, and of all movers at time 0
+    # with their velocities x, y [m/s]; (): random.
+    wall_boxes: tuple[tuple[float, float, float, float], ...] = ()
+    mover_boxes: tuple[tuple[float, float, float, float, float, float], ...] = ()
 
 
 # `planner_jax.task.intercept.suites` defines the other ranges of random cases, such as distances.
@@ -51,6 +57,24 @@ SUITES = {
         (10, 12),
         (3, 4),
         spare=0.5,
+    ),
+    "qu-curve": Suite(
+        "The obstacles of `easy`; the target's velocity changes by 0.4 m/s each second.",
+        (4, 6),
+        (1, 1),
+        control=(0.0, 0.4),
+    ),
+    "qu-map": Suite(
+        "One map with four walls, and two movers that cross it at constant speed.",
+        (4, 4),
+        (2, 2),
+        wall_boxes=(
+            (2.0, 0.0, 2.4, 3.2),
+            (2.6, 5.2, 4.0, 5.6),
+            (4.4, 2.4, 4.8, 4.2),
+            (5.6, 4.8, 6.0, 8.0),
+        ),
+        mover_boxes=((3.2, 0.2, 3.6, 0.6, 0.0, 0.4), (5.0, 7.2, 5.4, 7.6, 0.0, -0.4)),
     ),
 }
 

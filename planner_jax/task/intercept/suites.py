@@ -27,7 +27,7 @@ from planner_jax.core.checks import floating
 from planner_jax.core.protocol import take
 from planner_jax.core.registry import require_name
 from planner_jax.plane.obstacles import Obstacles
-from planner_jax.plane.target import TurningPath
+from planner_jax.plane.target import ControlledPath, LaterPath, PlanePath, TurningPath
 from planner_jax.task.arguments import make_generators
 from planner_jax.task.intercept.case import InterceptCase, case
 from planner_jax.task.intercept.searches import earliest_arrival
@@ -41,6 +41,7 @@ MEETING_ROOM = 0.4  # [m], least distance of the meeting point from walls and mo
 TARGET_ROOM = 0.05  # [m], least distance of the target's path from walls
 BODY_ROOM = 0.13  # [m], least distance of the body's middle from walls: half the body's width
 _STEP = 0.1  # [s], between two positions of a target that are tested
+_CONTROLLED = 14  # [s], time before time 0 from which control inputs change a target's velocity
 _CELL = 0.1  # [m], side of a cell of the grid on which `_is_separated` searches a path
 START_X, START_SPEED = 0.8, 0.5  # [m], [m/s], of the car at time 0
 EDGE_ROOM = 0.3  # [m], least distance of the meeting point from the edge of the map
@@ -69,7 +70,11 @@ def draw_with_counts(
     require_name(SUITES, "suite", suite)
     spec, randoms, dtype = SUITES[suite], make_generators(suite, num, seed, first), floating(dtype)
     accepted, counts, rejected = draw_accepted(spec, randoms)
-    return Drawn(cases=cases_of(accepted, dtype), draws=counts, rejected=rejected)
+    cases = cases_of(accepted, dtype)
+    if any(spec.control):
+        target = _controlled_path(spec, accepted, dtype)
+        cases = dataclasses.replace(cases, target=target)
+    return Drawn(cases=cases, draws=counts, rejected=rejected)
 
 
 def draw_accepted(
@@ -123,7 +128,8 @@ def _unit(angle: np.ndarray) -> np.ndarray:
 
 
 def _candidates(suite: Suite, kinds: np.ndarray, uniform: np.ndarray) -> Draws:
-    turning, count_walls = kinds[:, 0] < 0.5, _integer(kinds[:, 1], *suite.num_walls)
+    turning = (kinds[:, 0] < 0.5) & (not any(suite.control))
+    count_walls = _integer(kinds[:, 1], *suite.num_walls)
     count_movers = _integer(kinds[:, 2], *suite.num_movers)
     u, walls, movers = np.split(uniform, np.cumsum([7, suite.wall_room[0] * (2 + _SHAPE)]), axis=1)
     start = np.stack([np.full(len(u), START_X), _between(u[:, 0], 1.0, SIZE - 1.0)], axis=1)
@@ -136,6 +142,8 @@ def _candidates(suite: Suite, kinds: np.ndarray, uniform: np.ndarray) -> Draws:
     else:
         corners = _between(walls[..., None, :2], 0.0, SIZE)
         corners = corners + _polygons(walls[..., 2:], (3, 6), (0.2, 0.8))
+        if suite.wall_boxes:
+            corners[:, : len(suite.wall_boxes)] = _boxes(*np.transpose(suite.wall_boxes))
         present = np.arange(suite.wall_room[0]) < count_walls[:, None]
     target = target_to(meeting, suite.time, turning, u[:, 3:7])
     movers = movers.reshape(len(u), suite.mover_room[0], 3 + _SHAPE)
@@ -144,6 +152,11 @@ def _candidates(suite: Suite, kinds: np.ndarray, uniform: np.ndarray) -> Draws:
     velocity = _between(movers[..., 0], *suite.mover_speed)[..., None]
     velocity = velocity * _unit(2.0 * np.pi * movers[..., 1])
     middle = crossing - velocity * when[..., None]
+    moving = middle[..., None, :] + _polygons(movers[..., 3:], (4, 6), (0.2, 0.4))
+    if suite.mover_boxes:
+        *sides, velocity_x, velocity_y = np.transpose(suite.mover_boxes)
+        moving[:, : len(velocity_x)] = _boxes(*sides)
+        velocity[:, : len(velocity_x)] = np.stack([velocity_x, velocity_y], axis=-1)
     return {
         "start": start,
         "meeting": meeting,
@@ -152,7 +165,7 @@ def _candidates(suite: Suite, kinds: np.ndarray, uniform: np.ndarray) -> Draws:
         **target,
         "walls": corners,
         "walls present": present,
-        "movers": middle[..., None, :] + _polygons(movers[..., 3:], (4, 6), (0.2, 0.4)),
+        "movers": moving,
         "movers present": np.arange(suite.mover_room[0]) < count_movers[:, None],
         "velocity": velocity,
     }
@@ -244,6 +257,27 @@ def path_of(draws: Draws, dtype: DTypeLike) -> TurningPath:
     return TurningPath(*(jnp.asarray(part, dtype) for part in parts))
 
 
+def _controlled_path(suite: Suite, draws: Draws, dtype: DTypeLike) -> PlanePath:
+    """Return the paths of targets whose velocity changes each second, from 14 s before time 0.
+
+    The mean velocity up to the meeting is the velocity in `draws`.
+    """
+    control, before = np.array(suite.control), _CONTROLLED
+    vel = draws["speed"][:, None] * _unit(draws["angle"])
+    vel = vel - control * (_ramps(suite.time) / suite.time + before)
+    pos = draws["pos"] - before * vel - control * _ramps(before)
+    controls = np.tile(control, (len(pos), before + int(suite.time), 1))
+    leaves = np.concatenate([pos, vel], axis=1), controls, np.ones(len(pos))
+    path = ControlledPath(*(jnp.asarray(leaf.astype(dtype), dtype) for leaf in leaves))
+    return LaterPath(path, jnp.asarray(np.full(len(pos), before, dtype), dtype))
+
+
+def _ramps(time: np.ndarray | float) -> np.ndarray:
+    """Return the sum of max(time - k, 0) over the whole numbers k > 0, in [s]."""
+    whole = np.floor(time)
+    return whole * time - 0.5 * whole * (whole + 1.0)
+
+
 def cases_of(draws: Draws, dtype: DTypeLike) -> InterceptCase:
     """Make cases from the arrays `draws` of random starts, targets, times and obstacles."""
 
@@ -284,7 +318,9 @@ def _displace(angle, speed, rate, time) -> np.ndarray:
 def _path(suite: Suite, draws: Draws) -> np.ndarray:
     times = np.linspace(0.0, draws["time"], round(suite.time / _STEP) + 1, axis=1)
     angle, speed, rate = (draws[name][:, None] for name in ("angle", "speed", "rate"))
-    return draws["pos"][:, None] + _displace(angle, speed, rate, times)
+    ramps = _ramps(times) - times * _ramps(suite.time) / suite.time
+    bend = ramps[..., None] * np.array(suite.control)
+    return draws["pos"][:, None] + _displace(angle, speed, rate, times) + bend
 
 
 def _is_off_map(suite: Suite, draws: Draws) -> np.ndarray:
