@@ -79,15 +79,15 @@ def errors_of(
     rng = np.random.default_rng(seed)
     found = pj.gradient(planner, cases, of=of, by=by)
     away = {name: rng.normal(size=found.by[name].shape[1:]) for name in by}
-    slope = sum(
+    slope: Any = sum(
         np.sum(
             np.asarray(found.by[k], np.float64) * each[None], axis=tuple(range(1, each.ndim + 1))
         )
         for k, each in away.items()
     )
     errors, solved = np.full(slope.shape, np.nan), np.flatnonzero(pj.are_solved(found.plans))
-    some = jax.tree.map(lambda leaf: np.asarray(leaf)[solved], (cases, found.plans))
-    expected = differences(planner, *some, of, away) if solved.size else [errors[solved]]
+    some, plans = jax.tree.map(lambda leaf: np.asarray(leaf)[solved], (cases, found.plans))
+    expected = differences(planner, some, plans, of, away) if solved.size else [errors[solved]]
     errors[solved] = np.min([abs(slope[solved] - each) / abs(each) for each in expected], axis=0)
     return found, errors
 
