@@ -1,12 +1,14 @@
 """The minimum-jerk primitive: its ends, its cost, and its optimality."""
 
+import math
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from derivatives import assert_gradient_matches_differences
 
-from planner_jax.baselines.parts.minimum_jerk import minimum_jerk
+from planner_jax.baselines.parts.minimum_jerk import minimum_jerk, primitive_cost
 from planner_jax.trajectory.polynomial import snap_energy
 
 DURATION = 0.9
@@ -74,6 +76,18 @@ def test_the_cost_is_the_mean_squared_jerk_and_every_change_raises_it():
         changed = [axis + change for axis, change in zip(axes, changes, strict=True)]
         np.testing.assert_allclose(jerk_cost(changed) - cost, jerk_cost(changes), rtol=1e-9)
         assert jerk_cost(changed) > cost
+
+
+@float64
+def test_the_closed_form_of_the_cost_is_the_mean_squared_jerk_for_random_ends():
+    rng = np.random.default_rng(3)
+    heads, tails = rng.normal(scale=3.0, size=(2, 100, 3, 3))
+    durations = rng.uniform(0.3, 2.0, size=100)
+    primitives, costs = jax.vmap(solve)(heads, tails, durations)
+    gamma, beta, alpha = (math.factorial(k) * primitives.coeffs[:, 0, k] for k in (3, 4, 5))
+    by_axis = jax.jit(jax.vmap(primitive_cost))(alpha, beta, gamma, durations)
+    assert by_axis.shape == (100, 3)
+    np.testing.assert_allclose(by_axis.sum(axis=1), costs, rtol=1e-12)
 
 
 def cost_and_coefficients(point):

@@ -102,6 +102,48 @@ def test_objective_gradient_agrees_with_finite_differences():
     assert np.isfinite(value_and_gradient(cost)(np.zeros_like(shift))[1]).all()
 
 
+def test_free_durations_at_equal_values_have_the_cost_and_motion_of_equal_durations():
+    case = jax.tree.map(lambda leaf: leaf[0], rows("hard", 1)[0])
+    free = PaperCatch(free_pieces=True)
+    moves = 0.3 * np.random.default_rng(1).normal(size=len(PROBLEM.scale))
+
+    @jax.jit
+    def evaluate_both(moves):
+        context = PROBLEM.prepare(case)
+        point = PROBLEM.guesses(context, 1)[0] + moves
+        each = (PROBLEM, point), (free, jnp.pad(point, (0, len(free.scale) - point.size)))
+        return [(p.objective(x, context).cost, p.decode(x, context)) for p, x in each]
+
+    (cost, plan), (free_cost, free_plan) = evaluate_both(moves)
+    np.testing.assert_allclose(free_cost, cost, rtol=1e-9)
+    np.testing.assert_allclose(free_plan.violation, plan.violation, rtol=1e-6)
+    size = np.abs(plan.trajectory.coeffs).max()
+    np.testing.assert_allclose(
+        free_plan.trajectory.coeffs, plan.trajectory.coeffs, atol=1e-8 * size
+    )
+
+    def free_cost_of(shift):
+        context = free.prepare(case)
+        return free.objective(free.guesses(context, 1)[0] + shift, context).cost
+
+    shift = 0.3 * np.random.default_rng(0).normal(size=len(free.scale))
+    assert_gradient_matches_differences(free_cost_of, shift, step=1e-6, rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_free_durations_never_cost_more_than_equal_ones():
+    cases = jax.tree.map(lambda *x: np.concatenate(x), *(rows(name, 4)[0] for name in NAMES))
+    equal = pj.plan(PLANNER, cases)
+    free = pj.plan(PaperCatch.planner(free_pieces=True), cases)
+    assert np.all(free.cost <= equal.cost * (1.0 + 1e-6))
+    durations = np.asarray(free.trajectory.durations)
+    np.testing.assert_allclose(durations.sum(axis=1), free.times[:, 0], rtol=1e-9)
+    # Only limits that hold along the trajectory make unequal durations cheaper: without them the
+    # best waypoints lie on one polynomial for any durations. They do hold on the first hard throw.
+    np.testing.assert_allclose(durations[0] / durations[0].mean(), 1.0, atol=1e-3)
+    assert free.cost[4] < equal.cost[4] * (1.0 - 8e-4) and np.ptp(durations[4]) > 0.05
+
+
 def test_invalid_sizes_are_rejected():
     with pytest.raises(ValueError, match="num_pieces must be >= 2, got 1"):
         PaperCatch(num_pieces=1)

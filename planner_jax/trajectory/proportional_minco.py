@@ -337,8 +337,15 @@ def chain_trajectory(
     """Join N segments of M pieces each; the pieces of inactive segments have a duration of 0 s."""
     build = functools.partial(proportional_trajectory, maps)
     pieces = jax.vmap(build)(chain.rows, chain.offsets, chain.piece_durations)
+    return join_segments(pieces, chain, active)
+
+
+def join_segments(
+    pieces: polynomial.PiecewisePolynomial, chain: Chain, active: Bool[Array, " N"]
+) -> polynomial.PiecewisePolynomial:
+    """Join trajectories of the N segments of a chain, given on a leading axis of `pieces`."""
     # Positions at the start of the chain, and at the ends of its segments.
-    ends = jnp.concatenate([chain.rows[:1, 0], chain.rows[:, maps.order]])
+    ends = jnp.concatenate([chain.rows[:1, 0], chain.rows[:, chain.rows.shape[1] // 2]])
     last = ends[jnp.sum(active)]
     still = jnp.zeros_like(pieces.coeffs).at[:, :, 0].set(last)
     coeffs = jnp.where(active[:, None, None, None], pieces.coeffs, still)

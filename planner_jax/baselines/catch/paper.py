@@ -21,7 +21,7 @@ from planner_jax.penalties.flight import (
     speed_excess,
     thrust_band_excess,
 )
-from planner_jax.penalties.hinges import steep_hinge
+from planner_jax.penalties.hinges import smooth_hinge, steep_hinge, trapezoid
 from planner_jax.robot.quadrotor import QuadrotorLimits, body_z
 from planner_jax.task.catch.case import CatchCase
 from planner_jax.task.catch.context import (
@@ -31,12 +31,20 @@ from planner_jax.task.catch.context import (
     targets_at,
 )
 from planner_jax.task.catch.plan import CatchPlan
-from planner_jax.trajectory.polynomial import Motion, evaluate
+from planner_jax.trajectory.minco import minco
+from planner_jax.trajectory.polynomial import (
+    Motion,
+    PiecewisePolynomial,
+    evaluate,
+    sample_pieces,
+    snap_energy,
+)
 from planner_jax.trajectory.proportional_minco import (
     Chain,
     ProportionalMinco,
     chain_rows,
     chain_trajectory,
+    join_segments,
     proportional_minco,
     sample_motion,
     trajectory_energy,
@@ -47,7 +55,10 @@ _ORDER = 4  # derivative whose square is minimised: snap
 # trajectory [m]; then log(duration) and position to jerk of a catch (SI units, x, y, z).
 _OFFSET_SCALE = 0.05
 _CATCH_SCALE = (0.035, *(0.06,) * 3, *(0.6,) * 3, *(1.2,) * 3, *(2.4,) * 3)
+_SHARE_SCALE = 0.1  # unit of the logarithm of a piece's duration relative to the first piece
 _PATIENT = {"memory": 16, "trial_steps": (1.0, 2.5, 0.3, 0.05), "tolerance": 1e-8, "patience": 10}
+# The search for free durations, which lowers the cost slowly.
+_LONG = LbfgsConfig(max_steps=400, **_PATIENT | {"tolerance": 1e-10, "patience": 60})
 COST_UNIT = 1e3  # divisor of the cost, so that the Hessian has moderate entries
 
 
@@ -88,12 +99,16 @@ class PaperCatch(Problem):
     penalties of speed, body rate, thrust and ground, integrated by the trapezoid rule; and
     penalties of the net's distance (eqs 22-24) and angle (eq. 25). The paper reports neither
     weights nor thresholds. They come from the authors' published C++ code. All polynomial pieces of
-    a segment (the trajectory to one catch) have the same duration. The last catch has zero jerk.
+    a segment (the trajectory to one catch) have the same duration. With `free_pieces` their
+    durations are variables, too (eq. 17), and a last search continues from the optimum for equal
+    durations. Its cost is lower only where limits hold along the trajectory: otherwise the best
+    waypoints lie on one polynomial, whatever the durations. The last catch has zero jerk.
 
     The variables are other coordinates of the paper's variables, so that the optima are the same:
     offsets of the waypoints from the smoothest trajectory, and for each catch the logarithm of the
     segment's duration, the net's position relative to the ball, and the quadrotor's velocity,
-    acceleration and jerk. The jerk of the last catch is unused.
+    acceleration and jerk. The jerk of the last catch is unused. Free durations add the logarithms
+    of the later pieces' durations relative to the first piece.
 
     This planner ignores the additional limits of a case (`extras`); the referee checks them.
     """
@@ -124,13 +139,23 @@ class PaperCatch(Problem):
     miss_weight: float = 1e4
     angle_weight: float = 1e2
     hinge_width: float = 0.01  # width of the smoothed penalties of limits and of the net's angle
+    free_pieces: bool = False  # whether the durations of a segment's pieces differ
     scale: tuple[float, ...] = ()  # units of one segment's variables; () selects tuned units
 
     def __post_init__(self) -> None:
         require_settings(self)
         require_size("num_pieces", self.num_pieces, 2)
+        usual = (_OFFSET_SCALE,) * self.num_offsets + _CATCH_SCALE
         if not self.scale:
-            object.__setattr__(self, "scale", (_OFFSET_SCALE,) * self.num_offsets + _CATCH_SCALE)
+            free = (_SHARE_SCALE,) * (self.num_pieces - 1) if self.free_pieces else ()
+            object.__setattr__(self, "scale", usual + free)
+        if self.free_pieces:  # units of zero keep the durations equal
+            equal = (("scale", usual + (0.0,) * (self.num_pieces - 1)),)
+            (attempt,) = type(self).attempts
+            stages = tuple(Stage(s.solver, s.settings + equal) for s in attempt.all_stages)
+            object.__setattr__(
+                self, "attempts", (dataclasses.replace(attempt, solver=_LONG, stages=stages),)
+            )
 
     @property
     def maps(self) -> ProportionalMinco:
@@ -179,10 +204,11 @@ class PaperCatch(Problem):
             ],
             axis=1,
         )
-        return (natural / jnp.asarray(self.scale, dtype)[None]).reshape(1, -1)
+        scaled = natural / jnp.asarray(self.scale[: natural.shape[1]], dtype)[None]
+        return jnp.pad(scaled, ((0, 0), (0, len(self.scale) - natural.shape[1]))).reshape(1, -1)
 
     def catches(self, natural: Array, context: CatchContext) -> Catch:
-        """Return N catches from their unscaled variables `natural` (N, 13).
+        """Return N catches from their unscaled variables `natural` (N, 13 or more).
 
         They are the logarithm of the segment's duration, the net's position relative to the ball,
         and velocity, acceleration and jerk of the quadrotor.
@@ -205,21 +231,46 @@ class PaperCatch(Problem):
             angle_excess=net_angle_excess(axis, ball.vel, net.max_angle),
         )
 
-    def _unpack(self, point: Array, context: CatchContext) -> tuple[Chain, Catch]:
+    def _natural(self, point: Array) -> Array:
         scale = jnp.asarray(self.scale, point.dtype)
-        natural = point.reshape(-1, scale.size) * scale[None]
+        return point.reshape(-1, scale.size) * scale[None]
+
+    def _unpack(self, point: Array, context: CatchContext) -> tuple[Chain, Catch]:
+        natural = self._natural(point)
         catch = self.catches(natural[:, self.num_offsets :], context)
         piece_durations = catch.durations / self.num_pieces
         rows = chain_rows(context.case.head_state, catch.tail_states, piece_durations)
         offsets = natural[:, : self.num_offsets].reshape(natural.shape[0], -1, 3)
         return Chain(rows=rows, offsets=offsets, piece_durations=piece_durations), catch
 
-    def _at_ends(self, chain: Chain, catch: Catch, context: CatchContext) -> Array:
+    def _free_paths(
+        self, point: Array, chain: Chain, catch: Catch, context: CatchContext
+    ) -> PiecewisePolynomial:
+        """Return the trajectories of N segments with free durations, on a leading axis."""
+        logs = self._natural(point)[:, 1 - self.num_pieces :]
+        shares = jax.nn.softmax(jnp.pad(logs, ((0, 0), (1, 0))), axis=1)
+        heads = jnp.concatenate([context.case.head_state[None], catch.tail_states[:-1]])
+        waypoints = jnp.matmul(
+            jnp.asarray(self.maps.waypoints, point.dtype)[None],
+            chain.columns,
+            precision=jax.lax.Precision.HIGHEST,
+        )
+        durations = catch.durations[:, None] * shares
+        return jax.vmap(minco)(heads, catch.tail_states, waypoints, durations)
+
+    def _free_cost(
+        self, path: PiecewisePolynomial, given: tuple[Array, QuadrotorLimits]
+    ) -> tuple[Array, Array]:
+        """Return the penalties along one segment, and its energy."""
+        along = jnp.stack(limits_excess(sample_pieces(path, self.nodes), given))
+        weights = jnp.array([self.limit_weight] * 3 + [self.ground_weight], along.dtype)
+        hinges = jnp.sum(weights[:, None] * smooth_hinge(along, self.hinge_width), axis=0)
+        by_piece = jax.vmap(trapezoid)(hinges.reshape(self.num_pieces, -1), path.durations)
+        return jnp.sum(by_piece), snap_energy(path, _ORDER)
+
+    def _at_ends(self, energy: Array, catch: Catch, context: CatchContext) -> Array:
         at_catch = self.miss_weight * steep_hinge(catch.miss, context.case.net.radius)
         at_catch += self.angle_weight * steep_hinge(catch.angle_excess, self.hinge_width)
-        energy = jax.vmap(lambda *segment: trajectory_energy(self.maps, *segment))(
-            chain.rows, chain.offsets, chain.piece_durations
-        )
         rest = jnp.sum(jnp.where(context.active, at_catch + energy, 0.0))
         return rest + self.time_weight * catch.times[-1]
 
@@ -241,9 +292,16 @@ class PaperCatch(Problem):
         """
         chain, catch = self._unpack(point, context)
         given = (context.case.gravity, context.case.limits)
-        along, _ = integrate_along(self._along(), chain.columns, chain.piece_durations, given)
+        if self.free_pieces:
+            paths = self._free_paths(point, chain, catch, context)
+            along, energy = jax.vmap(lambda path: self._free_cost(path, given))(paths)
+        else:
+            along, _ = integrate_along(self._along(), chain.columns, chain.piece_durations, given)
+            energy = jax.vmap(lambda *segment: trajectory_energy(self.maps, *segment))(
+                chain.rows, chain.offsets, chain.piece_durations
+            )
         penalty = jnp.sum(jnp.where(context.active, along, 0.0))
-        cost = penalty + self._at_ends(chain, catch, context)
+        cost = penalty + self._at_ends(energy, catch, context)
         return Evaluation(cost=cost / COST_UNIT, violation=jnp.zeros_like(cost))
 
     def rules_out(self, context: CatchContext) -> Array:
@@ -254,9 +312,15 @@ class PaperCatch(Problem):
         """Return the plan of a vector of variables, with its violation at samples of each piece."""
         chain, catch = self._unpack(point, context)
         gravity, limits, net = context.case.gravity, context.case.limits, context.case.net
-        motion = jax.vmap(lambda *segment: sample_motion(self.maps, self.nodes, *segment))(
-            chain.columns, chain.piece_durations
-        )
+        if self.free_pieces:
+            paths = self._free_paths(point, chain, catch, context)
+            trajectory = join_segments(paths, chain, context.active)
+            motion = jax.vmap(lambda path: sample_pieces(path, self.nodes))(paths)
+        else:
+            trajectory = chain_trajectory(self.maps, chain, context.active)
+            motion = jax.vmap(lambda *segment: sample_motion(self.maps, self.nodes, *segment))(
+                chain.columns, chain.piece_durations
+            )
         along = jnp.stack(limits_excess(motion, (gravity, limits)))  # (4, N, K)
         least, most = limits.thrust_bounds
         half = 0.5 * (most - least)
@@ -267,7 +331,7 @@ class PaperCatch(Problem):
         )
         violation = jnp.max(jnp.where(context.active, relative, -1.0))
         return CatchPlan(
-            trajectory=chain_trajectory(self.maps, chain, context.active),
+            trajectory=trajectory,
             gravity=context.case.gravity,
             order=context.case.order,
             decided_times=context.times,

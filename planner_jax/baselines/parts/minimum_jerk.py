@@ -34,6 +34,23 @@ def minimum_jerk(head_state: Array, tail_state: Array, duration: Array) -> Piece
     return PiecewisePolynomial(coeffs=coeffs[None], durations=jnp.reshape(t, (1,)))
 
 
+def primitive_cost(alpha: Array, beta: Array, gamma: Array, duration: Array) -> Array:
+    """Return the mean squared jerk of a minimum-jerk polynomial, by axis [Yu2023catch, eq. 16].
+
+    Args:
+        alpha: (3,) [m/s^5], fifth derivative of the position.
+        beta: (3,) [m/s^4], fourth derivative at the start.
+        gamma: (3,) [m/s^3], third derivative at the start.
+        duration: () T [s], > 0.
+
+    Returns:
+        (3,) [m^2/s^6]; the sum is the integral of |jerk|^2 divided by T.
+    """
+    t = duration
+    later = beta**2 / 3.0 + alpha * gamma / 3.0 + alpha * beta * t / 4.0 + alpha**2 * t**2 / 20.0
+    return gamma**2 + beta * gamma * t + later * t**2
+
+
 def minimum_jerk_after_ramp(
     head_state: Array, tail_state: Array, duration: Array, ease: float
 ) -> PiecewisePolynomial:
