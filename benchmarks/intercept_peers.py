@@ -35,14 +35,11 @@ from planner_jax.baselines.intercept.paper import PaperIntercept, paper_speed_st
 from planner_jax.baselines.intercept.path_then_speed import PathThenSpeed
 from planner_jax.baselines.protocols import BY_ROW
 from planner_jax.benchmarks.run import Bench, argument_parser, at_least, begin
+from planner_jax.benchmarks.speed_problems import SOFT_END
 from planner_jax.referee.intercept import InterceptVerdict
 from planner_jax.task.intercept.spec import SUITES
 
 BASELINES = "numba not installed: pip install 'planner-jax[baselines]' for the planner paper"
-# Weight of the squared error at the end of the speed profile, in units of the weight of the squared
-# acceleration: w_2 T^3 / w_1, with the weights w_1 = 10 and w_2 = 3 and the horizon T = 10 s of the
-# paper [Qu2022].
-SOFT_END = 3.0 * 10.0**3 / 10.0
 PAIRS = (
     ("spacetime", "em"),
     ("effort best", "lattice"),

@@ -1,6 +1,6 @@
 """Compare planners of the speed along a given path, as in [Qu2022, Table II].
 
-    python -m benchmarks.intercept_speed [--num 500] [--seed 0] [--batch 65536] [--out DIR]
+    python -m benchmarks.intercept_speed [--num 500] [--paper] [--batch 65536] [--out DIR]
 
 A car must reach the end of a given path at a given time and avoid moving obstacles. The station
 is the distance along the path. In the graph of station over time, obstacles are polygons. A planner
@@ -18,6 +18,10 @@ jerk over good plans, and the least distance from a polygon. The second table co
 planners on the problems where both plans are good. Times are for one problem at a time without
 compilation, from the problem's arrays to the plan's arrays. The planners take turns, so that other
 load affects all of them.
+
+With --paper only the two planners of Table II are compared: the lines of the paper with its weight
+of the end (eq. 19), and `em`, whose end is exact or has this weight, too. The printed columns of
+Table II cannot both be right, because "Max Acc." is below "Ave. Acc.", a root mean square.
 
 With --batch the program also prints how many problems per second the device solves in a batch. With
 the extra `peers`, the solvers Clarabel and OSQP also solve the quadratic programs of `trapezoid`
@@ -45,22 +49,51 @@ from planner_jax.baselines.intercept.speed import (
     speed_template,
 )
 from planner_jax.baselines.intercept.station_time import StationTimeProblem, reference_line
+from planner_jax.baselines.protocols import PUBLISHED
 from planner_jax.benchmarks.qp_peers import INSTALL, PEERS, is_installed
 from planner_jax.benchmarks.run import Bench, argument_parser, at_least, begin
-from planner_jax.benchmarks.speed_problems import speed_problems
+from planner_jax.benchmarks.speed_problems import SOFT_END, speed_problems
 from planner_jax.core.protocol import Status
 from planner_jax.trajectory.bezier import BezierCurve, bernstein, hodograph
 
 PIECES = (10, 20)  # Numbers of polynomial pieces of the planned curve.
 CONSTANT = "constant speed"
 OURS = "this library"
-# Pairs of a planner and a reference planner. They are compared on problems that both solve without
-# a collision.
-PAIRS = (
+
+
+@dataclasses.dataclass(frozen=True)
+class Comparison:
+    """Speed planners, the pairs of them that are compared, and the ones whose programs are solved.
+
+    A planner and a reference planner are compared on the problems that both solve without a
+    collision. The first planner to solve is the one in the run's summary.
+    """
+
+    planners: dict[str, SpeedPlanner]
+    pairs: tuple[tuple[str, str], ...]
+    solved: tuple[str, ...]
+
+
+ALL = Comparison(
+    SPEED_PLANNERS,
+    (
+        ("trapezoid", "em"),
+        ("trapezoid-edges", "em"),
+        ("trapezoid", "trapezoid-edges"),
+        ("trapezoid", "rectangle"),
+    ),
     ("trapezoid", "em"),
-    ("trapezoid-edges", "em"),
-    ("trapezoid", "trapezoid-edges"),
-    ("trapezoid", "rectangle"),
+)
+PAPER = Comparison(
+    {
+        "edges, soft end": dataclasses.replace(
+            SPEED_PLANNERS["trapezoid-edges"], end_weight=SOFT_END
+        ),
+        "em": SPEED_PLANNERS["em"],
+        "em, soft end": dataclasses.replace(SPEED_PLANNERS["em"], end_weight=SOFT_END),
+    },
+    (("edges, soft end", "em"), ("edges, soft end", "em, soft end")),
+    ("edges, soft end",),
 )
 
 
@@ -76,8 +109,8 @@ class Judged:
     clearance: np.ndarray  # [m], least distance from a polygon; negative inside of a polygon
 
 
-def planners() -> dict[str, SpeedPlanner]:
-    """Return the planners of the speed along a path by name, each with 10 and with 20 pieces.
+def planners(compared: Comparison = ALL) -> dict[str, SpeedPlanner]:
+    """Return the compared planners by name, each with 10 and with 20 pieces.
 
     The pieces are polynomials of the planned curve. A planner whose limits are checked only at
     samples has 100 samples, 0.1 s apart for 10 s.
@@ -87,7 +120,7 @@ def planners() -> dict[str, SpeedPlanner]:
             planner, pieces=pieces, samples=planner.samples and 100 // pieces
         )
         for pieces in PIECES
-        for name, planner in SPEED_PLANNERS.items()
+        for name, planner in compared.planners.items()
     }
 
 
@@ -177,13 +210,13 @@ def split_batches(*batches: Any) -> list[tuple]:
     return [jax.tree.map(lambda leaf, k=k: jnp.asarray(leaf[k]), batches) for k in range(num)]
 
 
-def table_of_planners(bench: Bench, problems: Any) -> dict[str, Judged]:
+def table_of_planners(bench: Bench, problems: Any, compared: Comparison) -> dict[str, Judged]:
     """Plan the speed in all problems with every planner, and print one row for each planner.
 
     In a problem, a car must reach the end of a path at a given time and avoid moving obstacles.
     Returns the results by planner.
     """
-    named = planners()
+    named = planners(compared)
     single = {
         name: jax.jit(lambda problem, planner=planner: plan_speed(problem, planner))
         for name, planner in named.items()
@@ -218,12 +251,15 @@ def table_of_planners(bench: Bench, problems: Any) -> dict[str, Judged]:
             f"{figures['clearance']:.4f} | {times[0]:.3f} / {times[1]:.3f} / {times[2]:.3f} |"
         )
         bench.row(table="planners", planner=name, **figures, ms=times)
-    bench.say("", *_compare_pairs(bench, judged, seconds))
+    bench.say("", *_compare_pairs(bench, compared.pairs, judged, seconds))
     return judged
 
 
 def _compare_pairs(
-    bench: Bench, judged: dict[str, Judged], seconds: dict[str, np.ndarray]
+    bench: Bench,
+    pairs: tuple[tuple[str, str], ...],
+    judged: dict[str, Judged],
+    seconds: dict[str, np.ndarray],
 ) -> list[str]:
     """Return the lines of a table that compares pairs of planners on problems that both solve.
 
@@ -235,7 +271,7 @@ def _compare_pairs(
         "|---|---|---|---|---|---|",
     ]
     for pieces in PIECES:
-        for pair in PAIRS:
+        for pair in pairs:
             ours, theirs = (f"{name}, {pieces}" for name in pair)
             one, other = judged[ours], judged[theirs]
             both = one.good & other.good
@@ -255,7 +291,7 @@ def _compare_pairs(
     return lines
 
 
-def table_of_solvers(bench: Bench, problems: Any) -> list[np.ndarray]:
+def table_of_solvers(bench: Bench, problems: Any, compared: Comparison) -> list[np.ndarray]:
     """Solve quadratic programs with this library, Clarabel and OSQP, and print a table.
 
     The programs plan the speed of a car along a path, with least acceleration. Returns by what
@@ -268,8 +304,8 @@ def table_of_solvers(bench: Bench, problems: Any) -> list[np.ndarray]:
         "|---|---|---|---|---|",
     )
     gaps = []
-    named = planners()
-    for name in (f"{kind}, {pieces}" for pieces in PIECES for kind in ("trapezoid", "em")):
+    named = planners(compared)
+    for name in (f"{kind}, {pieces}" for pieces in PIECES for kind in compared.solved):
         rows = solve_by_all(problems, named[name])
         for solver, (solved, cost, seconds) in rows.items():
             times = 1e3 * np.nanpercentile(seconds, [50, 95, 99])
@@ -360,7 +396,9 @@ def main() -> None:
     parser.add_argument(
         "--batch", type=at_least(0), default=0, help="problems in a batch; default: 0, no batch"
     )
+    parser.add_argument("--paper", action="store_true", help="only the planners of Table II")
     options = parser.parse_args()
+    compared = PAPER if options.paper else ALL
     with begin(parser, options) as bench:
         problems = speed_problems(options.num, options.seed)
         bench.say(
@@ -368,11 +406,16 @@ def main() -> None:
             f"jax {jax.__version__}, load average {os.getloadavg()[0]:.1f}",
             "",
         )
-        judged = table_of_planners(bench, problems)
-        gaps = table_of_solvers(bench, problems)
+        judged = table_of_planners(bench, problems, compared)
+        if options.paper:
+            rows = (
+                each for each in PUBLISHED if (each.paper, each.table) == ("Qu2022", "Table II")
+            )
+            bench.say("", *(f"[Qu2022, Table II] {each.row}: {each}" for each in rows))
+        gaps = table_of_solvers(bench, problems, compared)
         if options.batch:
             table_of_batches(bench, problems, options.batch)
-        bench.count(judged[f"trapezoid, {PIECES[0]}"].good, *gaps)
+        bench.count(judged[f"{compared.solved[0]}, {PIECES[0]}"].good, *gaps)
 
 
 if __name__ == "__main__":

@@ -6,12 +6,13 @@ The stages are the prediction of the target from 15 observations by a polynomial
 path by Hybrid A* on 80 x 80 cells of 0.1 m and its smoothing; and the speed along the path by
 dynamic programming and a quadratic program. The plan meets the case's target, not the predicted
 one, whose mean error at the meeting is printed. Times are for one case at a time on one core, from
-arrays to arrays, without compilation, which the last column has. The fastest of three calls counts;
-"total" is the time of all stages in one call.
+arrays to arrays, without compilation, which the last column has. The fastest of three runs of all
+stages counts.
 
 The second table has how many cases pass each stage: Hybrid A* finds a path, dynamic programming a
 line between the moving obstacles in the graph of station and time, the quadratic program a curve,
-and the referee accepts the drive. The cases are own cases: [Qu2022] shows one map, states neither
+and the referee accepts the drive. An accepted drive counts as passing all stages, also if the
+program reports a small excess. The cases are own cases: [Qu2022] shows one map, states neither
 limits nor numbers, and publishes no rate. The extra `baselines` is needed.
 """
 
@@ -104,8 +105,9 @@ def run(bench: Bench, planner: PaperIntercept, suite: str, num: int, seed: int) 
     seconds, passed, plans, errors = [], [], [], []
     for lane, positions in zip(lanes, seen, strict=True):
         runs = [run_stages(stages, lane, positions) for _ in range(3)]
-        seconds.append([min(each[part] for each, _ in runs) for part in PARTS])
-        predicted, path, plan, is_found = runs[0][1]
+        fastest, found = min(runs, key=lambda one: one[0]["total"])
+        seconds.append(list(fastest.values()))
+        predicted, path, plan, is_found = found
         errors.append(np.linalg.norm(predicted - lane.target.at(lane.time).pos))
         passed.append([is_found, *stages.check(lane, path)])
         plans.append(plan)
@@ -124,7 +126,7 @@ def run(bench: Bench, planner: PaperIntercept, suite: str, num: int, seed: int) 
         published = BY_ROW["Qu2022", "Table III", part]
         bench.say(f"| {part} | {cells} | {published} | {first[part]:.1f} |")
         bench.row(table="times", stage=part, **figures, first_call=first[part])
-    counts = [num, *count_passed(np.column_stack([passed, accepted]))]
+    counts = [num, *count_passed(np.column_stack([passed, accepted]) | accepted[:, None])]
     bench.say("", "| stage | cases | lost here |", "|---|---|---|", f"| all cases | {num} | - |")
     for name, before, after in zip(PASSED, counts, counts[1:], strict=False):
         bench.say(f"| {name} | {after} | {before - after} |")

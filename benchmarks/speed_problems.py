@@ -10,6 +10,10 @@ import numpy as np
 
 from planner_jax.baselines.intercept.station_time import Blocked, StationTimeProblem, reference_line
 
+# Weight of the squared error at the end of the speed profile, in units of the weight of the squared
+# acceleration: w_2 T^3 / w_1, with the weights w_1 = 10 and w_2 = 3 and the horizon T = 10 s of the
+# paper [Qu2022].
+SOFT_END = 3.0 * 10.0**3 / 10.0
 _BLOCK = 256  # Number of problems that are drawn at once.
 _MOST = 3  # Maximum number of polygons in one problem.
 

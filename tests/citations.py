@@ -10,12 +10,14 @@ several files cite the equation, which file implements it.
 """
 
 import ast
+import functools
 import itertools
 import re
 import sys
 import tomllib
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterator
+from pathlib import Path
 
 from tests.tracked import ROOT, tracked_files
 
@@ -30,15 +32,16 @@ PAPERS = {
 KEYED = re.compile(rf"\[[^\[\]]*?({'|'.join(PAPERS)})([^\[\]]*)\]")
 NUMBER = r"\d+[a-z]?"
 EQUATIONS = re.compile(rf"\b[Ee]qs?\.?\s+({NUMBER}(?:\s*(?:,|-|and|to)\s*{NUMBER})*)")
-PARTS = re.compile(r"\b(Algorithm \d|Tables? [IVX]+(?: and [IVX]+)?)")
+PARTS = re.compile(r"\b(Algorithm \d|Fig\. \d|Tables? [IVX]+(?: and [IVX]+)?)")
 STATUSES = ("as printed", "corrected", "different", "not used", "text not available")
 IN_CODE = STATUSES[:3]  # statuses of equations that the code computes
 HEAD = """# Where each equation is
 
 This page lists all equations of four papers of [references](references.md). The column "computes"
 says in a few words what an equation computes. The column "implemented in" has the file that
-computes it, and the functions or classes there whose docstrings cite it. The files in the last
-column use, check or discuss the equation. The column "as printed?" has one of these words:
+computes it, and the functions or classes there whose docstrings cite it. "Tested in" has the two
+modules of `tests/` that name these functions most often, or the reason why there is none. The files
+in the last column use, check or discuss the equation. The column "as printed?" has one of these words:
 
 - as printed: the code computes the printed equation, perhaps in other variables.
 - corrected: the printed equation has a misprint, which the code does not have.
@@ -47,7 +50,8 @@ column use, check or discuss the equation. The column "as printed?" has one of t
 - text not available: the text of the paper that this project has lacks the equation, for example
   Section III of Yu2023catch.
 
-JAX computes gradients by automatic differentiation. The last table has algorithms and tables;
+JAX computes gradients by automatic differentiation. The last table has algorithms, tables and
+figures. `python -m benchmarks.paper_figures` draws some figures from runs of this library;
 [the page of results](results.md#published-numbers) lists the numbers of the tables.
 
 `python -m tests.citations --write` generates this page from the citations in the code and the words
@@ -93,9 +97,9 @@ def name_at(tree: ast.Module, line: int) -> str:
 
 
 def parts_of(text: str) -> Iterator[tuple[int, str, str]]:
-    """Yield, for each algorithm or table that a text cites, its position, paper and name.
+    """Yield, for each algorithm, table or figure that a text cites, its position, paper and name.
 
-    A table is cited as `[KEY, Table N]`, `Table N of [KEY]` or, in code, `"KEY", "Table N"`.
+    A table or figure is cited as `[KEY, Table N]`, `Table N of [KEY]` or, in code, `"KEY", "Table N"`.
     """
     keyed = list(KEYED.finditer(text))
     papers = {match[1] for match in keyed}
@@ -139,7 +143,7 @@ def make_page(numbers: dict[str, list[str]], words: dict[tuple[str, str], dict[s
 
     Args:
         numbers: the numbers of all equations of each paper.
-        words: the entry of each equation, algorithm and table, by (paper, number or name).
+        words: the entry of each equation, algorithm, table and figure, by (paper, number or name).
 
     Raises:
         LookupError: an entry is missing, or contradicts the citations in the code.
@@ -157,14 +161,15 @@ def make_page(numbers: dict[str, list[str]], words: dict[tuple[str, str], dict[s
         for key, (file, names) in itertools.product(keys, files.items()):
             places[key][file] |= names
     lines = [HEAD]
-    head = "computes | as printed? | implemented in | also cited in |\n|---|---|---|---|---|"
+    head = "computes | as printed? | implemented in | tested in | also cited in |\n"
+    head += "|---|---|---|---|---|---|"
     for paper, title in PAPERS.items():
         lines.append(f"## {title}, {paper}\n")
         lines.append(f"| equation | {head}")
         keys = ((paper, number) for number in numbers[paper])
         lines += [f"| {key[1]} {_write_row(key, words[key], places[key])}" for key in keys]
         lines.append("")
-    lines += ["## Algorithms and tables\n", f"| paper and part | {head}"]
+    lines += ["## Algorithms, tables and figures\n", f"| paper and part | {head}"]
     for key in words:
         if key in parts:
             lines.append(f"| {', '.join(key)} {_write_row(key, words[key], places[key])}")
@@ -177,7 +182,7 @@ def _write_row(key: tuple[str, str], row: dict[str, str], files: dict[str, set[s
         raise LookupError(f"{WORDS.name} needs the `status` of {key}, and a `note` on changes")
     if "by" in row and row["by"] != "autodiff":
         raise LookupError(f"{key} has by = {row['by']!r}, known is 'autodiff'")
-    is_table = key[1].startswith("Table")
+    is_table = key[1].startswith(("Table", "Fig."))
     is_code = status in IN_CODE and "by" not in row and not is_table
     if place is None and len(files) == 1 and is_code:
         place = next(iter(files))
@@ -187,8 +192,43 @@ def _write_row(key: tuple[str, str], row: dict[str, str], files: dict[str, set[s
     others = "; ".join(cited[file] for file in cited if file != place)
     first = AUTODIFF if "by" in row else cited[place] if place else ""
     printed = f"{status}: {row['note']}" if "note" in row else status
-    printed = "" if is_table else printed
-    return f"| {row['computes']} | {printed} | {first} | {others} |"
+    printed = row.get("note", "") if is_table else printed
+    tests = find_tests(place, files[place]) if is_code and place else []
+    if is_code and bool(tests) == ("untested" in row):
+        raise LookupError(f"{key} needs `untested`, a reason, if and only if no test names it")
+    tested = row.get("untested", ", ".join(f"`{name}`" for name in tests))
+    return f"| {row['computes']} | {printed} | {first} | {tested} | {others} |"
+
+
+@functools.cache
+def _count_names() -> dict[str, Counter[str]]:
+    """Return how often each test module names words and, with dots, modules."""
+    texts = {
+        Path(file).stem: (ROOT / file).read_text() for file in tracked_files("tests/test_*.py")
+    }
+    return {
+        stem: Counter(re.findall(r"\w+", text)) + Counter(re.findall(r"\w+(?:\.\w+)+", text))
+        for stem, text in texts.items()
+    }
+
+
+def find_tests(file: str, names: set[str]) -> list[str]:
+    """Return the two test modules that name functions or classes of a file most often.
+
+    Test modules that import the file are preferred, and suffice if no test has the names.
+    """
+    module = ".".join(Path(file).with_suffix("").parts)
+    module = module if module.startswith("planner_jax") else f"planner_jax.{module}"
+    package, _, stem = module.rpartition(".")
+    words = {word for name in names for word in name.split(".") if word and word[0] != "_"}
+    # All tasks have a function of this name.
+    words = {f"pj.{module.split('.')[2]}.case" if word == "case" else word for word in words}
+    tests = _count_names()
+    importing = {name for name, each in tests.items() if each[module] or each[package] * each[stem]}
+    counts = {name: sum(each[word] for word in words) for name, each in tests.items()}
+    naming = {name for name, count in counts.items() if count}
+    found = (importing & naming) or naming or importing
+    return sorted(found, key=lambda name: (-counts[name], name))[:2]
 
 
 def _write_place(file: str, names: set[str]) -> str:

@@ -214,3 +214,11 @@ def test_a_second_process_loads_the_programs_of_the_first(tmp_path):
     assert empty["success"] == warm["success"] == [True]
     assert empty["programs"] >= 1 and warm["cpu"] < 0.8 * empty["cpu"]
     assert 0.0 < warm["again"] < 0.1 * warm["cpu"]
+
+
+@pytest.mark.parametrize("name", ["ALL", "PAPER"])
+def test_pairs_and_solved_programs_are_among_the_compared_speed_planners(name):
+    compared = getattr(importlib.import_module("planner_jax.benchmarks.intercept_speed"), name)
+    assert {*compared.solved}.union(*compared.pairs) <= compared.planners.keys()
+    weights = {planner.end_weight for planner in compared.planners.values()}
+    assert weights == ({None, 300.0} if name == "PAPER" else {None})

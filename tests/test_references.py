@@ -47,6 +47,24 @@ def test_the_page_of_equations_follows_the_citations_in_the_code() -> None:
     assert not stale.returncode, "run python -m tests.citations --write"
 
 
+def test_every_figure_and_table_of_the_four_papers_has_an_entry() -> None:
+    _, words = read_words()
+    counts = dict.fromkeys(("Yu2023catch", "Yu2023bat", "Qu2022", "Natarajan2024"), (0, 0))
+    for paper, part in (key for key in words if " " in key[1]):
+        figures, tables = counts[paper]
+        counts[paper] = figures + part.startswith("Fig."), tables + part.startswith("Table")
+    assert [*counts.values()] == [(8, 3), (9, 1), (4, 3), (5, 2)]
+
+
+def test_an_equation_in_code_names_its_test_or_the_reason_why_it_has_none() -> None:
+    numbers, words = read_words()
+    for key, changes in (("4b", {"untested": None}), ("4a", {"untested": "no time"})):
+        row = words["Natarajan2024", key] | changes
+        row = {name: text for name, text in row.items() if text is not None}
+        with pytest.raises(LookupError, match=f"'{key}'.*needs `untested`"):
+            make_page(numbers, words | {("Natarajan2024", key): row})
+
+
 @pytest.mark.parametrize(
     "paper, last", [("Yu2023catch", 29), ("Yu2023bat", 24), ("Qu2022", 24), ("Natarajan2024", 8)]
 )
