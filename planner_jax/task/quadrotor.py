@@ -12,6 +12,7 @@ from jaxtyping import PyTree
 from planner_jax.core import rules
 from planner_jax.core.arithmetic import numpy_of, to_host
 from planner_jax.core.checks import numbers_of
+from planner_jax.core.choices import STARTS, require_one_of
 from planner_jax.core.errors import ArgumentError, ArgumentTypeError
 from planner_jax.core.rules import Field, Table
 from planner_jax.robot.quadrotor import QuadrotorLimits, RotorLimits
@@ -118,6 +119,16 @@ def require_own_robot(robot: object, usual: QuadrotorModel, suite: str, wind: ob
     if not is_usual or wind is not None:
         name = "wind" if is_usual else "robot"
         raise ArgumentError(name, f"left out with suite {suite!r}, which has its own", shown="")
+
+
+def add_starts(starts: object, cases: PyTree, suite: str, seed: int, first: int) -> PyTree:
+    """Return the drawn cases, with states at time 0 as `starts`, one of `STARTS`, requires."""
+    require_one_of(STARTS, "starts", starts)
+    if starts == STARTS[0]:
+        return cases
+    from planner_jax.task.starts import draw_states  # few draws need it
+
+    return draw_states(cases, suite, seed, first)
 
 
 def add_heading(cases: PyTree, leaf: Callable[..., Array], *given: object) -> PyTree:

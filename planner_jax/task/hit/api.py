@@ -6,6 +6,7 @@ from collections.abc import Sequence
 import jax.numpy as jnp
 from jax.typing import DTypeLike
 
+from planner_jax.core.choices import STARTS
 from planner_jax.core.origin import to_world
 from planner_jax.core.planner import Planner
 from planner_jax.core.registry import suite_named
@@ -16,7 +17,7 @@ from planner_jax.task.hit.case import HitCase
 from planner_jax.task.hit.plan import HitPlan
 from planner_jax.task.hit.spec import REAL_SCENARIOS, START, TASK
 from planner_jax.task.hit.suites import generate_serves, to_cases
-from planner_jax.task.quadrotor import require_own_robot
+from planner_jax.task.quadrotor import add_starts, require_own_robot
 
 
 def draw(
@@ -30,6 +31,7 @@ def draw(
     limit_scale: float = 1.0,
     robot: QuadrotorModel = PAPER_HITTER,
     wind: Sequence[float] | None = None,
+    starts: str = STARTS[0],
     dtype: DTypeLike = jnp.float32,
 ) -> HitCase:
     """Draw a batch of random cases: serves that a hovering quadrotor has to return.
@@ -46,6 +48,8 @@ def draw(
         limit_scale: factor on the limits of speed, acceleration and body rate.
         robot: quadrotor with a racket. Suites of other packages define their own robot.
         wind: (3,) [m/s], velocity of the air, for a robot with drag.
+        starts: state of the quadrotor at time 0: "hover" at `start`, or "random", around it, in
+            the ranges of `task.starts.with_states`.
         dtype: type of every floating leaf.
 
     Raises:
@@ -54,9 +58,9 @@ def draw(
     suite = suite_named(suite, "court")
     if suite not in TASK.suites:
         require_own_robot(robot, PAPER_HITTER, suite, wind)
-        return TASK.other_suite(suite)(num, seed, first)
+        return add_starts(starts, TASK.other_suite(suite)(num, seed, first), suite, seed, first)
     serves = generate_serves(num, seed, REAL_SCENARIOS.get(suite), first=first)
-    return to_cases(
+    cases = to_cases(
         serves,
         start=start,
         seed=seed,
@@ -66,6 +70,7 @@ def draw(
         wind=wind,
         dtype=dtype,
     )
+    return add_starts(starts, cases, suite, seed, first)
 
 
 def planner(
