@@ -121,14 +121,20 @@ def require_own_robot(robot: object, usual: QuadrotorModel, suite: str, wind: ob
         raise ArgumentError(name, f"left out with suite {suite!r}, which has its own", shown="")
 
 
-def add_starts(starts: object, cases: PyTree, suite: str, seed: int, first: int) -> PyTree:
-    """Return the drawn cases, with states at time 0 as `starts`, one of `STARTS`, requires."""
+def add_starts(
+    starts: object, cases: PyTree, suite: str, seed: int, first: int | np.ndarray
+) -> PyTree:
+    """Return drawn cases with states at time 0 of the kind `starts`, one of `STARTS`.
+
+    `first` is the number of the first case, or the numbers (B,) of all cases, in the suite.
+    """
     require_one_of(STARTS, "starts", starts)
     if starts == STARTS[0]:
         return cases
     from planner_jax.task.starts import draw_states  # few draws need it
 
-    return draw_states(cases, suite, seed, first)
+    index = first + np.arange(len(cases.head_state)) if isinstance(first, int) else first
+    return draw_states(cases, suite, seed, index)
 
 
 def add_heading(cases: PyTree, leaf: Callable[..., Array], *given: object) -> PyTree:

@@ -23,14 +23,15 @@ _THRUST = (0.7, 1.3)  # divided by gravity
 _WITHIN = 0.9  # greatest fraction of a limit that a state may use
 
 
-def draw_states(cases: PyTree, suite: str, seed: int, first: int) -> PyTree:
-    """Return a batch of cases, counted from `first`, with random states at time 0.
+def draw_states(cases: PyTree, suite: str, seed: int, index: np.ndarray) -> PyTree:
+    """Return a batch of B cases with random states at time 0; see `with_states`.
 
-    The state of case k depends on `suite`, `seed` and k alone; see `with_states`.
+    The state of the case with number k in `index` (B,) depends on `suite`, `seed` and k alone.
     """
     random = np.random.default_rng([seed, zlib.crc32(suite.encode()), zlib.crc32(b"starts")])
+    first, last = int(index.min()), int(index.max())
     random.bit_generator.advance(first * NUM)  # type: ignore[attr-defined]
-    return with_states(cases, random.random((cases.batch_shape[0], NUM)))
+    return with_states(cases, random.random((last + 1 - first, NUM))[index - first])
 
 
 def with_states(cases: PyTree, uniform: PyTree) -> PyTree:

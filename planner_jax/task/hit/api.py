@@ -60,7 +60,7 @@ def draw(
         require_own_robot(robot, PAPER_HITTER, suite, wind)
         return add_starts(starts, TASK.other_suite(suite)(num, seed, first), suite, seed, first)
     serves = generate_serves(num, seed, REAL_SCENARIOS.get(suite), first=first)
-    cases = to_cases(
+    return to_cases(
         serves,
         start=start,
         seed=seed,
@@ -68,9 +68,9 @@ def draw(
         limit_scale=limit_scale,
         robot=robot,
         wind=wind,
+        starts=starts,
         dtype=dtype,
     )
-    return add_starts(starts, cases, suite, seed, first)
 
 
 def planner(
