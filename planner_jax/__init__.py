@@ -25,7 +25,7 @@ Classes for parts of cases and plans:
   `Plane`, `Geofence`, `SpeedZone`, `Dislike`, or any class with the same methods
 * targets in space: `BallState`, `fly`, `BallPath`, `HarmonicPath`, `table_path`, `predict_path`,
   `target_at`; in the plane: `TurningPath`, `PolynomialPath`
-* `ball.fit`: estimates and predicts the flight of a ball from a recording
+* `ball.fit`: estimates and predicts flights from recordings; `perception`: estimates during flights
 * obstacles of a car: `Obstacles`, made by `obstacles`
 * trajectories: `PiecewisePolynomial`, `evaluate`
 * base classes and settings for planners and tasks that a user writes: `Planner`, `Plan`, `Attempt`,
