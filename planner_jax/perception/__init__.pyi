@@ -3,9 +3,17 @@ from .drag import drag_by_rls as drag_by_rls
 from .drag import measure_drag as measure_drag
 from .drag import rls_update as rls_update
 from .drag import specific_energy as specific_energy
+from .filters import BALL_FILTER as BALL_FILTER
+from .filters import ROBOT_FILTER as ROBOT_FILTER
+from .filters import Filter as Filter
 from .linear_fit import DragWindow as DragWindow
 from .linear_fit import LinearDragFit as LinearDragFit
 from .linear_fit import fit_linear_drag as fit_linear_drag
 from .linear_fit import refine_model as refine_model
 from .linear_fit import window_init as window_init
 from .linear_fit import window_update as window_update
+from .robot_filter import BodyState as BodyState
+from .robot_filter import RobotFilterModel as RobotFilterModel
+from .robot_filter import RobotFilterState as RobotFilterState
+from .robot_filter import difference as difference
+from .robot_filter import retract as retract
