@@ -25,7 +25,7 @@ Classes for parts of cases and plans:
   `Plane`, `Geofence`, `SpeedZone`, `Dislike`, or any class with the same methods
 * targets in space: `BallState`, `fly`, `BallPath`, `HarmonicPath`, `table_path`, `predict_path`,
   `target_at`; in the plane: `TurningPath`, `PolynomialPath`, `ControlledPath`
-* `ball.fit`: estimates and predicts the flight of a ball from a recording
+* `ball.fit`: estimates and predicts flights from recordings; `perception`: estimates during flights
 * `penalties`: the penalties of the published planners, as pure functions
 * obstacles of a car: `Obstacles`, made by `obstacles`
 * trajectories: `PiecewisePolynomial`, `evaluate`, `snap_energy`; `minco`, the spline of least

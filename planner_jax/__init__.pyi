@@ -1,6 +1,7 @@
 from . import ball as ball
 from . import live as live
 from . import penalties as penalties
+from . import perception as perception
 from .ball.flight import BallState as BallState
 from .ball.flight import fly as fly
 from .ball.prediction import predict_path as predict_path

@@ -8,11 +8,11 @@ from jax import Array
 
 from planner_jax.ball.estimation import EkfState, congruence
 from planner_jax.ball.flight import BallState, fly
+from planner_jax.perception.drag import rls_update
 from planner_jax.sims import sensing as sight
 from planner_jax.sims.loop_state import Loop
 from planner_jax.sims.rally_state import Trial, pick
 from planner_jax.sims.scoring import racket_impact
-from planner_jax.sims.sensing import rls_update
 
 _LEARNING = 0.25  # [s], after an impact, when the restitution is estimated from the new flight
 # Standard deviation [m/s] of the difference of the ball's velocities before and after an impact, by

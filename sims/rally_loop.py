@@ -26,6 +26,7 @@ from jaxtyping import PyTree
 
 from planner_jax.ball.flight import BallState
 from planner_jax.core.compiled import QUICK_OPTIONS
+from planner_jax.perception.drag import RlsState
 from planner_jax.planning.replan import Replanning
 from planner_jax.planning.replanner import Replanner
 from planner_jax.robot.attitude import tilt_quaternion
@@ -38,7 +39,6 @@ from planner_jax.sims.rally_ball import observe, predict
 from planner_jax.sims.rally_state import Bounce, Frames, Passage, Trial, pick
 from planner_jax.sims.robot import Physics
 from planner_jax.sims.scoring import Contact, Moment, moment, passage, racket_impact
-from planner_jax.sims.sensing import RlsState
 from planner_jax.task.rally.case import RallyCase
 from planner_jax.task.rally.default_planner import RallyProblem
 from planner_jax.task.rally.plan import RallyPlan

@@ -6,8 +6,9 @@ from flax import struct
 from jax import Array
 from jaxtyping import PyTree
 
+from planner_jax.perception.drag import RlsState
 from planner_jax.sims.robot import Physics
-from planner_jax.sims.sensing import Estimate, RlsState
+from planner_jax.sims.sensing import Estimate
 from planner_jax.task.rally.plan import RallyPlan
 
 

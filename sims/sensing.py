@@ -14,51 +14,13 @@ from jax import Array
 
 from planner_jax.ball.estimation import EkfModel, EkfState, ekf_init, ekf_predict, ekf_update
 from planner_jax.ball.flight import BallState, fly, rk4_step
+from planner_jax.perception.drag import RlsState, rls_update, specific_energy
 from planner_jax.sims.noise import Sensing
 
 _LEAST_STD = 1e-3  # [m], least standard deviation that the filter assumes of an observation
 _ACCELERATION_DENSITY = 0.01  # [m^2/s^3], spectral density of the filter's process noise
 _FLIGHT_STEPS = 4  # number of integration steps of a prediction over latency and planning
 _DRAG_SPREAD = 0.2  # relative standard deviation of the initial drag estimate
-
-
-def specific_energy(ball: BallState, gravity: Array) -> Array:
-    """Return a ball's energy per unit mass,  |v|^2 / 2 + g z  [m^2/s^2], at speed |v| and height z.
-
-    Here g > 0 is the magnitude of gravity. Above eq. 6, [Yu2023bat] adds the product of position
-    and gravity vector instead of g z. With that sign, energy would change in a flight without drag.
-    """
-    return 0.5 * jnp.sum(ball.vel**2) + gravity * ball.pos[2]
-
-
-@struct.dataclass
-class RlsState:
-    """The least-squares estimate of a number x from measurements  y = h x + noise.
-
-    The factor h of each measurement is known, and the noise has unit variance.
-    """
-
-    estimate: Array  # (), estimate of x
-    # (), variance of the estimate; at first, the variance that is assumed without measurements.
-    variance: Array
-
-
-def rls_update(state: RlsState, regressor: Array, measurement: Array) -> RlsState:
-    """Update a recursive least-squares estimate with one more measurement.
-
-    Args:
-        state: the estimate so far.
-        regressor: (), known factor h; the measurement is h times the estimated number plus noise.
-        measurement: (); if it is not finite, the estimate does not change.
-    """
-    usable = jnp.isfinite(measurement)
-    y = jnp.where(usable, measurement, 0.0)
-    # From variance P, regressor h and gain K, textbooks compute the variance (1 - K h) P. The
-    # equal formula P / (1 + h^2 P) is used here, since it has no rounding error of a difference.
-    variance = state.variance / (1.0 + regressor**2 * state.variance)
-    error = y - regressor * state.estimate
-    after = RlsState(estimate=state.estimate + variance * regressor * error, variance=variance)
-    return jax.tree.map(lambda new, old: jnp.where(usable, new, old), after, state)
 
 
 @struct.dataclass

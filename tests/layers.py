@@ -22,7 +22,7 @@ OUTSIDE = ("sims", "policies", "benchmarks")
 LAYERS = (
     *("host", "core", "lanes", "referee"),
     *("ball", "trajectory", "space", "robot", "plane"),
-    *("cost", "penalties", "optimise", "planning", "recovery"),
+    *("cost", "penalties", "optimise", "perception", "planning", "recovery"),
     *("runs", "task", "baselines"),
     *("export", "sweep", "live", "__init__"),
     *("sims", "policies", "cli", "benchmarks", "__main__"),

@@ -11,7 +11,7 @@ from serve import DRAG, GRAVITY, LINEAR_DRAG, float64
 from planner_jax.ball.estimation import EkfModel, EkfState, ekf_init, ekf_predict, ekf_update
 from planner_jax.ball.flight import BallState, fly, rk4_step
 from planner_jax.ball.linear_drag import linear_drag_flight
-from planner_jax.sims.sensing import RlsState, rls_update
+from planner_jax.perception.drag import RlsState, rls_update
 
 NUM = 121
 PERIOD = 0.01  # [s] Time between two observations.

@@ -13,7 +13,7 @@ from serve import serve as ball
 from planner_jax.ball import flight
 from planner_jax.ball.flight import BallState, fly
 from planner_jax.ball.linear_drag import linear_drag_flight
-from planner_jax.sims.sensing import specific_energy
+from planner_jax.perception.drag import specific_energy
 
 WEIGHT = np.array([0.0, 0.0, -GRAVITY])
 

@@ -11,7 +11,6 @@ from scipy.optimize import minimize, rosen
 import planner_jax as pj
 from planner_jax.baselines.hit.bat import BatHit
 from planner_jax.baselines.parts.lbfgs_lite import LitePlanner, LiteRule, minimise_lite
-from planner_jax.core.errors import ArgumentError
 
 UNIT = 1e4  # divisor of the cost of `BatHit`
 TIGHT = LiteRule(gradient=1e-9, decrease=1e-14, max_steps=20000)

@@ -11,9 +11,9 @@ import pytest
 from planner_jax.ball.estimation import EkfState
 from planner_jax.ball.flight import BallState, fly
 from planner_jax.core.errors import ArgumentError
+from planner_jax.perception.drag import RlsState
 from planner_jax.sims import rally_ball, rally_loop, rally_state
 from planner_jax.sims.scoring import racket_impact
-from planner_jax.sims.sensing import RlsState
 from planner_jax.sims.settings import RallyFly
 from planner_jax.sims.tasks.rally import StateFile
 from planner_jax.task.rally.suites import COURSES

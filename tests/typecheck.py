@@ -15,7 +15,7 @@ from beartype.roar import BeartypeDecorHintException
 # Packages of `planner_jax` whose functions are checked while tests run.
 PACKAGES = (
     *("core", "lanes", "ball", "trajectory", "robot", "space", "plane"),
-    *("cost", "penalties", "optimise", "planning"),
+    *("cost", "penalties", "optimise", "perception", "planning"),
 )
 is_on = True  # False for tests of the library's own checks, which take arguments of any type
 # What an argument annotated as `jax.Array` may be: a JAX or NumPy array, a number, or a

@@ -9,6 +9,7 @@ EFFORTS = ("feasible", "good", "best")  # how long a planner searches; the first
 RECOVERIES = ("brake", "home")  # come to standstill anywhere, or at the case's initial position
 NONE = "none"  # setting for plans that end at their last contact, without a recovery
 CHOICES = (NONE, *RECOVERIES)
+STARTS = ("hover", "random")  # states of a quadrotor at time 0 that a suite may draw
 SCALES = (1e-3, 1e3)  # least and greatest plausible factor on the limits of a case
 
 

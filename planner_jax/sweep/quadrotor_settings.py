@@ -5,7 +5,14 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from planner_jax.core.choices import CHOICES, EFFORTS, require, require_one_of, require_scale
+from planner_jax.core.choices import (
+    CHOICES,
+    EFFORTS,
+    STARTS,
+    require,
+    require_one_of,
+    require_scale,
+)
 from planner_jax.core.errors import ArgumentError
 from planner_jax.runs.manifest import Entries, Row
 from planner_jax.runs.settings import SweepSettings, option, recovery_option, recovery_options
@@ -82,6 +89,7 @@ class QuadrotorSettings(SweepSettings):
     limit_scale: float = option(1.0, "F", "factor on the limits of speed, body rate and thrust")
     robot: object = robot_option("the task's")
     wind: tuple[float, ...] | None = WIND
+    starts: str = option(STARTS[0], "NAME", f"state of the robot at time 0: {' or '.join(STARTS)}")
     effort: str = option(EFFORTS[0], "NAME", f"how long the planner searches: {', '.join(EFFORTS)}")
     recovery: str = recovery_option()
 
@@ -93,6 +101,7 @@ class QuadrotorSettings(SweepSettings):
         super().__post_init__()
         require_scale(self.limit_scale)
         object.__setattr__(self, "robot", resolve_robot(self.robot, self.TOOL, self.wind))
+        require_one_of(STARTS, "starts", self.starts)
         require_one_of(EFFORTS, "effort", self.effort)
         rule = f"left out for the planner {self.WITHOUT_EFFORT}, which minimises nothing"
         has_effort = self.effort == EFFORTS[0] or self.planner != self.WITHOUT_EFFORT

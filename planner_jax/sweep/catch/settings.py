@@ -34,7 +34,7 @@ class CatchSettings(QuadrotorSettings):
     WITHOUT_EFFORT: ClassVar[str] = "mpp"
     RUN: ClassVar[str] = "planner_jax.sweep.catch.sweep:CatchSweep"
     PLANNER: ClassVar[tuple[str, ...]] = ("decide",)
-    DRAW: ClassVar[tuple[str, ...]] = ("limit_scale", "robot", "wind")
+    DRAW: ClassVar[tuple[str, ...]] = ("limit_scale", "robot", "wind", "starts")
     JUDGE: ClassVar[tuple[str, ...]] = ("tolerance", "net_test")
     # Number of cases in a batch on a GPU. It is small, because evaluating the 720 orders of six
     # targets takes 1 MB of memory for each case.

@@ -32,7 +32,7 @@ class HitSettings(QuadrotorSettings):
     TOOL: ClassVar[str] = "racket"
     WITHOUT_EFFORT: ClassVar[str] = "juggle"
     RUN: ClassVar[str] = "planner_jax.sweep.hit.sweep:HitSweep"
-    DRAW: ClassVar[tuple[str, ...]] = ("start", "delay", "limit_scale", "robot", "wind")
+    DRAW: ClassVar[tuple[str, ...]] = ("start", "delay", "limit_scale", "robot", "wind", "starts")
     JUDGE: ClassVar[tuple[str, ...]] = ("drag_after_impact",)
     DEFAULT_NUM: ClassVar[int] = 9000
     CASE_BYTES: ClassVar[int] = 12_000

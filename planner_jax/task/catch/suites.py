@@ -21,7 +21,13 @@ from planner_jax.ball.target import BallPath, HarmonicPath, TargetPath
 from planner_jax.core import GRAVITY
 from planner_jax.core.arithmetic import host_leaf
 from planner_jax.core.checks import floating, require_scalar
-from planner_jax.core.choices import require, require_scale, require_size
+from planner_jax.core.choices import (
+    STARTS,
+    require,
+    require_one_of,
+    require_scale,
+    require_size,
+)
 from planner_jax.core.registry import suite_named
 from planner_jax.robot.quadrotor_model import PAPER_CATCHER, QuadrotorModel
 from planner_jax.task.arguments import require_draw
@@ -70,6 +76,7 @@ def draw(
     robot: QuadrotorModel = PAPER_CATCHER,
     wind: Sequence[float] | None = None,
     num_targets: int | None = None,
+    starts: str = STARTS[0],
     dtype: DTypeLike = jnp.float32,
 ) -> CatchCase:
     """Draw a batch of random catch cases in float64, and cast them to `dtype`.
@@ -84,6 +91,8 @@ def draw(
     * `robot`: quadrotor with a net. Suites of other packages define their own robot.
     * `wind`: (3,) [m/s], velocity of the air, for a robot with drag.
     * `num_targets`: number N of targets, at least the suite's. Additional targets are absent.
+    * `starts`: state of the robot at time 0: "hover" at one point, or "random", in the ranges of
+      `task.starts.with_states`.
     """
     suite = suite_named(suite, "throws")
     require_draw(num, seed, first)
@@ -92,6 +101,7 @@ def draw(
     require_scale(limit_scale)
     if suite not in SUITES:
         require_own_robot(robot, PAPER_CATCHER, suite, wind)
+        require(starts == STARTS[0], "starts", f"left out with suite {suite!r}", starts)
         return TASK.other_suite(suite)(num, seed, first)
     own = SUITES[suite].num_targets
     size = own if num_targets is None else num_targets
@@ -113,18 +123,32 @@ def draw(
         optional=SUITES[suite].optional,
         dtype=dtype,
     )
-    return dataclasses.replace(cases, limits=cases.limits.scale(limit_scale, cases.gravity))
+    cases = dataclasses.replace(cases, limits=cases.limits.scale(limit_scale, cases.gravity))
+    if starts == STARTS[0]:
+        return cases
+    from planner_jax.task.starts import draw_states  # few draws need it
+
+    return draw_states(starts, cases, suite, seed, range(first, first + num))
 
 
-def draw_by_key(key: Array, num: int, suite: str) -> CatchCase:
-    """Draw `num` cases of a suite with a key of `jax.random`; may be called inside `jax.jit`."""
+def draw_by_key(key: Array, num: int, suite: str, starts: str = STARTS[0]) -> CatchCase:
+    """Draw `num` cases of a suite with a key of `jax.random`; may be called inside `jax.jit`.
+
+    `starts` is "hover" or "random", as for `draw`.
+    """
+    require_one_of(STARTS, "starts", starts)
     columns, make_targets = _PATHS[suite]
     paths = make_targets(jax.random.uniform(key, (num, columns)))
     targets, horizon = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), paths)
     one = draw(1, suite)
     cases = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (num, *leaf.shape[1:])), one)
     times = one.times / one.horizon[:, :1] * horizon[:, :1]
-    return dataclasses.replace(cases, targets=targets, horizon=horizon, times=times)
+    cases = dataclasses.replace(cases, targets=targets, horizon=horizon, times=times)
+    if starts == STARTS[0]:
+        return cases
+    from planner_jax.task.starts import NUM, with_states  # few draws need it
+
+    return with_states(cases, jax.random.uniform(jax.random.fold_in(key, 1), (num, NUM)))
 
 
 def _module(array: PyTree) -> ModuleType:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 import jax.numpy as jnp
 from jax.typing import DTypeLike
 
+from planner_jax.core.choices import STARTS, require
 from planner_jax.core.origin import to_world
 from planner_jax.core.planner import Planner
 from planner_jax.core.registry import suite_named
@@ -30,6 +31,7 @@ def draw(
     limit_scale: float = 1.0,
     robot: QuadrotorModel = PAPER_HITTER,
     wind: Sequence[float] | None = None,
+    starts: str = STARTS[0],
     dtype: DTypeLike = jnp.float32,
 ) -> HitCase:
     """Draw a batch of random cases: serves that a hovering quadrotor has to return.
@@ -46,6 +48,8 @@ def draw(
         limit_scale: factor on the limits of speed, acceleration and body rate.
         robot: quadrotor with a racket. Suites of other packages define their own robot.
         wind: (3,) [m/s], velocity of the air, for a robot with drag.
+        starts: state of the quadrotor at time 0: "hover" at `start`, or "random", around it, in
+            the ranges of `task.starts.with_states`.
         dtype: type of every floating leaf.
 
     Raises:
@@ -54,6 +58,7 @@ def draw(
     suite = suite_named(suite, "court")
     if suite not in TASK.suites:
         require_own_robot(robot, PAPER_HITTER, suite, wind)
+        require(starts == STARTS[0], "starts", f"left out with suite {suite!r}", starts)
         return TASK.other_suite(suite)(num, seed, first)
     serves = generate_serves(num, seed, REAL_SCENARIOS.get(suite), first=first)
     return to_cases(
@@ -64,6 +69,7 @@ def draw(
         limit_scale=limit_scale,
         robot=robot,
         wind=wind,
+        starts=starts,
         dtype=dtype,
     )
 

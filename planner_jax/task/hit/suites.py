@@ -11,7 +11,7 @@ import numpy as np
 from scipy.interpolate import RectBivariateSpline
 
 from planner_jax.core.checks import numeric, require_kind, require_scalar
-from planner_jax.core.choices import require, require_scale
+from planner_jax.core.choices import STARTS, require, require_scale
 from planner_jax.core.errors import ArgumentError, ArgumentTypeError
 from planner_jax.robot.quadrotor_model import PAPER_HITTER, QuadrotorModel
 from planner_jax.task.arguments import require_draw
@@ -210,6 +210,7 @@ def to_cases(
     limit_scale: float = 1.0,
     robot: QuadrotorModel = PAPER_HITTER,
     wind: Sequence[float] | None = None,
+    starts: str = STARTS[0],
     dtype=jnp.float32,
 ) -> HitCase:
     """Make a batch of hits to plan from serves, by default with the numbers of [Yu2023bat].
@@ -217,7 +218,8 @@ def to_cases(
     `start` (3,) [m] is the hover position of the quadrotor `robot`. If it is "uniform", positions
     in the quadrotor's half court are drawn with `seed`. When planning starts, the balls have flown
     for `delay` [s]. `limit_scale` multiplies the limits of speed, acceleration and body rate.
-    `wind` (3,) [m/s] is the velocity of the air, for a robot with drag.
+    `wind` (3,) [m/s] is the velocity of the air, for a robot with drag. With `starts="random"` the
+    quadrotor moves at time 0, as `draw` explains.
     """
     require_kind("serves", serves, Serves)
     require_scalar("limit_scale", limit_scale)
@@ -243,4 +245,9 @@ def to_cases(
         wind=wind,
         dtype=dtype,
     )
-    return dataclasses.replace(cases, limits=cases.limits.scale(limit_scale, cases.gravity))
+    cases = dataclasses.replace(cases, limits=cases.limits.scale(limit_scale, cases.gravity))
+    if starts == STARTS[0]:
+        return cases
+    from planner_jax.task.starts import draw_states  # few draws need it
+
+    return draw_states(starts, cases, "hit", seed, serves.index)
