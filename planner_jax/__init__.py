@@ -28,8 +28,7 @@ Classes for parts of cases and plans:
 * `ball.fit`: estimates and predicts flights from recordings; `perception`: estimates during flights
 * `penalties`: the penalties of the published planners, as pure functions
 * obstacles of a car: `Obstacles`, made by `obstacles`
-* trajectories: `PiecewisePolynomial`, `evaluate`, `snap_energy`; `minco`, the spline of least
-  energy for waypoints and durations of its pieces; `durations_of`, durations as free variables
+* trajectories: `PiecewisePolynomial`, `evaluate`, `snap_energy`; splines: `minco`, `durations_of`
 * base classes and settings for planners and tasks that a user writes: `Planner`, `Plan`, `Attempt`,
   `outcome`, `Problem`, `SearchPlanner`, `pending`, `LbfgsConfig`, `NewtonConfig`, `Verdict`, `Task`
 

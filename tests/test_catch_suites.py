@@ -228,7 +228,7 @@ def test_padding_leaves_the_present_targets_alone(name):
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        ({"suite": "throw"}, "suite must be one of throws, hard, .*, swarm12, got 'throw'"),
+        ({"suite": "throw"}, "suite must be one of throws, paper-throws, .*, swarm12, got 'throw'"),
         ({"num": 0}, "num must be >= 1, got 0"),
         ({"seed": -1}, "seed must be >= 0, got -1"),
         ({"suite": "triangle3", "num_targets": 2}, "num_targets must be >= 3 .*'triangle3', got 2"),

@@ -48,8 +48,7 @@ def draw(
         limit_scale: factor on the limits of speed, acceleration and body rate.
         robot: quadrotor with a racket. Suites of other packages define their own robot.
         wind: (3,) [m/s], velocity of the air, for a robot with drag.
-        starts: state of the quadrotor at time 0: "hover" at `start`, or "random", around it, in
-            the ranges of `task.starts.with_states`.
+        starts: "hover" at `start`, or "random", moving near it; see `task.starts.with_states`.
         dtype: type of every floating leaf.
 
     Raises:

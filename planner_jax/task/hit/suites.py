@@ -218,8 +218,7 @@ def to_cases(
     `start` (3,) [m] is the hover position of the quadrotor `robot`. If it is "uniform", positions
     in the quadrotor's half court are drawn with `seed`. When planning starts, the balls have flown
     for `delay` [s]. `limit_scale` multiplies the limits of speed, acceleration and body rate.
-    `wind` (3,) [m/s] is the velocity of the air, for a robot with drag. With `starts="random"` the
-    quadrotor moves at time 0, as `draw` explains.
+    `wind` (3,) [m/s] is the velocity of the air, for a robot with drag. `starts` is as in `draw`.
     """
     require_kind("serves", serves, Serves)
     require_scalar("limit_scale", limit_scale)
