@@ -25,17 +25,20 @@ weights and the width of the penalties times 0.1 and 10, and 8 polynomial pieces
 as the authors did, on --drawn serves a scenario that are drawn and not judged.
 """
 
+import copy
 import csv
 import dataclasses
 import itertools
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 
 import planner_jax as pj
 from planner_jax.baselines.hit.bat import BatHit
 from planner_jax.baselines.hit.comparison import choose_reference
+from planner_jax.baselines.hit.juggle import JuggleHit
 from planner_jax.baselines.protocols import BY_ROW
 from planner_jax.benchmarks.run import Bench, argument_parser, begin, parse_names
 from planner_jax.runs.summary import wilson_interval
@@ -98,37 +101,51 @@ def agreement(ours: np.ndarray, theirs: np.ndarray, scenario: np.ndarray) -> dic
     return {"same": same, "kappa": kappa(ours, theirs), "correlation": correlation}
 
 
+def cases_of(row: Row, serves: Serves) -> pj.hit.HitCase:
+    """Convert serves to cases with the coefficient of restitution of a row."""
+    cases = pj.hit.to_cases(serves)
+    if row.restitution is None:
+        return cases
+    filled = np.full_like(cases.restitution, row.restitution)
+    return dataclasses.replace(cases, restitution=filled)
+
+
 def plan_and_judge(row: Row, serves: Serves, **options: Any) -> np.ndarray:
     """Plan serves by the planner of a row; return the referee's verdicts (N,) bool."""
-    cases = pj.hit.to_cases(serves)
-    if row.restitution is not None:
-        filled = np.full_like(cases.restitution, row.restitution)
-        cases = dataclasses.replace(cases, restitution=filled)
-    planner = pj.hit.planner(row.planner, **row.options, **options)
+    cases, planner = cases_of(row, serves), pj.hit.planner(row.planner, **row.options, **options)
     return pj.hit.judge(cases, pj.plan(planner, cases)).success
 
 
-def tune(row: Row, drawn: int) -> list[Row]:
-    """Return for each of the 36 scenarios the row of the grid with the most successes.
+@jax.jit
+@jax.vmap
+def _juggle(height: jax.Array, apex: jax.Array, case: pj.hit.HitCase) -> pj.hit.HitPlan:
+    planner = copy.copy(JuggleHit())  # one program for all heights and apexes
+    object.__setattr__(planner, "height", height)
+    object.__setattr__(planner, "apex", apex)
+    return planner.solve(case, planner.attempts[0])
+
+
+def judge_tuned(options: np.ndarray, row: Row, serves: Serves) -> np.ndarray:
+    """Plan serves by Juggle with the options of their scenarios; return verdicts (N,) bool.
+
+    `options` (36, 2) [m] has the height of the hit and the apex of the returned ball.
+    """
+    cases = cases_of(row, serves)
+    height, apex = options[serves.scenario].T.astype(cases.gravity.dtype)
+    return pj.hit.judge(cases, jax.device_get(_juggle(height, apex, cases))).success
+
+
+def tune(row: Row, drawn: int) -> np.ndarray:
+    """Return for each of the 36 scenarios the options of `GRID` with the most successes, (36, 2).
 
     Each scenario has `drawn` random serves. Of equal rates the first one of `GRID` is selected.
     """
-    serves = generate_serves(drawn * len(court.SCENARIOS), 1)
-    grid = [
-        dataclasses.replace(row, options={"height": height, "apex": apex}) for height, apex in GRID
+    serves, num = generate_serves(drawn * len(court.SCENARIOS), 1), len(court.SCENARIOS)
+    rates = [
+        rates_by_scenario(judge_tuned(np.tile(pair, (num, 1)), row, serves), serves.scenario)
+        for pair in GRID
     ]
-    rates = [rates_by_scenario(plan_and_judge(each, serves), serves.scenario) for each in grid]
-    return [grid[best] for best in np.argmax(rates, axis=0)]
-
-
-def judge_tuned(rows: list[Row], serves: Serves) -> np.ndarray:
-    """Return the verdicts (N,) bool of serves, each planned by the row of its scenario."""
-    success = np.zeros(len(serves), bool)
-    for row in {str(row): row for row in rows}.values():
-        own = np.flatnonzero([rows[scenario] == row for scenario in serves.scenario])
-        if own.size:
-            success[own] = plan_and_judge(row, serves[own])
-    return success
+    return np.array(GRID)[np.argmax(rates, axis=0)]
 
 
 def report(
@@ -195,9 +212,8 @@ def main() -> None:
         for name, row in rows.items():
             if options.tune:
                 found = tune(row, options.drawn)
-                success, home, name = judge_tuned(found, serves), None, f"{name}, tuned"
-                bench.note(**{name: {k: each.options for k, each in
-                                     zip(court.SCENARIOS, found, strict=True)}})  # fmt: skip
+                success, home, name = judge_tuned(found, row, serves), None, f"{name}, tuned"
+                bench.note(**{name: dict(zip(court.SCENARIOS, found.tolist(), strict=True))})
             else:
                 success = plan_and_judge(row, serves)
                 home = plan_and_judge(row, serves, recovery="home") if options.home else None
