@@ -41,7 +41,8 @@ This page lists all equations of four papers of [references](references.md). The
 says in a few words what an equation computes. The column "implemented in" has the file that
 computes it, and the functions or classes there whose docstrings cite it. "Tested in" has the two
 modules of `tests/` that name these functions most often, or the reason why there is none. The files
-in the last column use, check or discuss the equation. The column "as printed?" has one of these words:
+in the last column use, check or discuss the equation. The column "as printed?" has one of these
+words:
 
 - as printed: the code computes the printed equation, perhaps in other variables.
 - corrected: the printed equation has a misprint, which the code does not have.
@@ -99,7 +100,8 @@ def name_at(tree: ast.Module, line: int) -> str:
 def parts_of(text: str) -> Iterator[tuple[int, str, str]]:
     """Yield, for each algorithm, table or figure that a text cites, its position, paper and name.
 
-    A table or figure is cited as `[KEY, Table N]`, `Table N of [KEY]` or, in code, `"KEY", "Table N"`.
+    A table is cited as `[KEY, Table N]`, `Table N of [KEY]` or, in code, `"KEY", "Table N"`, and a
+    figure in the same manner.
     """
     keyed = list(KEYED.finditer(text))
     papers = {match[1] for match in keyed}
