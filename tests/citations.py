@@ -100,8 +100,8 @@ def name_at(tree: ast.Module, line: int) -> str:
 def parts_of(text: str) -> Iterator[tuple[int, str, str]]:
     """Yield, for each algorithm, table or figure that a text cites, its position, paper and name.
 
-    A table or figure is cited as `[KEY, Table N]`, `Table N of [KEY]` or, in code, as the strings
-    `"KEY", "Table N"`.
+    A table is cited as `[KEY, Table N]`, `Table N of [KEY]` or, in code, `"KEY", "Table N"`, and a
+    figure in the same manner.
     """
     keyed = list(KEYED.finditer(text))
     papers = {match[1] for match in keyed}

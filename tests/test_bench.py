@@ -1,5 +1,6 @@
 import dataclasses
 import importlib
+import itertools
 import json
 import time
 from pathlib import Path
@@ -10,9 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from flax import struct
+from matplotlib.figure import Figure
 
 import planner_jax as pj
 from planner_jax import benchmarks
+from planner_jax.benchmarks import paper_figures
 from planner_jax.benchmarks.cost_gap import cost_gaps, gap_figures
 from planner_jax.benchmarks.first_plan import ROWS as FIRST_PLANS
 from planner_jax.benchmarks.first_plan import plan_in_new_process
@@ -22,6 +25,7 @@ from planner_jax.benchmarks.run import Bench
 from planner_jax.benchmarks.throughput import report
 from planner_jax.core import registry
 from planner_jax.core.errors import ArgumentError
+from planner_jax.runs import style
 
 BENCHMARKS = sorted(Path(benchmarks.__path__[0]).glob("*.py"))
 
@@ -222,3 +226,36 @@ def test_pairs_and_solved_programs_are_among_the_compared_speed_planners(name):
     assert {*compared.solved}.union(*compared.pairs) <= compared.planners.keys()
     weights = {planner.end_weight for planner in compared.planners.values()}
     assert weights == ({None, 300.0} if name == "PAPER" else {None})
+
+
+@pytest.mark.parametrize("name", ["qu-2", "qu-4", "bat-7"])
+def test_a_figure_of_a_paper_has_its_axes_and_the_same_data_each_time(name):
+    drawing, again = (paper_figures.FIGURES[name](30, 0) for _ in range(2))
+    assert drawing.to_csv() == again.to_csv()
+    head, *lines = drawing.to_csv().splitlines()
+    assert head == "panel,curve,x,y" and len(lines) == sum(each.x.size for each in drawing.curves)
+    with style.context():
+        paper_figures.draw_panels(figure := Figure(), drawing)
+    shown = {axes.get_title("left"): (axes.get_xlabel(), axes.get_ylabel()) for axes in figure.axes}
+    assert shown == drawing.panels
+    assert all(np.isfinite([*each.x, *each.y]).all() for each in drawing.curves)
+
+
+def test_only_the_uniform_drive_of_the_figure_of_speeds_enters_an_obstacle():
+    curves = [each for each in paper_figures.draw_speeds(30, 0).curves if each.panel == "station"]
+    boxes = [each for each in curves if each.name.startswith(paper_figures.OBSTACLE)]
+    lines = {each.name: each for each in curves if each not in boxes}
+    met = dict.fromkeys(lines, False)
+    for name, box in itertools.product(lines, boxes):
+        line, times = lines[name], np.linspace(*box.x[:2], 200)
+        station = np.interp(times, line.x, line.y)
+        lower, upper = (np.interp(times, box.x[:2], each) for each in (box.y[:2], box.y[:1:-1]))
+        met[name] |= bool(((station > lower) & (station < upper)).any())
+    assert met == {"uniform": True, "EM": False, "lines of the paper": False}
+
+
+def test_a_figure_of_speeds_without_a_suitable_problem_says_so(monkeypatch):
+    free = SimpleNamespace(good=np.ones(1, bool))
+    monkeypatch.setattr(paper_figures, "judge", lambda *_: free)
+    with pytest.raises(LookupError, match="^no problem of 1 has the required outcomes$"):
+        paper_figures.draw_speeds(1, 0)
