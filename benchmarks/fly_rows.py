@@ -1,15 +1,15 @@
 """Measure success of catches and hits in closed-loop simulation of quadrotors.
 
-    python -m benchmarks.fly_rows [--num 1000] [--seed 0] [--rows exact,catch,hit,hit-once,ablate]
-                                  [--limit 300]
+    python -m benchmarks.fly_rows [--num 1000] [--seed 0] [--limit 300]
+                                  [--rows exact,catch,hit,hit-once,ablate,published]
 
 The option --rows selects groups of lines: `exact` without noise, `catch` and `hit` with noise,
-`hit-once` for hits that are planned once, at several times after the serve, and `ablate`, which
-leaves out one part of the control loop at a time. The noise is `lab`, that is the
-noise of a motion-capture hall, with a latency of 20 ms. The initial estimate of the ball's drag is
-15 % too large or too small. Catches are re-planned 100 times per second. Hits are re-planned 50
-times per second or, as in [Yu2023bat], not at all. A flight of several balls succeeds if all balls
-are caught.
+`hit-once` for hits that are planned once, at several times after the serve, `ablate`, which leaves
+out one part of the control loop at a time, and `published`, which estimates the balls as the papers
+do. The noise is `lab`, that is the noise of a motion-capture hall, with a latency of 20 ms. The
+initial estimate of the ball's drag is 15 % too large or too small. Catches are re-planned 100 times
+per second. Hits are re-planned 50 times per second or, as in [Yu2023bat], not at all. A flight of
+several balls succeeds if all balls are caught.
 
 Each line prints the success rate with its 95 % Wilson interval, and the required rate if there is
 one. Every simulation runs twice, and the time of the second run, without compilation, is printed.
@@ -327,12 +327,24 @@ def ablation_rows(args: Any) -> None:
         hits(title, loop, regions, args, DRAG_ERROR, planner=hit.planner(name))
 
 
+def published_rows(args: Any) -> None:
+    """Print lines for catches and hits whose balls the published observers estimate."""
+    loop = Loop(CATCH_WORLD, LAB, replan=CATCH_RATE, observer="linear", record=True)
+    if flights := catches("lab, one ball, published observer", loop, args, DRAG_ERROR):
+        prediction_errors(flights.flown)
+    loop = Loop(HIT_WORLD, LAB, replan=HIT_RATE, observer="rls", record=True)
+    title = "lab, S.1, published observer"
+    if flights := hits(title, loop, REAL_SCENARIOS["S.1"], args, DRAG_ERROR):
+        prediction_errors(flights.flown)
+
+
 ROWS = {
     "exact": exact_rows,
     "catch": catch_rows,
     "hit": hit_rows,
     "hit-once": once_rows,
     "ablate": ablation_rows,
+    "published": published_rows,
 }
 
 

@@ -42,6 +42,8 @@ _TASKS = {  # the number of a plan, and the parts of a case
         ("shared.limits.body_rate", "shared.net.height", "head_states"),
     ),
 }
+# Settings of Newton's method with which a search continues as far as float64 permits.
+_EXACT = pj.NewtonConfig(max_steps=20, damping=1e-6, tighten=30.0, tolerance=1e-12, patience=8)
 _LONG = {"max_steps": 2000, "settled": 20}  # least squares that end at the minimum
 
 
@@ -56,10 +58,12 @@ def differences(
         cases, plans = with_type(cases, np.float64), with_type(plans, np.float64)
         smooth, started = planner.settle(cases, lambda *_: plans)
         started = with_type(started, np.float64)
-        smooth, problem = smooth.with_polish(), smooth.problem
+        problem = smooth.problem
         if isinstance(problem, SmoothBlock):  # its least squares end early
             solver = dataclasses.replace(problem.solver, **_LONG)
             smooth = pj.SearchPlanner(dataclasses.replace(problem, solver=solver))
+        else:
+            smooth = smooth.with_polish(dataclasses.replace(_EXACT, subspace=problem.subspace))
 
         def number(step: float) -> np.ndarray:
             moved = started

@@ -48,7 +48,8 @@ def ready(loop: Loop, starts: Array, keys: Array) -> FlightState:
     def one(start: Array, key: Array) -> FlightState:
         zero, nothing = jnp.zeros(()), jnp.zeros(number, bool)
         unknown = jnp.zeros((number, 3)), jnp.full(number, 0.1, zero.dtype)
-        estimates = jax.vmap(sight.first_estimate)(*unknown)
+        begin = functools.partial(sight.first_estimate, observer=loop.observer)
+        estimates = jax.vmap(begin)(*unknown)
         return FlightState(
             physics=at_rest(loop.world, start),
             shown=jnp.zeros((loop.late_observations, number, 3)),
@@ -156,9 +157,8 @@ def await_ball(
     def guess(before: float, drag: Array) -> Estimate:
         ago = jnp.asarray(-ahead - loop.sensing.latency - before, drag.dtype)
         there = fly(coming, ago, drag, gravity, num_steps=16)[0]
-        estimate = sight.first_estimate(there.pos, drag)
-        belief = dataclasses.replace(estimate.belief, mean=jnp.concatenate([there.pos, there.vel]))
-        return sight.anchor_energy(dataclasses.replace(estimate, belief=belief), gravity)
+        estimate = sight.first_estimate(there.pos, drag, loop.observer, there.vel)
+        return sight.anchor_energy(estimate, gravity)
 
     def one(flight: FlightState, believed: Array) -> FlightState:
         put = lambda all_balls, one_ball: all_balls.at[ball].set(one_ball)  # noqa: E731
@@ -206,7 +206,7 @@ def watch_ball(
         after = update(estimate, at, sensing, gravity)
         return after, after
 
-    first = sight.first_estimate(observed[0], believed)
+    first = sight.first_estimate(observed[0], believed, loop.observer)
     now, history = lax.scan(advance, first, seen)
     earlier = jax.tree.map(lambda leaf: leaf[-1 - loop.observations_per_plan], history)
     return shown, earlier, sight.anchor_energy(now, gravity)

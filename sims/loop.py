@@ -135,7 +135,7 @@ def _pose_problems(
             time=when,
             elapsed=elapsed,
             balls=predict_balls(loop, flight.estimates, loop.period),
-            drag=flight.estimates.drag,
+            drag=flight.estimates.path_drag,
             present=flight.present & (pilot.times(flight.plan) > elapsed),
             head_state=loop.world.carrier.head_state(flight.plan, elapsed),
         )
@@ -199,8 +199,7 @@ def _record(loop: Loop, pilot: Pilot, flight: FlightState, drag: Array) -> Recor
 
     def error(pos: Array, vel: Array, true_drag: Array, estimate: Estimate, ahead: Array) -> Array:
         truth = fly(BallState(pos, vel), ahead, true_drag, gravity, num_steps=12)[0]
-        ball, late = estimate.belief.ball, ahead + loop.sensing.latency
-        return fly(ball, late, estimate.drag, gravity, num_steps=12)[0].pos - truth.pos
+        return sight.fly_on(estimate, ahead + loop.sensing.latency, gravity, 12).pos - truth.pos
 
     return Record(
         time=flight.time,

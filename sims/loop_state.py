@@ -11,9 +11,10 @@ from flax import struct
 from jax import Array
 
 from planner_jax.ball.flight import BallState
+from planner_jax.core.choices import require, require_one_of
 from planner_jax.optimise.planner import Problem
 from planner_jax.sims.model import World
-from planner_jax.sims.noise import Sensing, require_whole
+from planner_jax.sims.noise import OBSERVERS, Sensing, require_whole
 from planner_jax.sims.robot import Physics
 from planner_jax.sims.scoring import Contact
 from planner_jax.sims.sensing import Estimate
@@ -26,7 +27,7 @@ class Outlook:
     time: Array  # () [s], time of this situation
     elapsed: Array  # () [s], time since the start of the current plan
     balls: BallState  # leaves (N, 3), predicted states of the balls
-    drag: Array  # (N,), drag coefficients K_D [1/m], estimated
+    drag: Array  # (N,), estimated K_D [1/m]; (N, 3) K_i [1/s] by the observer "linear"
     present: Array  # (N,) bool, whether each ball is in flight and not yet met
     head_state: Array  # planned state of the robot, (4, 3) for a quadrotor
 
@@ -87,8 +88,9 @@ class Loop:
     """The settings that determine a flight's compiled program; static under `jax.jit`.
 
     Raises:
-        ValueError: the time between plans or the latency is not a multiple of the observation
-            period, or the observation period is not a multiple of the time step.
+        ValueError: the observer is unknown or needs the Kalman filter; the time between plans or
+            the latency is not a multiple of the observation period; or the observation period is
+            not a multiple of the time step.
     """
 
     world: World
@@ -96,9 +98,13 @@ class Loop:
     replan: float = 0.0  # [Hz], rate of replanning; 0 flies the first plan to its end
     kalman: bool = True  # whether the observations of the balls are filtered
     estimate_drag: bool = True  # whether drag is estimated from the energy that a ball loses
+    observer: str = "energy"  # key of `noise.OBSERVERS`
     record: bool = False  # whether path and prediction errors are stored at every observation
 
     def __post_init__(self) -> None:
+        require_one_of(OBSERVERS, "observer", self.observer)
+        is_usual = self.observer == "energy"
+        require(self.kalman or is_usual, "observer", "energy without filter", self.observer)
         sensing, control_rate = self.sensing, 1.0 / self.world.timestep
         rule = f"a divisor of {control_rate:g} Hz"
         require_whole(control_rate / sensing.rate, "rate", rule, sensing.rate)

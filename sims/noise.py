@@ -61,6 +61,14 @@ class Sensing:
         return round(self.rate / replan)
 
 
+# Observers of a thrown ball, by name. All but the first use a linear Kalman filter, whose
+# coefficients of linear drag are fitted to its last estimates [Yu2023catch, Section V-A].
+OBSERVERS = {
+    "energy": "filter with quadratic drag, whose coefficient follows from the lost energy",
+    "linear": "linear filter; the ball's path is predicted with linear drag, too",
+    "rls": "linear filter; the path is predicted with quadratic drag, from losses of energy by RLS",
+}
+
 NOISES = {
     "none": Sensing(),
     # [Yu2023bat] and [Yu2023catch] observe with Vicon. Every module of their software runs within

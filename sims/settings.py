@@ -137,6 +137,11 @@ class BallFly(FlySettings):
 
     TOOL: ClassVar[str] = "net"  # tool that the robot must carry, or "racket"
 
+    @property
+    def loop_observer(self) -> str:
+        """The observer of the balls, a key of `noise.OBSERVERS`."""
+        return "energy"
+
     def known_robot(self) -> Any:
         """Return the robot as plans know it, with an error of its drag; None for the default."""
         if not self.rotor_drag_error:
@@ -166,7 +171,27 @@ class BallFly(FlySettings):
 
 
 @dataclasses.dataclass(frozen=True)
-class CatchFly(BallFly):
+class ThrownFly(BallFly):
+    """The settings that flights of hits and catches share."""
+
+    observer: str = option(
+        "default", "NAME", "estimator of the balls: default, or published, as in the papers"
+    )
+
+    PUBLISHED: ClassVar[str]  # key of `noise.OBSERVERS`: the published observer
+
+    def __post_init__(self) -> None:
+        require_one_of(("default", "published"), "observer", self.observer)
+        super().__post_init__()
+
+    @property
+    def loop_observer(self) -> str:
+        """The observer of the balls, a key of `noise.OBSERVERS`."""
+        return super().loop_observer if self.observer == "default" else self.PUBLISHED
+
+
+@dataclasses.dataclass(frozen=True)
+class CatchFly(ThrownFly):
     """Settings of flights of a quadrotor that catches thrown balls."""
 
     replan: float | None = option(None, "HZ", _REPLAN.format(100, "exact"))
@@ -188,6 +213,7 @@ class CatchFly(BallFly):
 
     TASK: ClassVar[Task] = CATCH
     FLIGHT: ClassVar[str] = "planner_jax.sims.tasks.catch:CatchFlight"
+    PUBLISHED: ClassVar[str] = "linear"
     TOOL: ClassVar[str] = "net"
     RATE: ClassVar[float] = 100.0
 
@@ -228,7 +254,7 @@ class CatchFly(BallFly):
 
 
 @dataclasses.dataclass(frozen=True)
-class HitFly(BallFly):
+class HitFly(ThrownFly):
     """Settings of flights of a quadrotor that hits served balls."""
 
     replan: float | None = option(None, "HZ", _REPLAN.format(50, "exact"))
@@ -238,6 +264,7 @@ class HitFly(BallFly):
 
     TASK: ClassVar[Task] = HIT
     FLIGHT: ClassVar[str] = "planner_jax.sims.tasks.hit:HitFlight"
+    PUBLISHED: ClassVar[str] = "rls"
     TOOL: ClassVar[str] = "racket"
     RATE: ClassVar[float] = 50.0
 

@@ -199,7 +199,8 @@ class BallTask(FlightTask):
         """Return the closed loop's settings; `record`: whether robot and ball states are stored."""
         settings = self.settings
         sensing = NOISES[settings.noise]
-        return Loop(self.world(), sensing, replan=settings.rate, record=record)
+        observer = settings.loop_observer
+        return Loop(self.world(), sensing, replan=settings.rate, observer=observer, record=record)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -67,6 +67,7 @@ def options_of(task: Task) -> dict[str, list[tuple[str, ...]]]:
         "recovery": [("--recovery", name) for name in CHOICES],
         "robot": [("--robot", model.name) for model in ROBOTS.values()],
         "wind": [wind, *((*wind, "--robot", file) for file in windy)],
+        "observer": [("--observer", "published")],
         "resume": [("--resume",)],
         "workers": [("--workers", "ray")],
     }

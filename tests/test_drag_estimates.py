@@ -184,10 +184,10 @@ def test_the_online_window_corrects_the_filters_drag():
         state, window, model = carry
         state = ekf_update(ekf_predict(state, 0.01, model), seen, model)
         mean = jnp.where(jnp.isfinite(seen[0]), state.mean, jnp.nan)
-        window = window_update(window, 0.01, mean)
+        window = window_update(window, 0.01, state.replace(mean=mean))
         return (state, window, refine_model(window, model, PRIOR, 1.0)), None
 
-    first = window_update(window_init(dtype=float), 0.0, start.mean)
+    first = window_update(window_init(dtype=float), 0.0, start)
     filled = jax.jit(functools.partial(jax.lax.scan, advance))((start, first, model), path[1:])
     window, model = filled[0][1:]
     np.testing.assert_allclose(window.ages, 0.01 * np.arange(19, -1, -1), atol=1e-12)

@@ -12,7 +12,7 @@ from jax import Array, lax
 from jax.typing import DTypeLike
 from jaxtyping import Float
 
-from planner_jax.ball.estimation import EkfModel
+from planner_jax.ball.estimation import EkfModel, EkfState
 from planner_jax.ball.flight import BallState
 from planner_jax.ball.linear_drag import linear_drag_flight
 from planner_jax.optimise.levenberg import LevenbergConfig, Model, least_squares
@@ -54,7 +54,8 @@ def fit_linear_drag(
         start: leaves (3,), state of the ball at time 0, taken as exact.
         drag: (3,) [1/s], start of the search, and mean of the prior.
         gravity: () [m/s^2], magnitude.
-        observation_std: () or (3,) [m] > 0, standard deviation of a coordinate of a position.
+        observation_std: () or (3,), or (n, 3) [m] > 0, standard deviation of a coordinate of a
+            position.
         shared: whether the axes share one coefficient, whose start is the mean of `drag`.
         prior_std: () or (3,) [1/s] > 0, standard deviation of the prior; infinite for no prior.
             With `shared` it is ().
@@ -113,27 +114,26 @@ class DragWindow:
     """The last n estimates of a ball's state, from old to new; NaN before there are n."""
 
     ages: Array  # (n,) [s], time from the estimate to the last one
-    means: Array  # (n, 6) [m, m/s], estimated positions and velocities
+    beliefs: EkfState  # leaves (n, 6) and (n, 6, 6)
 
 
 def window_init(num: int = 20, dtype: DTypeLike = jnp.float32) -> DragWindow:
     """Return an empty window of `num` estimates."""
-    return DragWindow(ages=jnp.zeros(num, dtype), means=jnp.full((num, 6), jnp.nan, dtype))
+    empty = EkfState(jnp.full((num, 6), jnp.nan, dtype), jnp.zeros((num, 6, 6), dtype))
+    return DragWindow(ages=jnp.zeros(num, dtype), beliefs=empty)
 
 
-def window_update(window: DragWindow, duration: Array, mean: Float[Array, "6"]) -> DragWindow:
+def window_update(window: DragWindow, duration: Array, belief: EkfState) -> DragWindow:
     """Return the window after one more estimate, in place of the oldest one.
 
     Args:
         window: the estimates so far.
         duration: () [s], time since the last update.
-        mean: (6,) [m, m/s], estimated position and velocity; NaN if the ball was not seen.
+        belief: estimate of the filter; its mean is NaN if the ball was not seen.
     """
-    zero = jnp.zeros_like(window.ages[:1])
-    return DragWindow(
-        ages=jnp.concatenate([window.ages[1:] + duration, zero]),
-        means=jnp.concatenate([window.means[1:], mean[None]]),
-    )
+    push = lambda old, new: jnp.concatenate([old[1:], new[None]])  # noqa: E731
+    ages = push(window.ages + duration, jnp.zeros_like(window.ages[0]))
+    return DragWindow(ages=ages, beliefs=jax.tree.map(push, window.beliefs, belief))
 
 
 def refine_model(
@@ -141,7 +141,9 @@ def refine_model(
 ) -> EkfModel:
     """Return the Kalman filter's model with the drag that fits the window [Yu2023catch, eq. 12].
 
-    The fitted flight starts from the oldest estimate of the window.
+    The fitted flight starts from the oldest estimate of the window. This estimate's uncertainty
+    reduces the weights of the later ones. Otherwise the filter and its drag could diverge, since an
+    error of the drag causes an error of the start, which changes the drag.
 
     Args:
         window: the last estimates of the filter.
@@ -149,16 +151,22 @@ def refine_model(
         drag: (3,) [1/s], mean of the prior, the same at every call for one ball.
         prior_std: () or (3,) [1/s], standard deviation of the prior.
     """
-    there = jnp.all(jnp.isfinite(window.means), axis=1)
+    means = window.beliefs.mean
+    there = jnp.all(jnp.isfinite(means), axis=1)
     first = jnp.argmax(there)
-    mean = jnp.where(jnp.any(there), window.means[first], 0.0)
+    mean = jnp.where(jnp.any(there), means[first], 0.0)
+    times = window.ages[first] - window.ages
+    P, t = window.beliefs.covariance[first], times[:, None]
+    pos, cross, vel = (jnp.diagonal(each)[None] for each in (P[:3, :3], P[:3, 3:], P[3:, 3:]))
+    # All n positions have the start's error in common. With n times its variance it counts once.
+    common = jnp.sum(there.astype(t.dtype)) * (pos + 2.0 * t * cross + t**2 * vel)
     fit = fit_linear_drag(
-        window.ages[first] - window.ages,
-        window.means[:, :3],
+        times,
+        means[:, :3],
         BallState(pos=mean[:3], vel=mean[3:]),
         drag,
         gravity=model.gravity,
-        observation_std=model.observation_std,
+        observation_std=jnp.sqrt(model.observation_std**2 + common),
         prior_std=prior_std,
     )
     return dataclasses.replace(model, drag=fit.drag)

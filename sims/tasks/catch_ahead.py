@@ -77,7 +77,7 @@ def predict_case(loop: Loop, flights: FlightState, new: Array, horizon: Array) -
         horizon = horizon - after
         return dataclasses.replace(
             case,
-            targets=tables(balls, flight.earlier.drag, horizon, case.gravity),
+            targets=tables(balls, flight.earlier.path_drag, horizon, case.gravity),
             present=new,
             horizon=horizon,
             head_state=head,

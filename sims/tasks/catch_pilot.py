@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from planner_jax.ball.flight import BallState
+from planner_jax.ball.linear_drag import linear_drag_flight
 from planner_jax.ball.prediction import PathTable, predict_path
 from planner_jax.core.protocol import is_better
 from planner_jax.optimise.settings import Attempt, LbfgsConfig
@@ -131,7 +132,18 @@ def is_worth_flying(fresh: CatchPlan, warm: CatchPlan) -> Array:
 
 
 def tables(balls: BallState, drag: Array, horizon: Array, gravity: Array) -> PathTable:
-    """Predict the paths of N balls with quadratic drag, up to times `horizon` (N,) [s]."""
-    predict = functools.partial(predict_path, num_nodes=_TABLE_NODES)
+    """Predict the paths of N balls, up to times `horizon` (N,) [s].
+
+    `drag` is (N,) K_D [1/m] of quadratic drag, or (N, 3) K_i [1/s] of linear drag.
+    """
     horizon = jnp.maximum(horizon, 0.1)
-    return jax.vmap(predict, in_axes=(0, 0, 0, None))(balls, horizon, drag, gravity)
+    if drag.ndim == 1:
+        predict = functools.partial(predict_path, num_nodes=_TABLE_NODES)
+        return jax.vmap(predict, in_axes=(0, 0, 0, None))(balls, horizon, drag, gravity)
+
+    def one(ball: BallState, drag: Array, resolution: Array) -> PathTable:
+        times = resolution * (jnp.arange(_TABLE_NODES, dtype=resolution.dtype) - 1.0)
+        path = jax.vmap(linear_drag_flight, (None, 0, None, None))(ball, times, drag, gravity)
+        return PathTable(pos=path.pos, vel=path.vel, resolution=resolution)
+
+    return jax.vmap(one)(balls, drag, horizon / (_TABLE_NODES - 3))

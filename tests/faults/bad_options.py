@@ -57,6 +57,7 @@ fly hit --seen 0                             | --seen must be > 0 and <= 1, got 
 fly hit --replan 1e300                       | --replan must be <=
 fly hit --video a/b.gif                      | --video must be a file name
 fly catch --noise x                          | --noise must
+fly hit --observer x                         | --observer must be one of default, published
 plan hit --vel -3 0.2 4 --target 4 0 0       | --pos
 plan hit --vel -3 0.2 4 --target 4 0 0 --pos 1 nan 2 | --pos must be finite, got nan
 plan hit --vel -3 0.2 4 --target 4 0 0 --pos 4 0 1 --speed inf | --speed must be finite
