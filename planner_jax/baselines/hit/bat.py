@@ -6,6 +6,7 @@ The transition is a state before the hit at which the quadrotor starts its swing
 import dataclasses
 import functools
 import math
+import operator
 from typing import Any
 
 import jax
@@ -98,6 +99,18 @@ def transition_point(start: Array, hit: Array, origin: Array, target: Array) -> 
 # Units of the optimiser's variables, chosen by hand: 0.1 m for a waypoint's coordinate, 0.05 for
 # the logarithm of the impact time, 0.3 m/s for a racket speed and 0.5 m/s^2 for a thrust.
 _UNITS = (0.1, 0.05, 0.3, 0.5)
+# Units, chosen by hand, of position [m], velocity, acceleration and jerk at the transition.
+_STATE_UNITS = (0.1, 0.3, 0.5, 5.0)
+
+
+def _sample(maps: ProportionalMinco, section: tuple[Array, Array, Array], nodes: int) -> Motion:
+    rows, offsets, duration = section
+    return sample_motion(maps, nodes, jnp.concatenate([rows, offsets]), duration)
+
+
+def _join(parts: list[Any]) -> Any:
+    """Concatenate the arrays of pytrees along the first axis."""
+    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
 
 
 @jax.tree_util.register_static
@@ -108,6 +121,8 @@ class BatHit(Problem):
     A trajectory of M polynomial pieces has M - 1 inner waypoints. The decision variables, in units
     of `scale`, are the waypoints' positions [m], the logarithm of the impact time T [s], y and z of
     the racket's velocity [m/s], and x and z of the thrust per unit mass [m/s^2] at the impact.
+    With `sections=2` the trajectory consists of two such splines, before and after the transition.
+    Position, velocity, acceleration and jerk at the transition are variables, too (eq. 18e).
     These parts follow the paper without changes:
 
     - Eqs 11-14 derive the complete state at the impact (`solve_decoupled_hit`).
@@ -127,7 +142,8 @@ class BatHit(Problem):
 
     The paper leaves some choices open. This planner makes these choices:
 
-    - The transition acts only on the initial guess, since eq. 18e leaves the transition state free.
+    - With one section, the transition acts only on the initial guess. The durations of two sections
+      are in proportion to `stage_times`, and the initial guess has no jerk at the transition.
     - `transition_point` interprets the ray of Fig. 4, and `transition_state` the thrust of Fig. 4b.
     - The jerk at the impact is zero.
     - Bat-Lite's initial guess is one primitive straight to the impact, of duration T_0.
@@ -150,7 +166,8 @@ class BatHit(Problem):
         ),
     )
     transition: bool = True
-    num_pieces: int = 4  # number of polynomial pieces
+    sections: int = 1  # number of splines; 2 have a variable state at the transition between them
+    num_pieces: int = 4  # number of polynomial pieces of each section
     nodes: int = 16  # number of intervals per piece in which penalties are integrated
     time_weight: float = 1e3  # weight of the impact time
     limit_weight: float = 1e5  # weight of speed, acceleration, body rate and ground
@@ -166,22 +183,36 @@ class BatHit(Problem):
     def __post_init__(self) -> None:
         require_settings(self)
         require_size("num_pieces", self.num_pieces, 2)
+        most = 2 if self.transition else 1
+        require(self.sections in range(1, most + 1), "sections", f"1 to {most}", self.sections)
         if not self.scale:
             place, time, speed, thrust = _UNITS
-            terminal = (time, speed, speed, thrust, thrust)
-            object.__setattr__(self, "scale", (place,) * self.num_offsets + terminal)
+            inner = (place,) * self.num_waypoints + _STATE_UNITS * (self.sections - 1)
+            scale = (*np.repeat(inner, 3).tolist(), time, speed, speed, thrust, thrust)
+            object.__setattr__(self, "scale", scale)
         size = self.num_offsets + 5
         require(len(self.scale) == size, "scale", f"of {size} numbers", len(self.scale))
 
     @property
     def maps(self) -> ProportionalMinco:
-        """Constant matrices that compute a trajectory from end states and waypoint variables."""
+        """Constant matrices that compute a section from its end states and waypoint variables."""
         return proportional_minco(_ORDER, (1.0,) * self.num_pieces)
 
     @property
+    def num_waypoints(self) -> int:
+        """The number of inner waypoints of all sections."""
+        return self.sections * (self.num_pieces - 1)
+
+    @property
     def num_offsets(self) -> int:
-        """The number of waypoint variables, three for each inner waypoint."""
-        return 3 * (self.num_pieces - 1)
+        """The number of variables of waypoints and of the transition state, three for each row."""
+        return 3 * (self.num_waypoints + 4 * (self.sections - 1))
+
+    @property
+    def shares(self) -> tuple[float, ...]:
+        """The durations of the sections, divided by the impact time."""
+        stages = self.stage_times
+        return (1.0,) if self.sections == 1 else tuple(each / sum(stages) for each in stages)
 
     def prepare(self, case: HitCase) -> HitContext:
         """Tabulate the incoming ball's positions and velocities at equal time steps."""
@@ -217,13 +248,21 @@ class BatHit(Problem):
         speeds = jnp.asarray(self.first_racket_vel_yz, dtype)
         terminal = jnp.concatenate([jnp.log(time)[None], speeds, thrust[::2]])
         impact, _ = self.impact(terminal, context)
-        natural = jnp.concatenate([self.primitive_waypoints(impact, case).ravel(), terminal])
+        inner = [self.primitive_waypoints(impact, case)]
+        if self.sections == 2:
+            inner += [self.transition_state(impact, case), jnp.zeros((1, 3), dtype)]
+        natural = jnp.concatenate([*(rows.ravel() for rows in inner), terminal])
         return (natural / jnp.asarray(self.scale, dtype))[None]
 
     def primitive_waypoints(self, impact: Impact, case: HitCase) -> Array:
-        """Return initial waypoints (M - 1, 3) [m] of M pieces, on minimum-jerk trajectories."""
+        """Return the initial waypoints [m] of each section's pieces, on minimum-jerk trajectories.
+
+        The result has the shape (W, 3), with W = `num_waypoints`.
+        """
         head, tail, end = case.head_state[:3], impact.tail_state[:3], impact.stroke.time
         shares = np.arange(1, self.num_pieces) / self.num_pieces
+        starts = np.cumsum(self.shares) - self.shares
+        shares = (starts[:, None] + np.outer(self.shares, shares)).ravel()
         times = end * jnp.asarray(shares, end.dtype)
         position = jax.vmap(evaluate, in_axes=(None, 0))
         if not self.transition:
@@ -248,16 +287,22 @@ class BatHit(Problem):
         )
 
     def _unpack(self, point: Array, context: HitContext):
+        """Return the arguments of `trajectory_energy` by section, the impact and its defect."""
         natural = point * jnp.asarray(self.scale, point.dtype)
-        waypoints = natural[: self.num_offsets].reshape(-1, 3)
+        inner = natural[: self.num_offsets].reshape(-1, 3)
         impact, defect = self.impact(natural[self.num_offsets :], context)
-        duration = impact.stroke.time / self.num_pieces
-        rows = boundary_rows(context.case.head_state, impact.tail_state, duration)
+        middle = [inner[self.num_waypoints :]] if self.sections == 2 else []
+        states = [context.case.head_state, *middle, impact.tail_state]
         to_offsets = jnp.asarray(self.maps.offsets, point.dtype)
-        offsets = jnp.matmul(
-            to_offsets, jnp.concatenate([rows, waypoints]), precision=lax.Precision.HIGHEST
-        )
-        return offsets, rows, duration, impact, defect
+        sections = []
+        for k, share in enumerate(self.shares):
+            duration = impact.stroke.time / (self.num_pieces / share)
+            rows = boundary_rows(states[k], states[k + 1], duration)
+            first = k * (self.num_pieces - 1)
+            columns = jnp.concatenate([rows, inner[first : first + self.num_pieces - 1]])
+            offsets = jnp.matmul(to_offsets, columns, precision=lax.Precision.HIGHEST)
+            sections.append((rows, offsets, duration))
+        return sections, impact, defect
 
     def _terminal_penalty(self, impact: Impact, defect: Array, case: HitCase) -> Array:
         """Return the penalty of apex and hitting velocity [Yu2023bat, eqs 21 and 24a]."""
@@ -268,7 +313,7 @@ class BatHit(Problem):
         return self.terminal_weight * (jnp.sum(smooth_hinge(excess, self.hinge_width)) + defect)
 
     def _penalty(self, motion: Motion, duration: Array, case: HitCase) -> Array:
-        """Return the penalty on limits along the trajectory [Yu2023bat, eq. 18a].
+        """Return the penalty on limits along a section [Yu2023bat, eq. 18a].
 
         It penalises the differences between squared quantities and squared limits, in SI units.
         """
@@ -288,13 +333,17 @@ class BatHit(Problem):
         The reported violation is always zero, so that the solver does not prefer iterates that keep
         the limits, and returns its last iterate.
         """
-        offsets, rows, duration, impact, defect = self._unpack(point, context)
-        columns = jnp.concatenate([rows, offsets])
-        motion = sample_motion(self.maps, self.nodes, columns, duration)
+        sections, impact, defect = self._unpack(point, context)
+        motions = [_sample(self.maps, each, self.nodes) for each in sections]
+        energies = (trajectory_energy(self.maps, *each) for each in sections)
+        penalties = (
+            self._penalty(motion, each[2], context.case)
+            for motion, each in zip(motions, sections, strict=True)
+        )
         cost = (
-            trajectory_energy(self.maps, rows, offsets, duration)
+            functools.reduce(operator.add, energies)
             + self.time_weight * impact.stroke.time
-            + self._penalty(motion, duration, context.case)
+            + functools.reduce(operator.add, penalties)
             + self._terminal_penalty(impact, defect, context.case)
         )
         return Evaluation(cost=cost / _COST_UNIT, violation=jnp.zeros_like(cost))
@@ -306,12 +355,11 @@ class BatHit(Problem):
     def decode(self, point: Array, context: HitContext) -> HitPlan:
         """Convert the variables `point` to a plan; its violation is sampled 96 times per piece."""
         case = context.case
-        offsets, rows, duration, impact, defect = self._unpack(point, context)
-        columns = jnp.concatenate([rows, offsets])
-        motion = sample_motion(self.maps, _DECODE_NODES, columns, duration)
+        sections, impact, defect = self._unpack(point, context)
+        motion = _join([_sample(self.maps, each, _DECODE_NODES) for each in sections])
         along = jnp.stack(motion_excess(motion, case.gravity, case.limits))
         violation = jnp.maximum(largest_violation(along, impact, case), defect)
-        trajectory = proportional_trajectory(self.maps, rows, offsets, duration)
+        trajectory = _join([proportional_trajectory(self.maps, *each) for each in sections])
         return HitPlan(
             trajectory=trajectory, gravity=case.gravity, stroke=impact.stroke, **pending(violation)
         ).with_heading(case)
