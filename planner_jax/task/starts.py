@@ -6,7 +6,9 @@
 import dataclasses
 import math
 import zlib
+from types import ModuleType
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
@@ -54,8 +56,8 @@ def with_states(cases: PyTree, uniform: PyTree) -> PyTree:
         uniform: (B, 9) random numbers of [0, 1), NumPy or JAX.
     """
     dtype = cases.head_state.dtype
-    host = dataclasses.replace(cases.limits, air=None, rotors=None)
-    limits = QuadrotorLimits(**{k: v if v is None else to_host(v) for k, v in vars(host).items()})
+    limits: QuadrotorLimits = dataclasses.replace(cases.limits, air=None, rotors=None)
+    limits = jax.tree.map(to_host, limits)
     start, gravity = to_host(cases.head_state)[:, 0], to_host(cases.gravity)
     xp, u = numpy_of(uniform, start), [uniform[:, k] for k in range(NUM)]
 
@@ -84,7 +86,7 @@ def with_states(cases: PyTree, uniform: PyTree) -> PyTree:
     return dataclasses.replace(cases, head_state=jnp.asarray(states, dtype))
 
 
-def _direction(xp: object, rise: PyTree, turn: PyTree) -> PyTree:
+def _direction(xp: ModuleType, rise: PyTree, turn: PyTree) -> PyTree:
     """Return unit vectors (B, 3) of the vertical component `rise`, turned by `turn` revolutions."""
     level, angle = xp.sqrt(1.0 - rise**2), 2.0 * math.pi * turn
     return xp.stack([level * xp.cos(angle), level * xp.sin(angle), rise], axis=1)
