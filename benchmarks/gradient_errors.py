@@ -25,7 +25,7 @@ from planner_jax.optimise.sensitivity import part_of, replace_part
 from planner_jax.planning.gradient import with_type
 from planner_jax.task.block.problem.smooth import SmoothBlock
 
-_STEPS = (1e-4, 1e-5)  # in the units of the parts
+_STEPS = (1e-3, 1e-4)  # in the units of the parts
 _TASKS = {  # the number of a plan, and the parts of a case
     "hit": ("stroke.time", ("ball.vel", "limits.body_rate", "head_state")),
     "catch": (lambda plan: jnp.max(plan.times), ("net.height", "limits.speed", "head_state")),

@@ -31,7 +31,7 @@ def acceleration_excess(acc: Components, most: Array, in_si: bool = False) -> Ar
 def body_rate_excess(
     acc: Components, jerk: Components, gravity: Array, most: Array, in_si: bool = False
 ) -> Array:
-    """Return the excess of body rates over `most` [rad/s] [Yu2023catch, eq. 27a].
+    """Return the excess of body rates over `most` [rad/s], by [Yu2023catch, eq. 27a].
 
     The body rate follows from acceleration [m/s^2], jerk [m/s^3] and `gravity` [m/s^2].
     """
@@ -43,7 +43,7 @@ def body_rate_excess(
 def thrust_excess(
     acc: Components, gravity: Array, least: Array, most: Array, in_si: bool = False
 ) -> tuple[Array, Array]:
-    """Return by how much the thrust is below `least` and above `most` [Yu2023catch, eq. 27a].
+    """Return the excesses of the thrust below `least` and above `most` [Yu2023catch, eq. 27a].
 
     The thrust is per unit mass [m/s^2]: the norm of acceleration plus `gravity` upwards.
     """

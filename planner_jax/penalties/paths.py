@@ -14,7 +14,7 @@ def obstacle_cost(
     """Return the cost () of the distances (n,) [m] of a path's points from the nearest obstacle.
 
     The cost is the sum of the squares of (reach - distance) / unit over the points nearer than
-    `reach` [m] [Qu2022, eq. 13]. The printed sum also counts the points farther away.
+    `reach` [m], by [Qu2022, eq. 13]. The printed sum also counts the points farther away.
     """
     close = (reach - distances) / unit
     return jnp.sum((close if printed else jnp.maximum(close, 0.0)) ** 2)
@@ -66,7 +66,7 @@ def speed_energy(points: Array, horizon: Array) -> Array:
 
 
 def end_error(points: Array, station: Array) -> Array:
-    """Return the squared distance () [m^2] of a curve's end from a station [m] [Qu2022, eq. 19].
+    """Return the squared distance () [m^2] of a curve's end from a station [Qu2022, eq. 19].
 
     `points` (K, n + 1) [m] are the control points of the curve's K Bezier pieces.
     """
