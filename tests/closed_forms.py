@@ -25,7 +25,7 @@ def recursion(state, controls, step):
 
 def positions_on(path, times):
     times = np.asarray(times, float)
-    if hasattr(path, "begin"):  # controls, of which the last is at the latest time or after it
+    if hasattr(path, "begin"):  # a delayed `ControlledPath`, whose controls last long enough
         num, positions = len(path.begin), []
         for k, when in enumerate(np.broadcast_to(times, (num, *times.shape[-1:]))):
             state, controls, step = (

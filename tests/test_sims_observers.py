@@ -26,7 +26,7 @@ TIMES = (0.01 * np.arange(81)).astype(np.float32)
 
 @functools.partial(jax.jit, static_argnames="observer")
 def observe(path, observer):
-    """Return the estimates after all positions (n, 3), of which the first third anchor the drag."""
+    """Return the estimates after the positions (n, 3); 27 of them set the reference energy."""
     sensing = Sensing(position_std=0.001)
 
     def advance(estimate, now):

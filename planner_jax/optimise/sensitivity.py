@@ -392,7 +392,7 @@ def _find_part(tree: PyTree, name: str, argument: str) -> PyTree:
 
 
 def members_of(tree: PyTree) -> dict[str, PyTree]:
-    """Return the parts of a dataclass by field, those of a tuple by index, and none of others."""
+    """Return parts by name: fields of a dataclass, entries of a tuple; other values have none."""
     if isinstance(tree, tuple):
         return {str(k): member for k, member in enumerate(tree)}
     return vars(tree) if dataclasses.is_dataclass(tree) else {}

@@ -1,4 +1,4 @@
-"""How far a net misses a ball, and how far it faces away from it."""
+"""Distance of a ball from the centre of a net, and excess of the angle between net and ball."""
 
 import jax.numpy as jnp
 from jax import Array

@@ -1,4 +1,4 @@
-"""How far a quadrotor's motion exceeds its limits: relative, or in squared SI units.
+"""Excesses of a quadrotor's motion over its limits, relative or in squared SI units.
 
 An excess is q^2 / limit^2 - 1 for a quantity q; with `in_si=True` it is q^2 - limit^2. Vectors are
 (..., 3) in the world frame, with z up; the results are (...,).

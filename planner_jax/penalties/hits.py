@@ -1,4 +1,4 @@
-"""How far the ball's return and the hitting speed exceed their limits."""
+"""Apex of the returned ball, and excesses of the apex and of the hitting speed."""
 
 import jax.numpy as jnp
 from jax import Array

@@ -142,7 +142,7 @@ def _join(parts: list[PyTree], num: int) -> tuple[PyTree, Array]:
 
 @jax.jit
 def _put_better(plans: PyTree, later: PyTree, lanes: Array) -> tuple[PyTree, Array]:
-    """Replace plans of the cases at the indices `lanes` by those of `later` that are better."""
+    """Replace the plans at the indices `lanes` where the plans in `later` are better."""
     kept = select(later, take_lanes(plans, lanes))
     put = lambda old, new: old.at[lanes].set(new, mode="drop")  # noqa: E731
     return with_unsolved(jax.tree.map(put, plans, kept))

@@ -80,19 +80,16 @@ def minimise_lite(
     """
     zero, infinite = jnp.zeros_like(start), jnp.full((), jnp.inf, start.dtype)
     empty = jnp.zeros((_MEMORY, *start.shape), start.dtype)
-    count, no = jnp.zeros((), jnp.int32), jnp.zeros((), bool)
+    no = jnp.zeros((), bool)
     state = _Search(
         point=start,
         cost=infinite,
         grad=zero,
         direction=zero,
-        length=jnp.ones_like(infinite),
-        low=jnp.zeros_like(infinite),
-        high=infinite,
-        trials=count,
+        **_new_line(infinite),
         memory=Memory(empty, empty, empty[:, 0]),
         past=jnp.full((_PAST,), jnp.inf, start.dtype),
-        iteration=count - 1,  # the first evaluation, of the start, makes it 0
+        iteration=jnp.full((), -1, jnp.int32),  # the first evaluation, of the start, makes it 0
         stationary=no,
         failed=no,
     )
@@ -112,6 +109,13 @@ def minimise_lite(
 
     end = lax.while_loop(is_unfinished, advance, state)
     return end.point, end.cost, jnp.maximum(end.iteration, 0), end.stationary
+
+
+def _new_line(cost: Array) -> dict[str, Array]:
+    """Return the fields of `_Search` at the start of a line search: a step of 1, and no bounds."""
+    zero = jnp.zeros_like(cost)
+    steps = {"length": zero + 1.0, "low": zero, "high": zero + jnp.inf}
+    return {**steps, "trials": jnp.zeros((), jnp.int32)}
 
 
 def _accept(state: _Search, point: Array, cost: Array, grad: Array, rule: LiteRule) -> _Search:
@@ -135,10 +139,7 @@ def _accept(state: _Search, point: Array, cost: Array, grad: Array, rule: LiteRu
         cost=cost,
         grad=grad,
         direction=direction,
-        length=jnp.ones_like(cost),
-        low=jnp.zeros_like(cost),
-        high=jnp.full_like(cost, jnp.inf),
-        trials=jnp.zeros_like(state.trials),
+        **_new_line(cost),
         memory=memory,
         past=jnp.concatenate([state.past[1:], cost[None]]),
         iteration=state.iteration + 1,
@@ -173,6 +174,8 @@ class LitePlanner(Planner[CaseT, PlanT]):
     rule: LiteRule = LiteRule()
     is_sequential: ClassVar[bool] = True  # searches of a batch differ much in their iterations
     attempts: ClassVar[tuple[BaseAttempt, ...]] = (BaseAttempt(),)  # pyright: ignore[reportIncompatibleMethodOverride]
+    title = SearchPlanner.title  # pyright: ignore[reportIncompatibleMethodOverride]
+    case_type = SearchPlanner.case_type  # pyright: ignore[reportAssignmentType]
 
     def settle(
         self, cases: CaseT, plan_of: Callable[[Planner, PyTree], PyTree] | None = None
@@ -191,16 +194,6 @@ class LitePlanner(Planner[CaseT, PlanT]):
             rule = f"{EFFORTS[0]} for a {self.title}, whose stopping rule is published"
             raise ArgumentError("effort", rule, effort)
         return self
-
-    @property
-    def title(self) -> str:
-        """Name of the problem, for messages."""
-        return type(self.problem).__name__
-
-    @property
-    def case_type(self) -> type:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """The class of the planner's cases."""
-        return self.problem.case_type
 
     def solve(self, case: CaseT, attempt: BaseAttempt) -> PlanT:
         """Return the plan of one case at the end of the search."""
