@@ -23,12 +23,17 @@ Vector = TypeVar("Vector", Array, tuple[Array, Array, Array])
 
 @struct.dataclass
 class BallState:
-    """Position and velocity of a ball at one instant, in the world frame with z up."""
+    """Position and velocity of a ball at one instant, in the world frame with z up.
+
+    Attributes:
+        pos: (3,) [m], position.
+        vel: (3,) [m/s], velocity.
+    """
 
     positions: ClassVar[dict] = {"pos": ()}
 
-    pos: Array  # (3,) [m]
-    vel: Array  # (3,) [m/s]
+    pos: Array
+    vel: Array
 
 
 def require_ball(ball: object) -> None:

@@ -52,18 +52,29 @@ class Ball:
     """Properties of a ball, and of the plane on which it bounces, as known before its flight.
 
     The default is an unknown ball. `spin_bounce` states the model of a bounce.
+
+    Attributes:
+        drag: [1/m], median of the coefficient K_D of quadratic drag.
+        drag_spread: standard deviation of log K_D.
+        lift_spread: standard deviations of the lift vector, in units of K_D |v|: along the flight;
+            horizontally across the flight (topspin, backspin); and perpendicular to both
+            (sidespin).
+        reach: [m], quotient of the surface's speed by |l|, and standard deviation of the quotient's
+            logarithm.
+        restitution: mean and standard deviation of the coefficient of restitution e.
+        friction: mean and standard deviation of the coefficient of friction mu.
+        grip: 2/5 for a hollow ball, 2/7 for a solid ball.
+        density: [m^2/s^3], power spectral density of accelerations that the model lacks.
     """
 
-    drag: float = 0.06  # [1/m], median of K_D
-    drag_spread: float = 1.0  # standard deviation of log K_D
-    # Standard deviations of the lift vector, in units of K_D |v|: along the flight, horizontal
-    # and across the flight (topspin, backspin), and perpendicular to both (sidespin).
+    drag: float = 0.06
+    drag_spread: float = 1.0
     lift_spread: tuple[float, float, float] = (0.4, 0.4, 0.4)
-    reach: tuple[float, float] = (20.0, 0.3)  # [m], speed of the surface / |l|, and spread of log
-    restitution: tuple[float, float] = (0.8, 0.1)  # e, mean and standard deviation
-    friction: tuple[float, float] = (0.3, 0.1)  # mu, mean and standard deviation
-    grip: float = 0.4  # 2/5 for a hollow ball, 2/7 for a solid ball
-    density: float = 0.01  # [m^2/s^3], power spectral density of accelerations not in the model
+    reach: tuple[float, float] = (20.0, 0.3)
+    restitution: tuple[float, float] = (0.8, 0.1)
+    friction: tuple[float, float] = (0.3, 0.1)
+    grip: float = 0.4
+    density: float = 0.01
 
     def __post_init__(self) -> None:
         for field in fields(self):
@@ -92,13 +103,21 @@ BALLS = {"unknown": Ball(), "table tennis": _TABLE_TENNIS}
 
 @dataclass(frozen=True)
 class Prediction:
-    """Positions and velocities of a ball at T times, or at (B, T) times of B balls."""
+    """Positions and velocities of a ball at T times, or at (B, T) times of B balls.
 
-    pos: np.ndarray  # (T, 3) [m]
-    vel: np.ndarray  # (T, 3) [m/s]
-    covariance: np.ndarray  # (T, 3, 3) [m^2], of the true position
-    observed_covariance: np.ndarray  # (T, 3, 3) [m^2], of an observed position
-    freedom: np.ndarray  # (T,), degrees of freedom of Student's t distribution of the errors
+    Attributes:
+        pos: (T, 3) [m], positions.
+        vel: (T, 3) [m/s], velocities.
+        covariance: (T, 3, 3) [m^2], covariances of the true positions.
+        observed_covariance: (T, 3, 3) [m^2], covariances of observed positions.
+        freedom: (T,) degrees of freedom of Student's t distribution of the errors.
+    """
+
+    pos: np.ndarray
+    vel: np.ndarray
+    covariance: np.ndarray
+    observed_covariance: np.ndarray
+    freedom: np.ndarray
 
     @property
     def is_known(self) -> np.ndarray:
@@ -121,17 +140,29 @@ class Prediction:
 
 @dataclass(frozen=True)
 class FlightFit:
-    """Estimated flight of one ball, or of B balls, whose arrays have a leading axis (B,)."""
+    """Estimated flight of one ball, or of B balls, whose arrays have a leading axis (B,).
 
-    start: np.ndarray  # () [s], time of the first observation
-    pos: np.ndarray  # (3,) [m], position at that time
-    vel: np.ndarray  # (3,) [m/s], velocity at that time
-    drag: np.ndarray  # () K_D [1/m]
-    lift: np.ndarray  # (3,) [1/s], lift vector l before the first bounce
-    noise: np.ndarray  # () [m], standard deviation of an observed coordinate across the path
-    stamp_noise: np.ndarray  # () [s], standard deviation of a time stamp
-    outliers: np.ndarray  # () share of observations that are far from the flight
-    covariance: np.ndarray  # (15, 15), of the unknowns, in the order of the module's docstring
+    Attributes:
+        start: () [s], time of the first observation.
+        pos: (3,) [m], position at the time `start`.
+        vel: (3,) [m/s], velocity at the time `start`.
+        drag: () [1/m], coefficient K_D of quadratic drag.
+        lift: (3,) [1/s], lift vector l before the first bounce.
+        noise: () [m], standard deviation of an observed coordinate across the path.
+        stamp_noise: () [s], standard deviation of a time stamp.
+        outliers: () share of the observations that are far from the flight.
+        covariance: (15, 15) covariance of the unknowns, in the order of the module's docstring.
+    """
+
+    start: np.ndarray
+    pos: np.ndarray
+    vel: np.ndarray
+    drag: np.ndarray
+    lift: np.ndarray
+    noise: np.ndarray
+    stamp_noise: np.ndarray
+    outliers: np.ndarray
+    covariance: np.ndarray
     # Times of observations, origin, and inputs of the program of `predict`.
     _data: tuple[PyTree, ...]
 

@@ -37,7 +37,13 @@ def state_at(path: TargetPath, time: Array) -> BallState:
 
 @struct.dataclass
 class BallPath:
-    """Path of a ball with drag acceleration -K_i v_i on each axis i [Yu2023catch, eq. 9a]."""
+    """Path of a ball with drag acceleration -K_i v_i on each axis i [Yu2023catch, eq. 9a].
+
+    Attributes:
+        ball: position and velocity of the ball at time 0.
+        drag: (3,) [1/s], drag coefficients K_i of the axes.
+        gravity: () [m/s^2], magnitude of gravity.
+    """
 
     rules: ClassVar[Table] = (
         Field("ball.pos", (3,)),
@@ -47,9 +53,9 @@ class BallPath:
     )
     positions: ClassVar[dict] = {"ball": ()}
 
-    ball: BallState  # at time 0
-    drag: Array  # (3,) K_i [1/s], drag coefficients of the axes
-    gravity: Array  # () [m/s^2], magnitude
+    ball: BallState
+    drag: Array
+    gravity: Array
 
     def at(self, time: Array) -> BallState:
         """Return position [m] and velocity [m/s] at one time () [s]."""
@@ -58,7 +64,15 @@ class BallPath:
 
 @struct.dataclass
 class HarmonicPath:
-    """A target that drifts and oscillates, p_0 + v t + A sin(w t + phi) [Yu2023catch, VII-B b]."""
+    """A target that drifts and oscillates, p_0 + v t + A sin(w t + phi) [Yu2023catch, VII-B b].
+
+    Attributes:
+        pos: (3,) [m], the point p_0.
+        vel: (3,) [m/s], velocity v of the drift.
+        amplitude: (3,) [m], amplitude A.
+        rate: () [rad/s], angular frequency w.
+        phase: () [rad], phase phi.
+    """
 
     rules: ClassVar[Table] = (
         *(Field(name, (3,)) for name in ("pos", "vel", "amplitude")),
@@ -66,11 +80,11 @@ class HarmonicPath:
     )
     positions: ClassVar[dict] = {"pos": ()}
 
-    pos: Array  # (3,) [m]
-    vel: Array  # (3,) [m/s], of the drift
-    amplitude: Array  # (3,) [m]
-    rate: Array  # () w [rad/s]
-    phase: Array  # () phi [rad]
+    pos: Array
+    vel: Array
+    amplitude: Array
+    rate: Array
+    phase: Array
 
     def at(self, time: Array) -> BallState:
         """Return position [m] and velocity [m/s] at one time () [s]."""

@@ -40,11 +40,15 @@ NEAR = Rule("within 10 km of the case's origin in float32", _is_near)
 
 @struct.dataclass
 class Located:
-    """A case or a plan, or a batch, whose positions are relative to an origin in the world."""
+    """A case or a plan, or a batch, whose positions are relative to an origin in the world.
+
+    Attributes:
+        origin: (2,) [m], x and y of the origin in the world; None: (0, 0).
+    """
 
     positions: ClassVar[dict] = {}  # for `move`, of the arguments of `replan`
 
-    origin: Array | None = struct.field(default=None, kw_only=True)  # (2,) x, y [m]; None: (0, 0)
+    origin: Array | None = struct.field(default=None, kw_only=True)
 
 
 def find_origin(

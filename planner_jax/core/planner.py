@@ -252,7 +252,11 @@ class Planner(Generic[CaseT, PlanT]):
 
 @struct.dataclass
 class PlannerAround(Planner[CaseT, PlanT]):
-    """A planner that wraps one other planner for cases of the same class."""
+    """A planner that wraps one other planner for cases of the same class.
+
+    Attributes:
+        planner: the wrapped planner.
+    """
 
     planner: Planner[CaseT, PlanT]
 

@@ -128,13 +128,19 @@ class Plan:
     """The outcome of planning: cost, violation and status; the subclasses of tasks add the motion.
 
     An object holds one plan, or a batch of plans with a leading axis on every leaf.
+
+    Attributes:
+        cost: () the planner's own objective.
+        violation: () largest relative excess over a limit that the planner checks; at most 5e-4 is
+            accepted.
+        iterations: () int32, number of the search's iterations.
+        status: () int32, outcome of the search, a `Status`.
     """
 
-    cost: Array  # (), the planner's own objective
-    # (), largest relative excess over a limit that the planner checks; at most 5e-4 is accepted
+    cost: Array
     violation: Array
-    iterations: Array  # () int32
-    status: Array  # () int32, a `Status`
+    iterations: Array
+    status: Array
 
     def save(self, path: str | os.PathLike) -> None:
         """Write the plan, or the batch, as NumPy's .npz, for `load` of the same class."""
@@ -187,13 +193,18 @@ def require_attempts(name: str, value: object, kind: type) -> None:
 
 @dataclasses.dataclass(frozen=True)
 class BaseAttempt:
-    """Settings of one search for cases that earlier attempts left unsolved; static under jit."""
+    """Settings of one search for cases that earlier attempts left unsolved; static under jit.
+
+    Attributes:
+        starts: number of starting points from which each case is solved.
+        within: greatest violation (relative excess over a limit) of a case that is searched
+            further; None: any violation.
+        improves: whether solved cases are searched, too. The plan that costs less is selected.
+    """
 
     continues: ClassVar[bool] = False  # whether a search needs the numbers of the best plans so far
-    starts: int = 1  # number of starting points from which each case is solved
-    # Greatest violation (relative excess over a limit) for a further search; None: no bound.
+    starts: int = 1
     within: float | None = dataclasses.field(default=None, kw_only=True)
-    # Whether solved cases are searched, too. The plan that costs less is selected.
     improves: bool = dataclasses.field(default=False, kw_only=True)
 
     def __post_init__(self) -> None:

@@ -39,26 +39,40 @@ class Task:
     """The description of a task: its functions, planners and suites, and settings of its runs.
 
     Objects are named as "module:attribute" and imported on first use.
+
+    Attributes:
+        name: name of the task on the command line.
+        summary: one line about the task, without a full stop.
+        home: name of the module with the functions `case`, `draw`, `planner` and `judge`.
+        planners: for each planner's name, the class or function that makes the planner; the default
+            planner is the first one.
+        suites: for each suite's name, a sentence about its cases; the default suite is the first
+            one.
+        from_file: for each planner that reads a file, as in "library:motions.bin", the command that
+            writes the file.
+        sweep: name of the class with the settings of the task's sweeps (runs of many cases).
+        flight: name of the class with the settings of the task's simulated flights; None: the task
+            has none.
+        single: name of the class with the options of `planner-jax plan`, which specify one case;
+            None: no such command.
+        bench: keyword arguments with which speed benchmarks call `planner`.
+        contact: dotted name of the contact times in a plan, such as "stroke.time".
+        yardstick: keyword arguments of `planner`. They select the planner with whose costs the
+            costs of other planners are compared; empty: no such planner. Planners that minimise a
+            cost are compared with a longer search of their own.
     """
 
-    name: str  # name on the command line
-    summary: str  # one line, without a full stop
-    home: str  # module with the functions `case`, `draw`, `planner` and `judge`
-    planners: Mapping[str, str]  # name -> class or function that makes the planner; default first
-    suites: Mapping[str, str]  # name -> a sentence about its cases; default first
-    # Planner that reads a file, as in "library:motions.bin" -> command that writes the file.
+    name: str
+    summary: str
+    home: str
+    planners: Mapping[str, str]
+    suites: Mapping[str, str]
     from_file: Mapping[str, str] = dataclasses.field(default_factory=dict)
-    # Classes with the settings of the task's sweeps (runs of many cases) and simulated flights.
     sweep: str = "planner_jax.runs.settings:SweepSettings"
     flight: str | None = None
-    # Class with the options of `planner-jax plan`, which specify one case; None: no such command.
     single: str | None = None
-    # Keyword arguments with which speed benchmarks call `planner`.
     bench: Mapping[str, object] = dataclasses.field(default_factory=dict)
-    contact: str | None = None  # dotted name of the contact times in a plan, such as "stroke.time"
-    # Keyword arguments of `planner`. They select the planner with whose costs the costs of other
-    # planners are compared; empty: no such planner. Planners that minimise a cost are compared with
-    # a longer search of their own.
+    contact: str | None = None
     yardstick: Mapping[str, object] = dataclasses.field(default_factory=dict)
 
     @property

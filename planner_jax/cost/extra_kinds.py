@@ -20,13 +20,18 @@ def _beside(vector: Numbers, pos: Numbers) -> Numbers:
 
 @struct.dataclass
 class KeepOut:
-    """A sphere that the quadrotor must not enter."""
+    """A sphere that the quadrotor must not enter.
+
+    Attributes:
+        centre: (3,) [m], centre of the sphere.
+        radius: () [m], radius of the sphere, > 0.
+    """
 
     rules: ClassVar[Table] = (Field("radius", None, POSITIVE),)
     positions: ClassVar[dict] = {"centre": ()}
 
-    centre: Numbers  # (3,) [m]
-    radius: Numbers  # () [m], > 0
+    centre: Numbers
+    radius: Numbers
 
     def excess(self, pos: Numbers, vel: Numbers, acc: Numbers) -> Numbers:
         """Return the depth of the positions inside the sphere, divided by its radius."""
@@ -55,13 +60,18 @@ class KeepOutBox(_Box):
 
 @struct.dataclass
 class Plane:
-    """A wall or ceiling: the quadrotor must stay on the side to which the normal points."""
+    """A wall or ceiling: the quadrotor must stay on the side to which the normal points.
+
+    Attributes:
+        point: (3,) [m], any point of the plane.
+        normal: (3,) normal of the plane, of any length.
+    """
 
     rules: ClassVar[Table] = (Field("normal", None, NOT_ZERO),)
     positions: ClassVar[dict] = {"point": ()}
 
-    point: Numbers  # (3,) [m], anywhere on the plane
-    normal: Numbers  # (3,), of any length
+    point: Numbers
+    normal: Numbers
 
     def excess(self, pos: Numbers, vel: Numbers, acc: Numbers) -> Numbers:
         """Return the distance [m] of positions beyond the plane, negative on the allowed side."""
@@ -86,14 +96,19 @@ class SpeedZone:
 
     The limit is speed / (u^2 (3 - 2 u)), where u falls linearly from one at the sphere to zero at
     1.25 radii. This limit and its slope are continuous.
+
+    Attributes:
+        centre: (3,) [m], centre of the sphere.
+        radius: () [m], radius of the sphere, > 0.
+        speed: () [m/s], greatest speed inside the sphere, > 0.
     """
 
     rules: ClassVar[Table] = (Field("radius", None, POSITIVE), Field("speed", None, POSITIVE))
     positions: ClassVar[dict] = {"centre": ()}
 
-    centre: Numbers  # (3,) [m]
-    radius: Numbers  # () [m], > 0
-    speed: Numbers  # () [m/s], > 0
+    centre: Numbers
+    radius: Numbers
+    speed: Numbers
 
     def excess(self, pos: Numbers, vel: Numbers, acc: Numbers) -> Numbers:
         """Return the ratio of the speed to the limit at the position, minus 1."""
@@ -103,14 +118,21 @@ class SpeedZone:
 
 @struct.dataclass
 class Dislike:
-    """A sphere with a cost inside it, which the quadrotor avoids if it can."""
+    """A sphere with a cost inside it, which the quadrotor avoids if it can.
+
+    Attributes:
+        centre: (3,) [m], centre of the sphere.
+        radius: () [m], radius of the sphere, > 0.
+        weight: () [1/s], weight of the cost; the planners' other costs are of the order of 1e-5 to
+            1.
+    """
 
     rules: ClassVar[Table] = (Field("radius", None, POSITIVE), Field("weight", None, NOT_NEGATIVE))
     positions: ClassVar[dict] = {"centre": ()}
 
-    centre: Numbers  # (3,) [m]
-    radius: Numbers  # () [m], > 0
-    weight: Numbers  # () [1/s]; the planners' other costs are of the order of 1e-5 to 1
+    centre: Numbers
+    radius: Numbers
+    weight: Numbers
 
     def cost(self, pos: Numbers, vel: Numbers, acc: Numbers) -> Numbers:
         """Return weight * (1 - r^2 / radius^2)^2 at a distance r < radius from centre, else 0."""

@@ -111,17 +111,29 @@ class Packet:
 
 @dataclasses.dataclass(frozen=True)
 class Answer:
-    """The answer to a request, with K setpoints."""
+    """The answer to a request, with K setpoints.
 
-    sequence: int  # sequence number of the request
-    sent: float  # [s], time at which the request was sent, by the sender's clock
+    Attributes:
+        sequence: sequence number of the request.
+        sent: [s], time at which the request was sent, by the sender's clock.
+        motion: kind of trajectory from which the setpoints are sampled.
+        fault: fault of the request.
+        reason: reason why the motion is not a plan.
+        begin: [s], time of the first setpoint, by the sender's clock.
+        period: [s], time between setpoints.
+        contact: [s], time of the contact with the ball by the sender's clock; NaN without a plan.
+        setpoints: (K, 20) setpoints, with the columns of `FIELDS`.
+    """
+
+    sequence: int
+    sent: float
     motion: Motion
-    fault: Fault  # fault of the request
-    reason: Reason  # why the motion is not a plan
-    begin: float  # [s], time of the first setpoint, by the sender's clock
-    period: float  # [s], time between setpoints
-    contact: float  # [s], time of the contact with the ball, sender's clock; NaN without a plan
-    setpoints: np.ndarray  # (K, 20), the columns of `FIELDS`
+    fault: Fault
+    reason: Reason
+    begin: float
+    period: float
+    contact: float
+    setpoints: np.ndarray
 
     def column(self, name: str) -> np.ndarray:
         """Return a field of all setpoints, such as "pos"; `name` is a key of `FIELDS`."""

@@ -68,6 +68,15 @@ class ChainProblem(Problem[CaseT, PlanT]):
     Cost: energy_weight * integral |snap|^2 + time_weight * total time + integral of the smoothed
     hinges of the limits and of the user's extra terms + end_weight * smoothed hinges of the
     relative excess over the limits at the segments' ends.
+
+    Attributes:
+        proportions: relative durations of a segment's pieces.
+        nodes: number of intervals of each piece, at whose ends penalties are evaluated.
+        time_weight: weight of the total time.
+        energy_weight: [s^8/m^2], weight of the integral of |snap|^2.
+        margin: relative distance from a limit at which penalties start.
+        hinge_width: width of the penalties' smoothed hinges, as a relative excess over a limit.
+        scale: units of a segment's variables; if empty, the measured units.
     """
 
     subspace = 0
@@ -81,13 +90,13 @@ class ChainProblem(Problem[CaseT, PlanT]):
     stands: ClassVar[bool] = False  # whether the quadrotor stands still after the last segment
     weights: ClassVar[tuple[str, ...]] = ("energy_weight", "margin", "hinge_width")
     refinements: ClassVar[tuple[str, ...]] = ("nodes",)
-    proportions: tuple[float, ...] = (1.0,) * 6  # relative durations of a segment's pieces
-    nodes: int = 8  # number of intervals of each piece, at whose ends penalties are evaluated
+    proportions: tuple[float, ...] = (1.0,) * 6
+    nodes: int = 8
     time_weight: float = 0.005
     energy_weight: float = 3e-8
-    margin: float = 0.03  # relative distance from a limit at which penalties start
+    margin: float = 0.03
     hinge_width: float = 0.1
-    scale: tuple[float, ...] = ()  # units of a segment's variables; if empty, the measured units
+    scale: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         require_settings(self)

@@ -172,10 +172,14 @@ class Problem(Generic[CaseT, PlanT], abc.ABC):
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class SearchPlanner(Planner[CaseT, PlanT]):
-    """A planner that minimises, in attempts at the cases that are still unsolved."""
+    """A planner that minimises, in attempts at the cases that are still unsolved.
 
-    problem: PyTree  # a `Problem`, whose class the type checker does not know
-    # Attempts, in order; by default the usual ones of the problem.
+    Attributes:
+        problem: the `Problem` to minimise.
+        attempts: attempts (searches) in their order; by default the usual ones of the problem.
+    """
+
+    problem: PyTree
     attempts: PyTree = dataclasses.field(default=None, metadata={"static": True})
 
     def __post_init__(self) -> None:

@@ -51,14 +51,23 @@ Curved = Callable[[Array], Curvature]
 @with_run_time_numbers("max_steps", "tolerance", "patience")
 @dataclasses.dataclass(frozen=True)
 class LbfgsConfig:
-    """Settings of the L-BFGS solver; hashable, so static under jit."""
+    """Settings of the L-BFGS solver; hashable, so static under jit.
 
-    max_steps: int = 10  # greatest number of iterations; 0 returns the start itself
-    memory: int = 6  # number of stored pairs: a step, and the change of the gradient along it
-    trial_steps: tuple[float, ...] = (1.0, 2.5, 0.3)  # lengths tried at once in each iteration
-    step_cap: float = 2.0  # greatest Euclidean length of a step with trial length 1
-    tolerance: float = 1e-4  # relative decrease of the cost below which progress stalls
-    patience: int = 2  # stalled iterations after which a problem counts as stationary
+    Attributes:
+        max_steps: greatest number of iterations; 0 returns the start itself.
+        memory: number of stored pairs: a step, and the change of the gradient along it.
+        trial_steps: step lengths that are tried at once in each iteration.
+        step_cap: greatest Euclidean length of a step with trial length 1.
+        tolerance: relative decrease of the cost below which progress stalls.
+        patience: number of stalled iterations after which a problem counts as stationary.
+    """
+
+    max_steps: int = 10
+    memory: int = 6
+    trial_steps: tuple[float, ...] = (1.0, 2.5, 0.3)
+    step_cap: float = 2.0
+    tolerance: float = 1e-4
+    patience: int = 2
 
     def __post_init__(self) -> None:
         for name, least in (("max_steps", 0), ("memory", 1), ("patience", 0)):
@@ -76,27 +85,40 @@ _SHARE = Rule("in (0, 1]", lambda value, part: (value > 0.0) & (value <= 1.0))
 
 @dataclasses.dataclass(frozen=True)
 class NewtonConfig:
-    """Settings of Newton's method; hashable, so static under jit."""
+    """Settings of Newton's method; hashable, so static under jit.
+
+    Attributes:
+        max_steps: greatest number of iterations.
+        subspace: number of vectors of the subspace; 0 uses the preconditioner alone.
+        damping: initial damping.
+        trial_dampings: each iteration tries one step for each t of these numbers, with t times the
+            preconditioner's matrix added to the Hessian. Then `damping` is multiplied by the t of
+            the cheapest step, but at least by `ease`; or by `tighten` if no step lowers the cost.
+        ease: least factor on `damping` after a step that lowers the cost.
+        tighten: factor on `damping` if no step lowers the cost.
+        step_cap: greatest Euclidean length of a step.
+        tolerance: predicted relative decrease of the cost below which a problem is stationary.
+        trusted: greatest damping at which a predicted decrease is reliable.
+        patience: number of iterations without progress after which a problem is stationary.
+        slack: rounding error of a cost, in units of machine epsilon times the cost. A step may
+            raise the cost by this error; such a step counts as progress if the predicted decrease
+            halves.
+        stragglers: size of a group as a fraction of the batch, number of iterations of a group, and
+            greatest number of groups. After `max_steps`, unfinished problems continue in groups, by
+            falling predicted decrease; None: no problem continues.
+    """
 
     max_steps: int = 6
-    subspace: int = 4  # number of subspace vectors; 0 uses the preconditioner alone
-    damping: float = 1e-4  # initial damping
-    # Each iteration tries one step for each t of these numbers, with t times the preconditioner's
-    # matrix added to the Hessian. Then `damping` is multiplied by the t of the cheapest step, but
-    # at least by `ease`; or by `tighten` if no step lowers the cost.
+    subspace: int = 4
+    damping: float = 1e-4
     trial_dampings: tuple[float, ...] = (0.0, 0.3, 3.0, 30.0)
     ease: float = 0.03
     tighten: float = 1e3
-    step_cap: float = 3.0  # largest Euclidean length of a step
-    tolerance: float = 1e-4  # predicted relative decrease below which a problem is stationary
-    trusted: float = MOST_DAMPING  # greatest damping at which a predicted decrease is reliable
-    patience: int = 3  # iterations without progress after which a problem is stationary
-    # Rounding error of a cost, in units of machine epsilon times the cost. A step may raise the
-    # cost by this error; such a step counts as progress if the predicted decrease halves.
+    step_cap: float = 3.0
+    tolerance: float = 1e-4
+    trusted: float = MOST_DAMPING
+    patience: int = 3
     slack: float = 0.0
-    # After `max_steps`, unfinished problems continue in groups, by falling predicted decrease. The
-    # three numbers are the size of a group as a fraction of the batch, the number of iterations of
-    # a group, and the greatest number of groups. With None, no problem continues.
     stragglers: tuple[float, int, int] | None = None
 
     def __post_init__(self) -> None:
@@ -142,12 +164,19 @@ class Stage:
 
 @dataclasses.dataclass(frozen=True)
 class Attempt(BaseAttempt):
-    """One attempt of a planner that minimises: solver, settings, preliminary searches."""
+    """One attempt of a planner that minimises: solver, settings, preliminary searches.
+
+    Attributes:
+        solver: solver of the search, an `LbfgsConfig` or another `Solver`.
+        settings: values of planner fields during this attempt.
+        stages: searches before the search by `solver`, from easy to hard.
+        first: index of the first of the `starts` starting points, the planner's `guesses`.
+    """
 
     solver: Solver = LbfgsConfig()
-    settings: Settings = ()  # values of planner fields during this attempt
-    stages: tuple[Stage, ...] = ()  # searches before the search by `solver`, from easy to hard
-    first: int = 0  # index of the first of the `starts` starting points, the planner's `guesses`
+    settings: Settings = ()
+    stages: tuple[Stage, ...] = ()
+    first: int = 0
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -26,10 +26,14 @@ class RlsState:
     """The least-squares estimate of a number x from measurements  y = h x + noise.
 
     The factor h of each measurement is known, and the noise has unit variance.
+
+    Attributes:
+        estimate: () estimate of x.
+        variance: () variance of the estimate; at first, the variance that is assumed without
+            measurements.
     """
 
-    estimate: Array  # (), estimate of x
-    # (), variance of the estimate; at first, the variance that is assumed without measurements.
+    estimate: Array
     variance: Array
 
 

@@ -20,13 +20,19 @@ from planner_jax.optimise.levenberg import LevenbergConfig, Model, least_squares
 
 @struct.dataclass
 class LinearDragFit:
-    """Coefficients of linear drag that fit positions of a ball, and their uncertainty."""
+    """Coefficients of linear drag that fit positions of a ball, and their uncertainty.
 
-    drag: Array  # (3,) [1/s], K_i; negative where noise outweighs the effect of drag
-    # (3, 3) [1/s^2], covariance; infinite for an axis that no observation informs about, without
-    # entries between axes unless they share one coefficient.
+    Attributes:
+        drag: (3,) [1/s], coefficients K_i; negative where noise outweighs the effect of drag.
+        covariance: (3, 3) [1/s^2], covariance of the coefficients; infinite for an axis that no
+            observation informs about, without entries between axes unless they share one
+            coefficient.
+        residual: () [m], root mean square of a coordinate's residual; 0 without observations.
+    """
+
+    drag: Array
     covariance: Array
-    residual: Array  # () [m], root mean square of a coordinate's residual; 0 without observations
+    residual: Array
 
 
 def fit_linear_drag(
@@ -111,10 +117,15 @@ def fit_linear_drag(
 
 @struct.dataclass
 class DragWindow:
-    """The last n estimates of a ball's state, from old to new; NaN before there are n."""
+    """The last n estimates of a ball's state, from old to new; NaN before there are n.
 
-    ages: Array  # (n,) [s], time from the estimate to the last one
-    beliefs: EkfState  # leaves (n, 6) and (n, 6, 6)
+    Attributes:
+        ages: (n,) [s], time from each estimate to the last one.
+        beliefs: estimates with leaves (n, 6) and (n, 6, 6).
+    """
+
+    ages: Array
+    beliefs: EkfState
 
 
 def window_init(num: int = 20, dtype: DTypeLike = jnp.float32) -> DragWindow:

@@ -28,38 +28,62 @@ _HIGHEST = lax.Precision.HIGHEST
 
 @struct.dataclass
 class BodyState:
-    """Pose and velocity of a quadrotor, and the biases of its IMU."""
+    """Pose and velocity of a quadrotor, and the biases of its IMU.
 
-    pos: Array  # (3,) [m]
-    quat_wxyz: Array  # (4,) unit quaternion, body to world
-    vel: Array  # (3,) [m/s]
-    rate_bias: Array  # (3,) [rad/s], gyroscope's measurement minus body rate
-    force_bias: Array  # (3,) [m/s^2], accelerometer's measurement minus specific force
+    Attributes:
+        pos: (3,) [m], position.
+        quat_wxyz: (4,) unit quaternion of the rotation from body to world.
+        vel: (3,) [m/s], velocity.
+        rate_bias: (3,) [rad/s], the gyroscope's measurement minus the body rate.
+        force_bias: (3,) [m/s^2], the accelerometer's measurement minus the specific force.
+    """
+
+    pos: Array
+    quat_wxyz: Array
+    vel: Array
+    rate_bias: Array
+    force_bias: Array
 
 
 @struct.dataclass
 class RobotFilterModel:
-    """Gravity, and the noise of IMU and poses; every field is ()."""
+    """Gravity, and the noise of IMU and poses; every field is ().
 
-    gravity: Array  # [m/s^2], magnitude
-    # Power spectral densities of the noise of gyroscope [rad^2/s] and accelerometer [m^2/s^3], and
-    # of the derivatives of their biases [rad^2/s^3], [m^2/s^5]. A sensor with independent errors of
-    # standard deviation s at the rate f has the density s^2 / f.
+    Attributes:
+        gravity: [m/s^2], magnitude of gravity.
+        rate_density: [rad^2/s], power spectral density of the gyroscope's noise. A sensor with
+            independent errors of standard deviation s at the rate f has the density s^2 / f.
+        force_density: [m^2/s^3], power spectral density of the accelerometer's noise.
+        rate_bias_density: [rad^2/s^3], power spectral density of the derivative of the gyroscope's
+            bias.
+        force_bias_density: [m^2/s^5], power spectral density of the derivative of the
+            accelerometer's bias.
+        pos_std: [m], standard deviation of a coordinate of a captured position.
+        attitude_std: [rad], standard deviation of each component of a captured attitude.
+    """
+
+    gravity: Array
     rate_density: Array
     force_density: Array
     rate_bias_density: Array
     force_bias_density: Array
-    pos_std: Array  # [m], standard deviation of a coordinate of a captured position
-    attitude_std: Array  # [rad], standard deviation of each component of a captured attitude
+    pos_std: Array
+    attitude_std: Array
 
 
 @struct.dataclass
 class RobotFilterState:
-    """The belief about a quadrotor, and the likelihood of all poses so far."""
+    """The belief about a quadrotor, and the likelihood of all poses so far.
+
+    Attributes:
+        mean: estimated pose, velocity and biases.
+        covariance: (15, 15) covariance of the error in the frame of the estimated body.
+        log_likelihood: () sum of the logarithms of the densities of the observed poses.
+    """
 
     mean: BodyState
-    covariance: Array  # (15, 15), covariance of the error in the frame of the estimated body
-    log_likelihood: Array  # (), sum of the logarithms of the densities of the observed poses
+    covariance: Array
+    log_likelihood: Array
 
 
 def multiply(a: Array, b: Array) -> Array:

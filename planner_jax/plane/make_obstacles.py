@@ -19,11 +19,17 @@ _CORNERS = 8  # least number of corners of an entry of `obstacles`; then its dou
 
 @dataclasses.dataclass(frozen=True)
 class Circle:
-    """A circular obstacle, or a part of a moving obstacle."""
+    """A circular obstacle, or a part of a moving obstacle.
 
-    x: float  # [m], middle, as the corners of a polygon in the same list
-    y: float  # [m]
-    radius: float  # [m], > 0
+    Attributes:
+        x: [m], x of the middle, in the frame of the polygons in the same list.
+        y: [m], y of the middle.
+        radius: [m], radius, > 0.
+    """
+
+    x: float
+    y: float
+    radius: float
 
 
 def obstacles(

@@ -39,11 +39,18 @@ class MapError(PlannerJaxError, ValueError):
 
 @dataclasses.dataclass(frozen=True)
 class OccupancyMap:
-    """A map of H x W square cells. The car must not touch occupied cells."""
+    """A map of H x W square cells. The car must not touch occupied cells.
 
-    occupied: np.ndarray  # (H, W) bool; the row index rises with y, the column index with x
-    resolution: float  # [m], length of a cell's side
-    origin: tuple[float, float, float]  # x, y [m] of the map's corner of cell (0, 0), yaw [rad]
+    Attributes:
+        occupied: (H, W) bool, whether each cell is occupied; the row index rises with y, the column
+            index with x.
+        resolution: [m], length of a cell's side.
+        origin: x, y [m] and yaw [rad] of the corner of cell (0, 0) in the world.
+    """
+
+    occupied: np.ndarray
+    resolution: float
+    origin: tuple[float, float, float]
 
     def walls(self, coarsen: int = 1) -> list[np.ndarray]:
         """Return polygons (V, 2) [m] that cover the occupied cells, and what no cell covers.

@@ -28,15 +28,25 @@ class Obstacles:
 
     World frame in the plane, SI units. Without a track an obstacle does not turn. Its velocity is
     constant ([Qu2022, eq. 5], with constant speeds as in its Section IV-A), and zero for walls.
+
+    Attributes:
+        centre: (N, 2) [m], centres of the polygons at time 0.
+        corners: (N, V, 2) [m], corners relative to the centre, counter-clockwise, padded with the
+            last corner.
+        velocity: (N, 2) [m/s], velocities of the polygons.
+        present: (N,) bool, whether the entry is an obstacle or only padding.
+        radius: (N,) [m], distance by which the polygon is enlarged at time 0.
+        growth: (N,) [m/s], rate at which `radius` grows after time 0.
+        track: poses of the polygons' frames; replaces `centre` and `velocity`.
     """
 
-    centre: Array  # (N, 2) [m], at time 0
-    corners: Array  # (N, V, 2) [m] from the centre, counter-clockwise, padded with the last corner
-    velocity: Array  # (N, 2) [m/s]
-    present: Array  # (N,) bool, whether the entry is an obstacle or only padding
-    radius: Array  # (N,) [m], distance by which the polygon is enlarged at time 0
-    growth: Array  # (N,) [m/s], rate at which `radius` grows after time 0
-    track: Track | None = None  # poses of the polygons' frames; replaces `centre` and `velocity`
+    centre: Array
+    corners: Array
+    velocity: Array
+    present: Array
+    radius: Array
+    growth: Array
+    track: Track | None = None
 
     def vertices(self, time: ArrayLike) -> Array:
         """Return the V corners of the N obstacles at one time () [s], (N, V, 2) [m].

@@ -43,15 +43,25 @@ class Prediction:
 
     Time 0 is the time of the last observation, or the time `now` that was passed. The arrays have
     the shape (), or (B,) for a batch.
+
+    Attributes:
+        path: expected path, which `pj.intercept.case` accepts as target.
+        has_changed: bool, whether a change was noticed: a stop, turn or other manoeuvre.
+        since: [s], expected time of this change, at most 0; NaN if none was noticed.
+        chance_changed: probability that the motion changed during the observations.
+        noise: [m], standard deviation of an observed coordinate, passed or estimated.
+        mixture: hypotheses about the motion, with their probabilities, from which `path` is
+            computed.
+        speed: [m/s], usual speed of the targets, if it was passed.
     """
 
-    path: FadingPath  # expected path, which `pj.intercept.case` accepts as target
-    has_changed: np.ndarray  # bool, whether a change was noticed: a stop, turn or other manoeuvre
-    since: np.ndarray  # [s], expected time of this change, at most 0; NaN if none was noticed
-    chance_changed: np.ndarray  # probability that the motion changed during the observations
-    noise: np.ndarray  # [m], standard deviation of an observed coordinate, passed or estimated
+    path: FadingPath
+    has_changed: np.ndarray
+    since: np.ndarray
+    chance_changed: np.ndarray
+    noise: np.ndarray
     mixture: Mixture
-    speed: float | None  # [m/s], usual speed of the targets, if it was passed
+    speed: float | None
 
     def radius(self, time: float | ArrayLike, share: float = 0.9) -> np.ndarray:
         """Return the radius [m] of the disc around the path that holds the target.

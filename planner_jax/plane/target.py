@@ -37,11 +37,16 @@ class TurningPath:
     """A target of constant speed whose direction turns at a constant rate, which may be 0.
 
     It covers the two modes of motion of [Qu2022, Section V-A], straight and turning.
+
+    Attributes:
+        pos: (2,) [m], position at time 0.
+        vel: (2,) [m/s], velocity at time 0.
+        turn_rate: () [rad/s], rate of the velocity's direction, positive to the left.
     """
 
-    pos: Array  # (2,) [m], at time 0
-    vel: Array  # (2,) [m/s], at time 0
-    turn_rate: Array  # () [rad/s], positive to the left
+    pos: Array
+    vel: Array
+    turn_rate: Array
 
     def at(self, time: Array) -> PointState:
         """Return position [m] and velocity [m/s] at one time () [s]."""
@@ -55,10 +60,15 @@ class TurningPath:
 
 @struct.dataclass
 class PolynomialPath:
-    """Path of a target: a polynomial of degree n in time on each axis [Qu2022, eq. 9]."""
+    """Path of a target: a polynomial of degree n in time on each axis [Qu2022, eq. 9].
 
-    coeffs: Array  # (n + 1, 2) [m/s^k], in ascending powers of the time
-    origin: Array  # () [s], the time from which the powers count
+    Attributes:
+        coeffs: (n + 1, 2) [m/s^k], coefficients in ascending powers k of the time.
+        origin: () [s], time from which the powers count.
+    """
+
+    coeffs: Array
+    origin: Array
 
     def at(self, time: Array) -> PointState:
         """Return position [m] and velocity [m/s] at one time () [s]."""
@@ -76,11 +86,16 @@ class ControlledPath:
     With the position x_k, the velocity v_k and the control u_k at the time k h, the recursion is
     x_{k+1} = x_k + h v_k and v_{k+1} = v_k + u_k. The path is straight between these times, before
     time 0, and after the last of the K controls.
+
+    Attributes:
+        state: (4,) x, y [m] and their derivatives [m/s] at time 0.
+        controls: (K, 2) [m/s], control inputs u_0 to u_{K-1}.
+        step: () [s], step h, > 0.
     """
 
-    state: Array  # (4,) x, y [m] and their derivatives [m/s], at time 0
-    controls: Array  # (K, 2) [m/s], u_0 to u_{K-1}
-    step: Array  # () h [s], > 0
+    state: Array
+    controls: Array
+    step: Array
 
     def at(self, time: Array) -> PointState:
         """Return position [m] and velocity [m/s], right-continuous, at one time () [s]."""

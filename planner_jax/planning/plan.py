@@ -38,13 +38,21 @@ _QUIET = 1.0  # [s] least time between two progress reports of one attempt
 
 @dataclasses.dataclass(frozen=True)
 class Progress:
-    """Report of `plan` on the progress of an attempt (search); `str` formats it as one line."""
+    """Report of `plan` on the progress of an attempt (search); `str` formats it as one line.
 
-    attempt: int  # number of this attempt, counted from 1
-    attempts: int  # greatest number of attempts that the planner makes
-    tried: int  # number of cases that this attempt has tried so far
-    cases: int  # number of cases of this attempt: all that earlier attempts left unsolved
-    seconds: float  # [s] time since the start of planning
+    Attributes:
+        attempt: number of this attempt, counted from 1.
+        attempts: greatest number of attempts that the planner makes.
+        tried: number of cases that this attempt has tried so far.
+        cases: number of cases of this attempt: all that earlier attempts left unsolved.
+        seconds: [s], time since the start of planning.
+    """
+
+    attempt: int
+    attempts: int
+    tried: int
+    cases: int
+    seconds: float
 
     def __str__(self) -> str:
         return (

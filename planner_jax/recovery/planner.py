@@ -43,6 +43,10 @@ class RecoveryProblem(ChainProblem[RecoveryCase, QuadrotorPlan]):
 
     Cost: energy_weight * integral |snap|^2 + time_weight * duration + integral of smooth one-sided
     penalties on the limits and of the user's extra terms.
+
+    Attributes:
+        proportions: relative durations of the pieces.
+        to: place of the standstill: "brake" for any place, "home" for the case's `home`.
     """
 
     case_type = RecoveryCase
@@ -63,8 +67,8 @@ class RecoveryProblem(ChainProblem[RecoveryCase, QuadrotorPlan]):
     guess_table = _GUESSES
     decode_nodes = (40, 40)
     stands = True
-    proportions: tuple[float, ...] = (0.4, 0.8, 1.0, 1.0, 1.0)  # relative durations of the pieces
-    to: str = "brake"  # where to stand still: "brake" anywhere, "home" at the case's `home`
+    proportions: tuple[float, ...] = (0.4, 0.8, 1.0, 1.0, 1.0)
+    to: str = "brake"
 
     def __post_init__(self) -> None:
         super().__post_init__()

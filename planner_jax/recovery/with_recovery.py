@@ -25,6 +25,11 @@ class RecoveringPlanner(PlannerAround[CaseT, PlanT]):
 
     If the recovery exceeds a limit, the plan is searched again with a lower speed limit, for each
     fraction in `slower` of the case's speed limit. Without a recovery the plan counts as unsolved.
+
+    Attributes:
+        recovery_planner: planner of the recovery trajectories.
+        slower: fractions of the case's speed limit with which plans without a recovery are searched
+            again.
     """
 
     recovery_planner: SearchPlanner

@@ -24,6 +24,13 @@ class Verdict:
 
     Arrays (B,) are () in the verdict on a single plan. Measurements are NaN where a number of the
     plan or of its case is not finite.
+
+    Attributes:
+        success: (B,) bool, whether the plan keeps every limit.
+        failed_limit: (B,) str, the first limit that is exceeded; "" for a success.
+        failed_time: (B,) [s], time at which that limit is exceeded most; NaN for a success.
+        failed_excess: (B,) greatest excess over that limit, in the unit of the sentence in
+            `SENTENCES`. The tolerance is not subtracted. NaN for a success.
     """
 
     # For each limit by name, the sentence that describes its violation. A sentence may contain
@@ -33,11 +40,9 @@ class Verdict:
     # For some limits by name, a sentence that replaces `SENTENCES` if the excess is infinite.
     UNBOUNDED: ClassVar[dict[str, str]] = {}
 
-    success: np.ndarray  # (B,) bool, whether the plan keeps every limit
-    failed_limit: np.ndarray  # (B,) str, the first limit that fails; "" for a success
-    failed_time: np.ndarray  # (B,) [s], when that limit is exceeded most; NaN for a success
-    # (B,) greatest excess over the failed limit, in the unit of the sentence in `SENTENCES`. The
-    # tolerance is not subtracted. NaN for a success.
+    success: np.ndarray
+    failed_limit: np.ndarray
+    failed_time: np.ndarray
     failed_excess: np.ndarray
 
     def sentence(self, k: int | None = None) -> str:

@@ -222,9 +222,13 @@ class ArmSetpoints:
 
 @struct.dataclass
 class ArmPlan(Plan):
-    """A plan of an arm: the motion of its n joints."""
+    """A plan of an arm: the motion of its n joints.
 
-    motion: PiecewisePolynomial  # of the joint angles [rad]: M pieces, coefficients (M, D + 1, n)
+    Attributes:
+        motion: joint angles [rad] over time: M pieces with the coefficients (M, D + 1, n).
+    """
+
+    motion: PiecewisePolynomial
 
     def sample(self, rate: float) -> ArmSetpoints:
         """Sample the plan, or the batch of plans, `rate` times a second from start to end.

@@ -83,25 +83,43 @@ class Meshes:
 
 @struct.dataclass
 class Scene:
-    """Surroundings of the arm: box to protect, box in which balls may be blocked, obstacles."""
+    """Surroundings of the arm: box to protect, box in which balls may be blocked, obstacles.
 
-    inner: Box  # protected box; the points up to `inner_radius` from it are protected, too
-    inner_radius: Array  # () [m], > 0 for a capsule, whose axis is a box without width
-    outer: Box  # box in which the shield may meet a ball
-    # (P, 2, 3) [m], ends of the axes of capsules, such as poles. Spheres are capsules, too.
+    Attributes:
+        inner: protected box; the points up to `inner_radius` from it are protected, too.
+        inner_radius: () [m], distance from `inner` up to which points are protected; > 0 for a
+            capsule, whose axis is a box without width.
+        outer: box in which the shield may meet a ball.
+        capsule_ends: (P, 2, 3) [m], ends of the axes of capsules, such as poles. Spheres are
+            capsules, too.
+        capsule_radius: (P,) [m]; a capsule with a negative radius, `ABSENT`, does not exist.
+        floor: () [m], height of the floor.
+        beam_ends: (N, 2, 3) [m], ends of the axes of capsules around the rig's beams.
+        beam_radius: (N,) [m], radii of these capsules.
+        box_middle: (M, 3) [m], middles of boxes at any orientation.
+        box_turn: (M, 4) unit quaternions w, x, y, z: rotations of the boxes' frames.
+        box_half: (M, 3) [m], halves of the boxes' edges.
+        cylinder_ends: (L, 2, 3) [m], ends of the cylinders' axes.
+        cylinder_radius: (L,) [m], radii of the cylinders.
+        meshes: convex hulls of meshes; None: there are none.
+        inner_ends: (2, 3) [m], ends of a protected capsule's oblique axis; `inner` is then the box
+            around it.
+    """
+
+    inner: Box
+    inner_radius: Array
+    outer: Box
     capsule_ends: Array
-    capsule_radius: Array  # (P,) [m]; a capsule with a negative radius, `ABSENT`, does not exist
-    floor: Array  # () [m], height of the floor
-    beam_ends: Array  # (N, 2, 3) [m], ends of the axes of capsules around the rig's beams
-    beam_radius: Array  # (N,) [m]
-    box_middle: Array  # (M, 3) [m], middles of boxes at any orientation
-    # (M, 4) unit quaternions w, x, y, z: rotations of the boxes' frames
+    capsule_radius: Array
+    floor: Array
+    beam_ends: Array
+    beam_radius: Array
+    box_middle: Array
     box_turn: Array
-    box_half: Array  # (M, 3) [m], halves of the boxes' edges
-    cylinder_ends: Array  # (L, 2, 3) [m], ends of the cylinders' axes
-    cylinder_radius: Array  # (L,) [m]
+    box_half: Array
+    cylinder_ends: Array
+    cylinder_radius: Array
     meshes: Meshes | None = None
-    # (2, 3) [m], ends of a protected capsule's oblique axis; `inner` is then the box around it
     inner_ends: Array | None = None
 
     def without_meshes(self) -> "Scene":

@@ -23,16 +23,23 @@ class Shield:
     normal, y and z are parallel to the edges. By default x is the axis z of the tip, as for the
     frame `tool0` of ROS. One of `half`, `radius` and `corners` describes the outline; without them
     the shield is a square of 0.30 m. Collisions are tested with a rectangle around the outline.
+
+    Attributes:
+        half: [m], halves of a rectangle's edges along y and z.
+        radius: [m], radius of a disc, whose outline is a regular polygon in the circle.
+        corners: [m], corners (y, z) of a convex polygon in their order around the middle, which is
+            inside.
+        position: [m], position of the shield's middle in the frame of the tip.
+        turn: unit quaternion w, x, y, z: rotation of the shield's frame in the frame of the tip.
+        mass: [kg], mass of the plate, spread evenly.
     """
 
-    half: tuple[float, float] | None = None  # [m], halves of a rectangle's edges along y and z
-    radius: float | None = None  # [m], of a disc, whose outline is a regular polygon in the circle
-    # [m], corners (y, z) of a convex polygon in their order around the middle, which is inside.
+    half: tuple[float, float] | None = None
+    radius: float | None = None
     corners: tuple[tuple[float, float], ...] | list | None = None
-    position: tuple[float, float, float] = (0.0, 0.0, 0.02)  # [m], in the frame of the tip
-    # Unit quaternion w, x, y, z: rotation of the shield's frame in the frame of the tip.
+    position: tuple[float, float, float] = (0.0, 0.0, 0.02)
     turn: tuple[float, float, float, float] = (0.5**0.5, 0.0, -(0.5**0.5), 0.0)
-    mass: float = 0.0  # [kg], spread evenly over the plate
+    mass: float = 0.0
 
     def __post_init__(self) -> None:
         given = [x for x in (self.half, self.radius, self.corners) if x is not None]

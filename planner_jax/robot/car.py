@@ -78,14 +78,22 @@ class CarSetpoints:
 
 @struct.dataclass
 class CarPlan(Plan):
-    """A plan of a car: speed and curvature are linear in time between K + 1 equidistant knots."""
+    """A plan of a car: speed and curvature are linear in time between K + 1 equidistant knots.
 
-    start: Array  # (3,) x [m], y [m] of the rear axle's middle and heading [rad] at time 0
-    time: Array  # () [s], end of the plan
-    # Speed at the knots, the first at time 0, the last at `time`; negative in reverse.
-    speed: Array  # (K + 1,) [m/s]
-    curvature: Array  # (K + 1,) [1/m], at the knots
-    origin: Array  # (2,) [m], world position to which `start` is relative
+    Attributes:
+        start: (3,) x [m], y [m] of the rear axle's middle and heading [rad] at time 0.
+        time: () [s], end of the plan.
+        speed: (K + 1,) [m/s], speed at the knots, the first at time 0, the last at `time`; negative
+            in reverse.
+        curvature: (K + 1,) [1/m], curvature at the knots.
+        origin: (2,) [m], world position to which `start` is relative.
+    """
+
+    start: Array
+    time: Array
+    speed: Array
+    curvature: Array
+    origin: Array
 
     def sample(self, rate: float) -> CarSetpoints:
         """Sample the plan, or the batch of plans, `rate` times a second from start to end.

@@ -40,15 +40,24 @@ _SHORTEST = 1e-3  # [s], least time in `beyond_reach`; avoids the product of zer
 
 @struct.dataclass
 class RotorLimits:
-    """Thrust limits of a rotor, and mass, inertia and mixer, which give the thrusts of a motion."""
+    """Thrust limits of a rotor, and mass, inertia and mixer, which give the thrusts of a motion.
 
-    mass: Array  # () [kg], of the quadrotor
-    # (3,) or (6,) [kg m^2], about the body's axes: I_xx, I_yy, I_zz, and maybe I_xy, I_xz, I_yz
+    Attributes:
+        mass: () [kg], mass of the quadrotor.
+        inertia: (3,) or (6,) [kg m^2], inertia about the body's axes: I_xx, I_yy, I_zz, and maybe
+            I_xy, I_xz, I_yz.
+        mixer: (R, 4) matrix from total thrust [N] and torque [N m] to the R rotors' thrusts [N].
+        min_thrust: () [N], least thrust of one rotor.
+        max_thrust: () [N], greatest thrust of one rotor.
+        heading: () [rad], constant heading of the flight; None: 0.
+    """
+
+    mass: Array
     inertia: Array
-    mixer: Array  # (R, 4), from total thrust [N] and torque [N m] to the R rotors' thrusts [N]
-    min_thrust: Array  # () [N], least thrust of one rotor
-    max_thrust: Array  # () [N], greatest thrust of one rotor
-    heading: Array | None = None  # () [rad], constant heading of the flight; None: 0
+    mixer: Array
+    min_thrust: Array
+    max_thrust: Array
+    heading: Array | None = None
 
 
 @struct.dataclass
@@ -70,19 +79,30 @@ class QuadrotorLimits:
 
     Which limits are None determines the compiled program. To change a number compiles nothing, but
     to replace None by a number compiles a new program.
+
+    Attributes:
+        speed: () [m/s], greatest speed.
+        body_rate: () [rad/s], greatest body rate, including its component about body z.
+        min_height: () [m], least height of the propeller plane.
+        acceleration: () [m/s^2], greatest acceleration.
+        min_thrust: () [m/s^2], least thrust per unit mass; None if `max_thrust` is None.
+        max_thrust: () [m/s^2], greatest thrust per unit mass.
+        rotors: limits of the rotors' thrusts; None: only the total thrust is limited.
+        max_tilt: () [rad], greatest tilt, the angle between thrust and vertical.
+        recovery_tilt: () [rad], greatest tilt of recoveries; None: 40 degrees.
+        air: drag and wind; None: there are neither drag nor wind.
     """
 
-    speed: Array  # () [m/s], greatest speed
-    body_rate: Array  # () [rad/s], greatest body rate, including its component about body z
-    min_height: Array  # () [m], least height of the propeller plane
-    acceleration: Array | None = None  # () [m/s^2], greatest acceleration
-    # () [m/s^2], least thrust per unit mass; None if `max_thrust` is None
+    speed: Array
+    body_rate: Array
+    min_height: Array
+    acceleration: Array | None = None
     min_thrust: Array | None = None
-    max_thrust: Array | None = None  # () [m/s^2], greatest thrust per unit mass
+    max_thrust: Array | None = None
     rotors: RotorLimits | None = None
-    max_tilt: Array | None = None  # () [rad], greatest tilt: angle between thrust and vertical
-    recovery_tilt: Array | None = None  # () [rad], greatest tilt of recoveries; None: 40 degrees
-    air: Air | None = None  # drag and wind; None: there is neither
+    max_tilt: Array | None = None
+    recovery_tilt: Array | None = None
+    air: Air | None = None
 
     @property
     def thrust_bounds(self) -> tuple[Array, Array]:
@@ -300,14 +320,20 @@ class QuadrotorPlan(Plan, Located):
     """A quadrotor's plan: the trajectory of the centre of the propeller plane.
 
     Positions in its arrays are relative to `origin`; positions of `sample` are not.
+
+    Attributes:
+        trajectory: positions [m] over time up to the last contact with a ball or target.
+        gravity: () [m/s^2], magnitude of gravity.
+        recovery: trajectory from the last contact to standstill; None if none was requested.
+        air: drag and wind of the case.
+        heading: heading [rad] over time, a polynomial of one dimension, up to the end of `whole`;
+            None: 0.
     """
 
-    trajectory: PiecewisePolynomial  # up to the last contact with a ball or target
-    gravity: Array  # () [m/s^2], magnitude
-    # Trajectory from the last contact to standstill; None if none was requested.
+    trajectory: PiecewisePolynomial
+    gravity: Array
     recovery: PiecewisePolynomial | None = struct.field(default=None, kw_only=True)
-    air: Air | None = struct.field(default=None, kw_only=True)  # drag and wind of the case
-    # Heading [rad] over time, a polynomial of one dimension, up to the end of `whole`; None: 0.
+    air: Air | None = struct.field(default=None, kw_only=True)
     heading: PiecewisePolynomial | None = struct.field(default=None, kw_only=True)
 
     @property

@@ -31,13 +31,21 @@ _NOT_NEGATIVE = (">= 0", lambda x: x >= 0.0)
 
 @dataclasses.dataclass(frozen=True)
 class Tool:
-    """The disc that meets the ball, perpendicular to the thrust: hoop of a net, or a racket."""
+    """The disc that meets the ball, perpendicular to the thrust: hoop of a net, or a racket.
 
-    kind: str  # "net" or "racket"
-    height: float  # [m], height of the disc's centre above the propeller plane
-    radius: float  # [m], of the disc
-    restitution: float = 0.7  # coefficient of restitution beta of a racket
-    # theta_safe [rad], greatest angle between a net's axis and the ball's reversed velocity.
+    Attributes:
+        kind: "net" or "racket".
+        height: [m], height of the disc's centre above the propeller plane.
+        radius: [m], radius of the disc.
+        restitution: coefficient of restitution beta of a racket.
+        max_angle: [rad], greatest angle theta_safe between a net's axis and the ball's reversed
+            velocity.
+    """
+
+    kind: str
+    height: float
+    radius: float
+    restitution: float = 0.7
     max_angle: float = math.pi / 6.0
 
     def __post_init__(self) -> None:
@@ -50,14 +58,23 @@ class Tool:
 
 @dataclasses.dataclass(frozen=True)
 class Rotors:
-    """R = 4, 6 or 8 rotors; each rotor turns in the direction opposite to the next rotor's."""
+    """R = 4, 6 or 8 rotors; each rotor turns in the direction opposite to the next rotor's.
 
-    places: tuple[tuple[float, float], ...]  # (R, 2) [m], x and y of rotors, counter-clockwise
-    max_thrust: float  # [N], of one rotor
-    min_thrust: float = 0.0  # [N], of one rotor
-    torque_ratio: float = 0.016  # [m], drag torque of a rotor divided by its thrust
-    lag: float = 0.02  # [s], time constant of a rotor's thrust
-    radius: float = 0.06  # [m], of a propeller; used only for pictures
+    Attributes:
+        places: (R, 2) [m], x and y of the rotors, counter-clockwise.
+        max_thrust: [N], greatest thrust of one rotor.
+        min_thrust: [N], least thrust of one rotor.
+        torque_ratio: [m], drag torque of a rotor divided by its thrust.
+        lag: [s], time constant of a rotor's thrust.
+        radius: [m], radius of a propeller; used only for pictures.
+    """
+
+    places: tuple[tuple[float, float], ...]
+    max_thrust: float
+    min_thrust: float = 0.0
+    torque_ratio: float = 0.016
+    lag: float = 0.02
+    radius: float = 0.06
 
     def __post_init__(self) -> None:
         rule = "x and y of 4, 6 or 8 rotors"
@@ -121,19 +138,29 @@ def place_in_cross(diagonal: float, count: int = 4) -> tuple[tuple[float, float]
 
 @dataclasses.dataclass(frozen=True)
 class FlightLimits:
-    """Limits that planned motions of a quadrotor keep; None means that there is no such limit."""
+    """Limits that planned motions of a quadrotor keep; None means that there is no such limit.
 
-    speed: float  # [m/s], greatest speed
-    body_rate: float  # [rad/s], greatest body rate, including its component about body z
-    min_height: float = 0.25  # [m], least height of the propeller plane
-    acceleration: float | None = None  # [m/s^2], greatest acceleration
-    thrust: tuple[float, float] | None = None  # [m/s^2], least and greatest thrust per unit mass
-    # Fraction of the range of a rotor's thrust that plans may use. The remainder is a reserve for
-    # the controller. None: plans do not limit the thrusts of single rotors.
+    Attributes:
+        speed: [m/s], greatest speed.
+        body_rate: [rad/s], greatest body rate, including its component about body z.
+        min_height: [m], least height of the propeller plane.
+        acceleration: [m/s^2], greatest acceleration.
+        thrust: [m/s^2], least and greatest thrust per unit mass.
+        rotor_share: fraction of the range of a rotor's thrust that plans may use. The remainder is
+            a reserve for the controller. None: plans do not limit the thrusts of single rotors.
+        max_tilt: [rad], greatest tilt (angle between thrust and vertical) of the whole flight;
+            None: no limit.
+        recovery_tilt: [rad], greatest tilt of recoveries.
+    """
+
+    speed: float
+    body_rate: float
+    min_height: float = 0.25
+    acceleration: float | None = None
+    thrust: tuple[float, float] | None = None
     rotor_share: float | None = 0.9
-    # [rad], greatest tilt (angle between thrust and vertical) of the whole flight; None: no limit
     max_tilt: float | None = None
-    recovery_tilt: float = RECOVERY_TILT  # [rad], greatest tilt of recoveries
+    recovery_tilt: float = RECOVERY_TILT
 
     def __post_init__(self) -> None:
         _require("limits.speed", self.speed, *_POSITIVE)
@@ -170,18 +197,27 @@ class QuadrotorModel:
 
     Raises:
         ValueError: a number is invalid, such as a negative mass, or the rotors cannot hover.
+
+    Attributes:
+        name: name of the quadrotor.
+        mass: [kg], mass.
+        inertia: [kg m^2], about the body's axes: the moments I_xx, I_yy, I_zz, and if they are not
+            0 also the other entries I_xy, I_xz, I_yz of the inertia matrix.
+        rotors: positions, thrusts and lag of the rotors.
+        tool: net or racket.
+        limits: limits that planned motions keep.
+        source: source of the numbers.
+        drag: drag of the rotors; None: plans and simulated flights have no drag.
     """
 
     name: str
-    mass: float  # [kg]
-    # [kg m^2], about the body's axes: the moments I_xx, I_yy, I_zz, and if they are not 0 also the
-    # other entries I_xy, I_xz, I_yz of the inertia matrix
+    mass: float
     inertia: tuple[float, ...]
     rotors: Rotors
     tool: Tool
     limits: FlightLimits
-    source: str = ""  # where the numbers are from
-    drag: RotorDrag | None = None  # None: plans and simulated flights have no drag
+    source: str = ""
+    drag: RotorDrag | None = None
 
     def __post_init__(self) -> None:
         parts = {"rotors": Rotors, "tool": Tool, "limits": FlightLimits}

@@ -20,10 +20,15 @@ class PiecewisePolynomial:
     """The trajectory p(t) = sum_k coeffs[i, k] (t - t_i)^k on piece i [Yu2023catch, eq. 13].
 
     Piece i starts at the time t_i.
+
+    Attributes:
+        coeffs: (M, D + 1, 3) coefficients of M pieces of degree D, in ascending powers of the time
+            since the piece's start t_i.
+        durations: (M,) [s], durations of the pieces, > 0.
     """
 
-    coeffs: Array  # (M, D + 1, 3), M pieces of degree D; ascending powers of the time since t_i
-    durations: Array  # (M,) [s], > 0
+    coeffs: Array
+    durations: Array
 
 
 @struct.dataclass

@@ -76,21 +76,35 @@ class BlockCase:
 
     Every number is a leaf of the pytree; plans can be differentiated by it. Robot base frame, z up,
     SI units. Time 0 is the first observation of the ball.
+
+    Attributes:
+        ball: position and velocity of the ball at time 0; the ball flies without drag.
+        gravity: () [m/s^2], magnitude of gravity.
+        ball_radius: () [m], radius of the ball; the shield meets the ball's nearest point.
+        delay: () [s], time at which the arm may start to move.
+        angles: (n,) [rad], joint angles at the time `delay`.
+        rates: (n,) [rad/s], joint rates at the time `delay`.
+        arm: kinematics, bodies and shield of the arm.
+        limits: limits of the joints.
+        ends_at_rest: () bool, whether the arm must be at rest at the contact.
+        offset: () [m], greatest distance of the ball from the shield's middle at the contact.
+        tilt: () [rad], greatest angle between the shield's normal and the reversed velocity of the
+            ball.
+        scene: obstacles, and the boxes to protect and to block in.
     """
 
     rules: ClassVar[Table] = RULES
 
-    ball: BallState  # position and velocity at time 0; the ball flies without drag
-    gravity: Array  # () [m/s^2], magnitude
-    ball_radius: Array  # () [m]; the shield meets the ball's nearest point
-    delay: Array  # () [s], time at which the arm may start to move
-    angles: Array  # (n,) [rad], joint angles at the time `delay`
-    rates: Array  # (n,) [rad/s], joint rates at the time `delay`
+    ball: BallState
+    gravity: Array
+    ball_radius: Array
+    delay: Array
+    angles: Array
+    rates: Array
     arm: Arm
     limits: ArmLimits
-    ends_at_rest: Array  # () bool, whether the arm must be at rest at the contact
-    offset: Array  # () [m], greatest distance of the ball from the shield's middle at the contact
-    # () [rad], greatest angle between the shield's normal and the reversed velocity of the ball
+    ends_at_rest: Array
+    offset: Array
     tilt: Array
     scene: Scene
 

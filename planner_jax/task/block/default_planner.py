@@ -65,26 +65,40 @@ class OnlineBlock(Planner):
 
     The arm moves until the contact. The cost of a plan is the root mean square, over joints and
     time, of the joints' accelerations divided by their limits. With `brisk` it is the duration [s].
+
+    Attributes:
+        pieces: number of pieces of each joint's rate.
+        points: number of points of the ball's path for which end poses are computed.
+        samples: number of samples of a motion at which least squares compute distances.
+        worst: number of samples with the least distances, at which least squares compute
+            derivatives.
+        checked: number of samples of the returned plan at which limits are checked.
+        margin: [m], least distance of the arm from all obstacles and itself. If the arm starts
+            nearer, the margin is half of the distance at the start.
+        obstacle_margin: [m], least distance from capsules, boxes and cylinders; it covers the gaps
+            between samples.
+        slack: fraction of every limit that plans leave unused.
+        brisk: whether motions from standstill to standstill are as fast as the limits allow: the
+            arm then waits for the ball. Otherwise the arm moves until the contact, which needs less
+            torque.
+        settling: number of steps of least squares that lower the cost of a solved plan, unless
+            `brisk` is true. If the number is not 0, all straight motions and starting points of a
+            search are compared.
+        weights: weights of the terms of least squares.
+        searches: searches in their order; each tries the cases that earlier ones left unsolved.
     """
 
     case_type: ClassVar[type] = BlockCase
     is_sequential: ClassVar[bool] = True
-    pieces: int = 10  # number of pieces of each joint's rate
-    points: int = 48  # number of points of the ball's path for which end poses are computed
-    samples: int = 32  # samples of a motion at which least squares compute distances
-    worst: int = 8  # samples with the least distances, at which least squares compute derivatives
-    checked: int = 96  # samples of the returned plan at which limits are checked
-    # [m], least distance of the arm from all obstacles and itself. If the arm starts nearer, the
-    # margin is half of the distance at the start.
+    pieces: int = 10
+    points: int = 48
+    samples: int = 32
+    worst: int = 8
+    checked: int = 96
     margin: float = 0.003
-    # [m], least distance from capsules, boxes and cylinders; covers gaps between samples
     obstacle_margin: float = 0.012
-    slack: float = 0.004  # fraction of every limit that plans leave unused
-    # Whether motions from standstill to standstill are as fast as the limits allow: the arm then
-    # waits for the ball. Otherwise the arm moves until the contact, which needs less torque.
+    slack: float = 0.004
     brisk: bool = False
-    # Number of steps of least squares that lower the cost of a solved plan, unless `brisk` is true.
-    # If the number is not 0, all straight motions and starting points of a search are compared.
     settling: int = 0
     weights: Weights = Weights()
     searches: tuple[Search, ...] = SEARCHES

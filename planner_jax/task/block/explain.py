@@ -33,18 +33,24 @@ class Prospects:
     In a pose the shield meets the ball where it may be blocked, off the shield's middle and tilted
     as far as the case allows. Inverse kinematics find the poses at 1280 samples of time, offset and
     tilt. Obstacles between start and poses are ignored.
+
+    Attributes:
+        poses: number of poses within the limits of the joint angles.
+        clear: number of these poses in which the arm touches nothing.
+        later: [s], time by which the ball would have to come later for the clear pose that is
+            reached soonest, negative if this pose is reached early. Each joint has its own least
+            time by its limits, and obstacles on the way are ignored. Infinite without a clear pose.
+        torque: greatest ratio of a joint's torque to its limit, in the straight motion to the clear
+            pose in time that needs the least ratio. 0 without limits of torque, infinite if no
+            clear pose is in time.
+        start: [m], least distance between two bodies at the start.
     """
 
-    poses: int  # number of poses within the limits of the joint angles
-    clear: int  # number of these poses in which the arm touches nothing
-    # [s], time by which the ball would have to come later for the clear pose that is reached
-    # soonest, negative if this pose is reached early. Each joint is given its own least time by its
-    # limits, and obstacles on the way are ignored. Infinite if there is no clear pose.
+    poses: int
+    clear: int
     later: float
-    # Greatest ratio of a joint's torque to its limit, in the straight motion to a clear pose in
-    # time that needs the least. 0 without limits of torque, infinite if no clear pose is in time.
     torque: float = 0.0
-    start: float = np.inf  # [m], least distance between two bodies at the start
+    start: float = np.inf
 
     @property
     def is_impossible(self) -> bool:

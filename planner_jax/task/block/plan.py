@@ -18,9 +18,13 @@ class BlockPlan(ArmPlan):
 
     The motion starts at the case's `delay`. If the motion must end at rest, the arm then stays in
     the end pose and waits for the ball.
+
+    Attributes:
+        contact_time: () [s], time of the contact of shield and ball; time 0 is the ball's first
+            observation.
     """
 
-    contact_time: Array  # () [s], of shield and ball; time 0 is the ball's first observation
+    contact_time: Array
 
 
 def append_braking(case: BlockCase, motion: PiecewisePolynomial) -> PiecewisePolynomial:

@@ -84,11 +84,15 @@ class ReplanBlock(ReplanAround[BlockPlan]):
 
     In every re-plan, times of cases and plans count from the first observation of the ball. The new
     motion starts at the case's `delay`, which grows from one re-plan to the next.
+
+    Attributes:
+        warm: planner that starts from the previous plan.
+        planner: planner of cases that `warm` does not solve.
     """
 
     plan_type: ClassVar[type] = BlockPlan
     warm: WarmBlock = WarmBlock()
-    planner: OnlineBlock = OnlineBlock()  # for cases that `warm` does not solve
+    planner: OnlineBlock = OnlineBlock()
 
     def begin(
         self,

@@ -59,21 +59,33 @@ _ARGUMENTS = {
 
 @struct.dataclass
 class Net:
-    """A net in a hoop above the propellers, across the thrust axis [Yu2023catch, eqs 22 and 25]."""
+    """A net in a hoop above the propellers, across the thrust axis [Yu2023catch, eqs 22 and 25].
 
-    height: Array  # () l [m], height of the hoop's centre above the propeller plane
-    radius: Array  # () [m], of the hoop
-    # () theta_safe [rad], greatest angle between the net's axis and the ball's reversed velocity
+    Attributes:
+        height: () [m], height l of the hoop's centre above the propeller plane.
+        radius: () [m], radius of the hoop.
+        max_angle: () [rad], greatest angle theta_safe between the net's axis and the ball's
+            reversed velocity.
+    """
+
+    height: Array
+    radius: Array
     max_angle: Array
 
 
 @struct.dataclass
 class CatchChoice:
-    """Which targets of a case to catch, in which order and about when; or a batch of choices."""
+    """Which targets of a case to catch, in which order and about when; or a batch of choices.
 
-    order: Array  # (N,) int32, permutation: targets to catch in their order, then the others
-    times: Array  # (N,) [s], ascending, first guess of the times of catches in that order
-    taken: Array  # (N,) bool, whether to catch each target; indices as in the case
+    Attributes:
+        order: (N,) int32, permutation: the targets to catch in their order, then the others.
+        times: (N,) [s], first guess of the times of catches in that order, ascending.
+        taken: (N,) bool, whether to catch each target; indices as in the case.
+    """
+
+    order: Array
+    times: Array
+    taken: Array
 
 
 @struct.dataclass
@@ -83,24 +95,37 @@ class CatchCase(Located):
     Every number is a leaf of the pytree. Time 0 is when planning starts. The planner first replaces
     the order and the guessed times of catches, the fields `order` and `times`. Positions are
     relative to `origin`.
+
+    Attributes:
+        targets: paths of the N targets, with leaves that have a leading axis N.
+        present: (N,) bool, whether each target exists; absent targets only pad the arrays.
+        horizon: (N,) [s], latest time at which each target may be caught.
+        order: (N,) int32, permutation: indices of the targets in the order of catching.
+        times: (N,) [s], first guess of the times of catches in that order, ascending.
+        head_state: (4, 3) position [m], velocity, acceleration and jerk of the quadrotor at time 0.
+        gravity: () [m/s^2], magnitude of gravity.
+        net: net of the quadrotor.
+        limits: limits with a least and a greatest thrust [Yu2023catch, eqs 3d, 3e].
+        extras: the user's further constraints and costs.
+        optional: whether targets may be left out; the number of caught targets is then maximised.
+        heading: requested heading of the quadrotor; None: 0.
     """
 
     rules: ClassVar[Table] = RULES
     positions: ClassVar[dict] = {"targets": (), "head_state": (0,)}
 
-    targets: TargetPath  # paths of the targets, leaves with a leading axis N
-    present: Array  # (N,) bool, whether each target exists; absent targets only pad the arrays
-    horizon: Array  # (N,) [s], latest time at which each target may be caught
-    order: Array  # (N,) int32, permutation: indices of the targets in the order of catching
-    times: Array  # (N,) [s], ascending, first guess of the times of catches in that order
-    head_state: Array  # (4, 3) position, velocity, acceleration, jerk of the quadrotor at time 0
-    gravity: Array  # () [m/s^2], magnitude
+    targets: TargetPath
+    present: Array
+    horizon: Array
+    order: Array
+    times: Array
+    head_state: Array
+    gravity: Array
     net: Net
-    limits: QuadrotorLimits  # with a least and a greatest thrust [Yu2023catch, eqs 3d, 3e]
-    extras: tuple[Extra, ...] = ()  # the user's further constraints and costs
-    # Whether targets may be left out; the number of caught targets is then maximised.
+    limits: QuadrotorLimits
+    extras: tuple[Extra, ...] = ()
     optional: bool = struct.field(pytree_node=False, default=False)
-    heading: "Heading | None" = None  # requested heading; None: 0
+    heading: "Heading | None" = None
 
     @property
     def batch_shape(self) -> tuple[int, ...]:

@@ -231,10 +231,14 @@ class Best(CatchDecision):
     the quadrotor would miss its targets. All orders of up to six targets are ranked. For more (at
     most 100) or optional targets, a beam search ranks only some orders and may miss the best one.
     The plan with the earliest last catch is selected.
+
+    Attributes:
+        finalists: number of orders that are planned.
+        width: number of partial orders that the beam search continues.
     """
 
-    finalists: int = 6  # number of orders that are planned
-    width: int = 64  # number of partial orders that the beam search continues
+    finalists: int = 6
+    width: int = 64
 
     def __post_init__(self) -> None:
         require_settings(self)

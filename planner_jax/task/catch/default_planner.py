@@ -87,6 +87,16 @@ class CatchProblem(ChainProblem[CatchCase, CatchPlan]):
     The cost is time_weight * total time + energy_weight * integral |snap|^2, plus the integral of
     smooth one-sided penalties on the limits [Yu2023catch, eqs 26-28] and of the user's extra terms,
     plus catch_weight * penalties on the net's angle [Yu2023catch, eq. 25] and on late catches.
+
+    Attributes:
+        proportions: relative durations of the pieces.
+        catch_weight: [s], weight of the penalties at a catch.
+        lift: thrust at catches before the last one in the first starting point: -1 is the least, 0
+            hover, 1 the greatest thrust. Near -1 catches are earliest; larger values leave a margin
+            for feedback control in flight.
+        entry: [m/s], least speed at which a ball enters the net from above; None: it may enter from
+            below.
+        learned: whether a network predicts a starting point for a single catch.
     """
 
     case_type = CatchCase
@@ -94,15 +104,11 @@ class CatchProblem(ChainProblem[CatchCase, CatchPlan]):
     package = "planner_jax.task.catch"
     num_end_variables = 12
     guess_table = _GUESSES
-    proportions: tuple[float, ...] = _PROPORTIONS  # relative durations of the pieces
-    catch_weight: float = 0.3  # [s] weight of the penalties at a catch
-    # Thrust at catches before the last one in the first starting point: -1 is the least, 0 hover, 1
-    # the greatest thrust. Near -1 catches are earliest; larger values leave a margin for feedback
-    # control in flight.
+    proportions: tuple[float, ...] = _PROPORTIONS
+    catch_weight: float = 0.3
     lift: float = _GUESSES[0, 3].item()
-    # [m/s], least speed at which a ball enters the net from above; None: it may enter from below.
     entry: float | None = None
-    learned: bool = True  # whether a network predicts a starting point for a single catch
+    learned: bool = True
 
     @property
     def end_weight(self) -> float:

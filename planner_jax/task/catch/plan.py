@@ -14,11 +14,17 @@ class CatchPlan(QuadrotorPlan):
 
     The trajectory has M pieces to each of N catches. If fewer than N targets are caught, the last
     pieces have zero duration and stay at the position of the last catch.
+
+    Attributes:
+        order: (N,) int32, indices of the targets in the order of catching.
+        decided_times: (N,) [s], times of the catches in that order before the optimisation.
+        times: (N,) [s], times of the catches in that order; a time is repeated if nothing is
+            caught.
     """
 
-    order: Array  # (N,) int32, indices of the targets in the order of catching
-    decided_times: Array  # (N,) [s], of the catches in that order, before the optimisation
-    times: Array  # (N,) [s], of the catches in that order; a time is repeated if nothing is caught
+    order: Array
+    decided_times: Array
+    times: Array
 
     @property
     def num_taken(self) -> Array:

@@ -49,15 +49,19 @@ class InterceptGroup:
     Every number is a leaf of the pytree. The middle of the car's body must come within
     `shared.tolerance` of every target. If `shared` restricts the heading at a meeting, the
     restriction applies to every meeting.
+
+    Attributes:
+        shared: car, obstacles, map and the targets' paths. The leaves of `shared.target` have a
+            leading axis N. All targets must be met before `shared.time` [s].
+        present: (N,) bool, whether each target exists; absent targets only pad the arrays.
+        order: (N,) int32, permutation: indices of the targets in the order of the meetings.
     """
 
     rules: ClassVar[Table] = RULES
 
-    # Car, obstacles, map and the targets' paths. The leaves of `shared.target` have a leading axis
-    # N. All targets must be met before `shared.time` [s].
     shared: InterceptCase
-    present: Array  # (N,) bool, whether each target exists; absent targets only pad the arrays
-    order: Array  # (N,) int32, a permutation: index of the first target to meet, the second, ...
+    present: Array
+    order: Array
 
     @property
     def batch_shape(self) -> tuple[int, ...]:

@@ -89,9 +89,12 @@ class Best(Decision):
 
     All N! orders of the N <= 8 targets are estimated. The planner plans each of the best orders,
     the finalists, and selects the plan whose last meeting is earliest.
+
+    Attributes:
+        finalists: number of orders that are planned.
     """
 
-    finalists: int = 6  # number of orders that are proposed and then planned
+    finalists: int = 6
 
     def __post_init__(self) -> None:
         require_settings(self)
@@ -163,9 +166,12 @@ class Search(Decision):
 
     Three local searches follow each other. The first ignores the time that turns take, the second
     counts a share of it, and the third all of it.
+
+    Attributes:
+        moves: greatest number of moves of each local search.
     """
 
-    moves: int = 40  # greatest number of moves of each local search
+    moves: int = 40
 
     def propose(self, case: InterceptGroup) -> GroupChoice:
         """Return the improved order of a group's N targets as the only proposal, (1, N)."""

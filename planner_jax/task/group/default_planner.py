@@ -36,13 +36,16 @@ class GroupIntercept(Planner):
 
     A leg is the drive to one target, planned by `planner`. To save computing time, every leg ends
     as early as possible, even if its end state delays the next leg.
+
+    Attributes:
+        planner: planner of every leg (drive to one target), with a single search to save time.
+        patient: planner of legs that `planner` fails.
     """
 
     case_type: ClassVar[type] = InterceptGroup
     attempts: ClassVar[tuple[BaseAttempt, ...]] = (BaseAttempt(),)  # pyright: ignore[reportIncompatibleMethodOverride]
-    # Planner of every leg (drive to one target), with a single search to save time.
     planner: SpacetimeIntercept = SpacetimeIntercept("early", searches=(_EARLY,))
-    patient: SpacetimeIntercept = SpacetimeIntercept("least")  # for legs that `planner` fails
+    patient: SpacetimeIntercept = SpacetimeIntercept("least")
 
     def plan_by(self, drive: Drive, cases: InterceptGroup) -> GroupPlan:
         """Plan the legs (drives to one target) in order; `drive(planner, legs)` plans a batch."""

@@ -54,16 +54,24 @@ class DirectGroup(Planner[InterceptGroup, GroupPlan]):
 
     The order stored in a case is a proposal. With `moves` > 0 the planner changes it after every
     leg (drive to one target) by so many moves of a local search.
+
+    Attributes:
+        moves: number of moves of the local search of the order after every leg; 0: the order is
+            kept.
+        trials: greatest number of least-squares problems of a case.
+        movers: number of moving obstacles in least squares; every plan is checked with all of them.
+        turn: [rad], greatest deviation from the prescribed heading at a meeting.
+        early: weight of a leg's duration, divided by the time up to which it may last.
     """
 
     case_type: ClassVar[type] = InterceptGroup
     is_sequential: ClassVar[bool] = True
     attempts: ClassVar[tuple[BaseAttempt, ...]] = (BaseAttempt(),)  # pyright: ignore[reportIncompatibleMethodOverride]
-    moves: int = 3  # moves of the local search of the order after every leg; 0: the order is kept
-    trials: int = 150  # greatest number of least-squares problems of a case
-    movers: int = 8  # number of moving obstacles in least squares; every plan is checked with all
-    turn: float = 0.3  # [rad], greatest deviation from the prescribed heading at a meeting
-    early: float = 100.0  # weight of a leg's duration, divided by the time up to which it may last
+    moves: int = 3
+    trials: int = 150
+    movers: int = 8
+    turn: float = 0.3
+    early: float = 100.0
 
     def solve(self, case: InterceptGroup, attempt: BaseAttempt, /) -> GroupPlan:
         """Plan one case leg by leg; if a leg has no plan, plan the leg before it again."""

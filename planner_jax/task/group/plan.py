@@ -15,11 +15,16 @@ class GroupPlan(Plan):
     Every leg starts at the state and the time at which the previous leg ends. Legs to absent
     targets, and after an unsolved leg, have zero duration. The cost is the time [s] when the last
     target is met.
+
+    Attributes:
+        order: (N,) int32, indices of the targets in the order of the meetings.
+        begins: (N,) [s], start time of each leg, in the sequence of `order`.
+        legs: plans of the N legs in the sequence of `order`; leaves have a leading axis N.
     """
 
-    order: Array  # (N,) int32, index of the target that is met first, second, ...
-    begins: Array  # (N,) [s], start time of each leg, in the sequence of `order`
-    legs: InterceptPlan  # the N legs in the sequence of `order`; leaves have a leading axis N
+    order: Array
+    begins: Array
+    legs: InterceptPlan
 
     @property
     def choice(self) -> GroupChoice:

@@ -65,11 +65,18 @@ _ARGUMENTS = {
 
 @struct.dataclass
 class HitLimits:
-    """Limits on speed at impact and on the returned ball's apex [Yu2023bat, eqs 18f and 18g]."""
+    """Limits on speed at impact and on the returned ball's apex [Yu2023bat, eqs 18f and 18g].
 
-    hitting_speed: Array  # (3,) [m/s], greatest speed of the quadrotor at the impact, world axes
-    min_apex: Array  # () [m], least height of the apex of the returned ball
-    max_apex: Array  # () [m], greatest height of the apex of the returned ball
+    Attributes:
+        hitting_speed: (3,) [m/s], greatest speed of the quadrotor at the impact on each axis of the
+            world.
+        min_apex: () [m], least height of the apex of the returned ball.
+        max_apex: () [m], greatest height of the apex of the returned ball.
+    """
+
+    hitting_speed: Array
+    min_apex: Array
+    max_apex: Array
 
 
 @struct.dataclass
@@ -77,23 +84,38 @@ class RacketCase(Located):
     """The fields that cases of hits and of rallies share. Every number is a leaf of the pytree.
 
     Time 0 is when planning starts. Positions are relative to `origin`.
+
+    Attributes:
+        ball: position and velocity of the ball at time 0.
+        head_state: (4, 3) position [m], velocity, acceleration and jerk of the quadrotor at time 0.
+        drag: () [1/m], coefficient K_D of the ball's quadratic drag.
+        gravity: () [m/s^2], magnitude of gravity.
+        restitution: () coefficient of restitution beta of the racket.
+        racket_height: () [m], height of the racket's centre above the propeller plane.
+        limits: limits of the quadrotor's motion.
+        hit_limits: limits at the impact and on the returned ball.
+        extras: the user's further constraints and costs.
+        racket_radius: () [m], radius of the racket; None: the contact's offset is not limited.
+        heading: requested heading of the quadrotor; None: 0.
+        lift: (3,) [1/s], lift vector of the ball; None: the ball has no spin.
+        around: wind, and friction of ball and racket, as `Surroundings`.
     """
 
     positions: ClassVar[dict] = {"ball": (), "head_state": (0,)}
 
-    ball: BallState  # position and velocity of the ball at time 0
-    head_state: Array  # (4, 3) position, velocity, acceleration, jerk of the quadrotor at time 0
-    drag: Array  # () [1/m], coefficient K_D of the ball's quadratic drag
-    gravity: Array  # () [m/s^2], magnitude
-    restitution: Array  # () coefficient of restitution beta of the racket
-    racket_height: Array  # () [m], height of the racket's centre above the propeller plane
+    ball: BallState
+    head_state: Array
+    drag: Array
+    gravity: Array
+    restitution: Array
+    racket_height: Array
     limits: QuadrotorLimits
     hit_limits: HitLimits
-    extras: tuple[Extra, ...] = ()  # the user's further constraints and costs
-    racket_radius: Array | None = None  # () [m]; None: the contact's offset is not limited
-    heading: "Heading | None" = None  # requested heading; None: 0
-    lift: Array | None = None  # (3,) [1/s], lift vector of the ball, None without spin
-    around: PyTree = None  # `Surroundings`: wind, and friction of ball and racket
+    extras: tuple[Extra, ...] = ()
+    racket_radius: Array | None = None
+    heading: "Heading | None" = None
+    lift: Array | None = None
+    around: PyTree = None
 
     @property
     def batch_shape(self) -> tuple[int, ...]:
@@ -103,10 +125,14 @@ class RacketCase(Located):
 
 @struct.dataclass
 class HitCase(RacketCase):
-    """One hit to plan, or a batch: a quadrotor has to hit a ball to a target with a racket."""
+    """One hit to plan, or a batch: a quadrotor has to hit a ball to a target with a racket.
+
+    Attributes:
+        target: (3,) [m], landing point of the returned ball.
+    """
 
     rules: ClassVar[Table] = RULES
-    target: Array = struct.field(kw_only=True)  # (3,) [m], landing point of the returned ball
+    target: Array = struct.field(kw_only=True)
 
 
 def case(

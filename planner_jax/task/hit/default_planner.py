@@ -124,6 +124,18 @@ class HitProblem(ChainProblem[HitCase, HitPlan]):
     The cost is energy_weight * integral |snap|^2, plus the integral of smooth one-sided penalties
     on the limits [Yu2023bat, eq. 18a] and of the user's extra terms, plus impact_weight * penalties
     on apex and hitting speed [Yu2023bat, eqs 21 and 24a].
+
+    Attributes:
+        proportions: durations of the trajectory's polynomial pieces, relative to each other. The
+            first pieces are short, so that the jerk can change fast and a hovering quadrotor starts
+            to turn early.
+        nodes: number of intervals of each piece, at whose ends penalties are evaluated.
+        time_weight: weight of the time of the impact.
+        energy_weight: [s^8/m^2], weight of the integral of |snap|^2.
+        drag_after_impact: whether the ball has drag also after the impact.
+        impact_weight: [s], weight of the penalties on apex and hitting speed.
+        velocities: whether the velocities at the waypoints are variables.
+        learned: whether a network predicts starting points of usual cases.
     """
 
     case_type = HitCase
@@ -133,16 +145,14 @@ class HitProblem(ChainProblem[HitCase, HitPlan]):
     guess_table = _GUESSES
     refinements = ("nodes", "velocities")
     decode_nodes = (16, 16)
-    # Durations of the trajectory's polynomial pieces, relative to each other. The first pieces are
-    # short, so that the jerk can change fast and a hovering quadrotor starts to turn early.
     proportions: tuple[float, ...] = _PROPORTIONS
-    nodes: int = 4  # intervals of each piece at whose ends penalties are evaluated
+    nodes: int = 4
     time_weight: float = 0.0
     energy_weight: float = 1e-8
     drag_after_impact: bool = False
-    impact_weight: float = 0.3  # [s] weight of the penalties for apex and hitting speed
-    velocities: bool = False  # whether the velocities at the waypoints are variables
-    learned: bool = True  # whether a network predicts starting points of usual cases
+    impact_weight: float = 0.3
+    velocities: bool = False
+    learned: bool = True
 
     @property
     def end_weight(self) -> float:

@@ -99,30 +99,52 @@ class InterceptCase:
     The middle of the car's body has to come within `tolerance` of the target, or of the region
     around it, at the time of the meeting. World frame in the plane, SI units, positions relative to
     `origin`. Time 0 is when the car starts to drive.
+
+    Attributes:
+        start: (3,) x [m], y [m] of the rear axle's middle and heading [rad] at time 0.
+        speed: () [m/s], speed of the car at time 0, negative in reverse.
+        curvature: () [1/m], curvature of the rear axle's path at time 0, from the steering angle.
+        target: expected path of the target.
+        time: () [s], time of the meeting; the latest time for planners that choose the time.
+        tolerance: () [m], greatest distance of the body's middle from the target at `time`.
+        end_heading: () [rad], required heading of the car at the meeting.
+        heading_tolerance: () [rad], greatest deviation from `end_heading`; pi: any heading.
+        walls: static obstacles.
+        movers: moving obstacles.
+        lower: (2,) [m], corner of the map; the body's middle must not leave the map.
+        upper: (2,) [m], the opposite corner.
+        body: rectangle of the car's body.
+        limits: limits of the car's motion.
+        region: (V, 2) [m], convex polygon around the target; all 0: the target itself.
+        earliest: () [s], earliest time of a meeting, for planners that choose the time.
+        end_speed: (2,) [m/s], least and greatest speed of the car at the meeting.
+        margin: () [m], least distance of the body from obstacles.
+        map_heading: () [rad], direction of the axes of `lower` and `upper`.
+        origin: (2,) [m], world position to which all positions of the case are relative.
     """
 
     rules: ClassVar[Table] = RULES
 
-    start: Array  # (3,) x [m], y [m] of the rear axle's middle and heading [rad] at time 0
-    speed: Array  # () [m/s], of the car at time 0, negative in reverse
-    curvature: Array  # () [1/m], of the rear axle's path at time 0, from the steering angle
-    target: PlanePath  # expected path of the target
-    time: Array  # () [s], of the meeting; the latest time for planners that choose the time
-    tolerance: Array  # () [m], greatest distance of the body's middle from the target at `time`
-    end_heading: Array  # () [rad], required heading of the car at the meeting
-    heading_tolerance: Array  # () [rad], greatest deviation from `end_heading`; pi: any heading
-    walls: Obstacles  # static obstacles
-    movers: Obstacles  # moving obstacles
-    lower: Array  # (2,) [m], corner of the map; the body's middle must not leave the map
-    upper: Array  # (2,) [m], the opposite corner
+    start: Array
+    speed: Array
+    curvature: Array
+    target: PlanePath
+    time: Array
+    tolerance: Array
+    end_heading: Array
+    heading_tolerance: Array
+    walls: Obstacles
+    movers: Obstacles
+    lower: Array
+    upper: Array
     body: CarBody
     limits: CarLimits
-    region: Array  # (V, 2) [m], convex polygon around the target; all 0: the target itself
-    earliest: Array  # () [s], earliest time of a meeting, for planners that choose the time
-    end_speed: Array  # (2,) [m/s], least and greatest speed of the car at the meeting
-    margin: Array  # () [m], least distance of the body from obstacles
-    map_heading: Array  # () [rad], direction of the axes of `lower` and `upper`
-    origin: Array  # (2,) [m], world position to which all positions of the case are relative
+    region: Array
+    earliest: Array
+    end_speed: Array
+    margin: Array
+    map_heading: Array
+    origin: Array
 
     @property
     def batch_shape(self) -> tuple[int, ...]:

@@ -63,15 +63,22 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
     possible before it, and "least" is the time, up to the case's time, of the least discomfort. A
     plan's cost is the meeting time [s] if `meet` is "early", and else the discomfort [m^2/s^3] of
     `terms.limit_terms`.
+
+    Attributes:
+        meet: choice of the time of the meeting, see above.
+        pieces: number of pieces of speed and curvature.
+        samples: number of samples of each piece at which least squares check obstacles.
+        checked: number of samples of each piece at which the finished plan is checked.
+        searches: searches in their order; by default `SEARCHES[meet]`.
     """
 
     case_type: ClassVar[type] = InterceptCase
     is_sequential: ClassVar[bool] = True
     meet: Literal["given", "early", "least"] = "given"
-    pieces: int = 32  # number of pieces of speed and curvature
-    samples: int = 3  # samples of each piece at which least squares check obstacles
-    checked: int = 16  # samples of each piece at which the finished plan is checked
-    searches: tuple[Search, ...] | None = None  # by default `SEARCHES[meet]`
+    pieces: int = 32
+    samples: int = 3
+    checked: int = 16
+    searches: tuple[Search, ...] | None = None
 
     def __post_init__(self) -> None:
         protocol.require_settings(self)

@@ -31,13 +31,18 @@ _SIDES = {"map": "every side of the map", "body": "every side of the body"}
 
 @dataclasses.dataclass(frozen=True)
 class Relaxation:
-    """A case with relaxed limits, and a plan that the referee accepts for this case."""
+    """A case with relaxed limits, and a plan that the referee accepts for this case.
+
+    Attributes:
+        case: the case with relaxed limits.
+        plan: the plan of that case.
+        changes: amount by which each limit is relaxed, by the name of the argument of
+            `pj.intercept.case`. "map" is the distance [m] by which the map is larger on every side,
+            and "body" the distance [m] by which the car's body is smaller on every side.
+    """
 
     case: InterceptCase
     plan: InterceptPlan
-    # Amount by which each limit is relaxed, by the name of the argument of `pj.intercept.case`.
-    # "map" is the distance [m] by which the map is larger on every side, and "body" the distance
-    # [m] by which the car's body is smaller on every side.
     changes: dict[str, float]
 
     def sentence(self) -> str:

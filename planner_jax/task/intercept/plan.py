@@ -17,9 +17,13 @@ from planner_jax.task.intercept.problem.clearance import clearance, is_blocked
 
 @struct.dataclass
 class InterceptPlan(CarPlan):
-    """A car's plan up to the meeting with its target, or a batch: each leaf has a leading axis."""
+    """A car's plan up to the meeting with its target, or a batch: each leaf has a leading axis.
 
-    meeting: Array  # (2,) [m], expected position of the target at the end, relative to `origin`
+    Attributes:
+        meeting: (2,) [m], expected position of the target at the end, relative to `origin`.
+    """
+
+    meeting: Array
 
 
 def make_plan(

@@ -36,10 +36,15 @@ RULES: Table = (
 
 @struct.dataclass
 class RallyLimits(HitLimits):
-    """Limits at every contact: speed, apex of the ball after it, and height of the contact."""
+    """Limits at every contact: speed, apex of the ball after it, and height of the contact.
 
-    min_contact: Array  # () [m], least height of a contact
-    max_contact: Array  # () [m], greatest height of a contact
+    Attributes:
+        min_contact: () [m], least height of a contact.
+        max_contact: () [m], greatest height of a contact.
+    """
+
+    min_contact: Array
+    max_contact: Array
 
 
 @struct.dataclass
@@ -47,20 +52,24 @@ class RallyCase(RacketCase):
     """K >= 1 hits to plan, or a batch: a quadrotor has to hit one ball again and again.
 
     Hit k sends the ball to a place that the planner chooses in a box, and hit k + 1 happens there.
+
+    Attributes:
+        hit_limits: limits at every contact.
+        places: (K, 3) [m], centre of the box in which the place after each hit is chosen.
+        place_range: (K, 3) [m], half the box's width; zeros for a fixed place.
+        ball_time: () [s], time at which the ball has the state `ball`, such as a partner's planned
+            hit.
+        home: (3,) [m], position at which the racket waits after the last hit until a partner has
+            returned the ball; None: the robot itself hits the ball at the last place.
     """
 
     rules: ClassVar[Table] = RULES
     positions: ClassVar[dict] = {**RacketCase.positions, "places": (), "home": ()}
 
     hit_limits: RallyLimits  # pyright: ignore[reportIncompatibleVariableOverride]
-    # (K, 3) [m], centre of the box in which the place after each hit is chosen
     places: Array = struct.field(kw_only=True)
-    # (K, 3) [m], half the box's width; zeros for a fixed place
     place_range: Array = struct.field(kw_only=True)
-    # () [s], time at which the ball has the state `ball`, such as a partner's planned hit
     ball_time: Array = struct.field(kw_only=True)
-    # (3,) [m], where the racket waits after the last hit until a partner has returned the ball;
-    # None: the robot itself hits the ball at the last place.
     home: Array | None = struct.field(kw_only=True, default=None)
 
 

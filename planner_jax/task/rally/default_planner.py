@@ -102,6 +102,17 @@ class RallyProblem(ChainProblem[RallyCase, RallyPlan]):
     and next_weight * energy_weight * the least energy of a next segment, which ends at standstill,
     level, below the last place, or below `home` after twice the flight time. Without the last term,
     the last hit may end in a state from which no further hit keeps the limits.
+
+    Attributes:
+        proportions: durations of a segment's polynomial pieces, relative to each other.
+        nodes: number of intervals of each piece, at whose ends penalties are evaluated.
+        time_weight: weight of the total time.
+        energy_weight: [s^8/m^2], weight of the integral of |snap|^2.
+        contact_weight: [s], weight of the penalties at the contacts.
+        place_weight: weight of the squares of the place variables.
+        apex_weight: weight of the squares of the apexes off the middle.
+        next_weight: weight of the least energy of a next segment, a multiple of `energy_weight`.
+        metric: whether the measured metric of the variables of two hits is used.
     """
 
     case_type = RallyCase
@@ -111,14 +122,14 @@ class RallyProblem(ChainProblem[RallyCase, RallyPlan]):
     guess_table = _GUESSES
     weights = (*ChainProblem.weights, "place_weight", "apex_weight")
     proportions: tuple[float, ...] = _PROPORTIONS
-    nodes: int = 6  # intervals of each piece at whose ends penalties are evaluated
+    nodes: int = 6
     time_weight: float = 0.0
     energy_weight: float = 5e-8
-    contact_weight: float = 0.3  # [s], weight of the penalties at the contacts
+    contact_weight: float = 0.3
     place_weight: float = 3e-3
     apex_weight: float = 3e-3
     next_weight: float = 3.0
-    metric: bool = True  # whether the measured metric of the variables of two hits is used
+    metric: bool = True
 
     @property
     def end_weight(self) -> float:

@@ -40,16 +40,24 @@ class ReachCase:
     """One case, or a batch: an arm has to move from standstill to standstill at a goal.
 
     Robot base frame, z up, SI units. The motion starts at time 0.
+
+    Attributes:
+        angles: (n,) [rad], joint angles at the start.
+        goals: (G, n) [rad], joint angles of the G goals; the motion may end at any of them.
+        arm: kinematics and bodies of the arm.
+        limits: limits of the joints.
+        scene: obstacles.
+        gravity: () [m/s^2], magnitude; it loads motors whose limits have torques.
     """
 
     rules: ClassVar[Table] = RULES
 
-    angles: Array  # (n,) [rad], joint angles at the start
-    goals: Array  # (G, n) [rad], joint angles; the motion may end at any of the G goals
+    angles: Array
+    goals: Array
     arm: Arm
     limits: ArmLimits
     scene: Scene
-    gravity: Array  # () [m/s^2], magnitude; it loads motors whose limits have torques
+    gravity: Array
 
     @property
     def batch_shape(self) -> tuple[int, ...]:

@@ -48,9 +48,13 @@ _CUTS = 30  # number of attempts to shorten a path
 
 @struct.dataclass
 class ReachPlan(ArmPlan):
-    """The plan of a motion from standstill to standstill, or a batch of plans."""
+    """The plan of a motion from standstill to standstill, or a batch of plans.
 
-    goal: Array  # () int32, index of the goal at which the motion ends
+    Attributes:
+        goal: () int32, index of the goal at which the motion ends.
+    """
+
+    goal: Array
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,15 +79,23 @@ class TreeSearch(Search):
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class ReachPlanner(Planner):
-    """Planner of arm motions from standstill to standstill; cost: the duration [s]."""
+    """Planner of arm motions from standstill to standstill; cost: the duration [s].
+
+    Attributes:
+        pieces: greatest number of pieces of a motion.
+        capacity: greatest number of states of a tree.
+        margin: [m], distance from obstacles, if start and goal have twice as much.
+        slack: fraction of every limit of rates and accelerations that is left unused.
+        searches: searches in their order; each tries the cases that earlier ones left unsolved.
+    """
 
     case_type: ClassVar[type] = ReachCase
     plan_type: ClassVar[type] = ReachPlan
     is_sequential: ClassVar[bool] = True
-    pieces: int = 96  # greatest number of pieces of a motion
-    capacity: int = 8192  # greatest number of states of a tree
-    margin: float = 0.002  # [m], distance from obstacles, if start and goal have twice as much
-    slack: float = 1e-4  # fraction of every limit of rates and accelerations that is left unused
+    pieces: int = 96
+    capacity: int = 8192
+    margin: float = 0.002
+    slack: float = 1e-4
     searches: tuple[Search, ...] = (
         Search(),
         TreeSearch(),

@@ -44,14 +44,21 @@ class TeamCase:
 
     A target may be left out, and no target is caught twice. The distance between the centres of any
     two robots is at least `least_distance` from time 0 until all robots stand still.
+
+    Attributes:
+        shared: targets, net and limits, which all robots share. Its `head_state` is the first
+            robot's.
+        head_states: (N, 4, 3) position [m], velocity, acceleration and jerk of the robots at time
+            0.
+        least_distance: () [m], least distance between the centres of the propeller planes of two
+            robots.
     """
 
     rules: ClassVar[Table] = RULES
 
-    # Targets, net and limits, which all robots share. Its `head_state` is the first robot's.
     shared: CatchCase
-    head_states: Array  # (N, 4, 3) position, velocity, acceleration, jerk of the robots at time 0
-    least_distance: Array  # () [m], between the centres of the propeller planes of two robots
+    head_states: Array
+    least_distance: Array
 
     @property
     def batch_shape(self) -> tuple[int, ...]:

@@ -54,12 +54,16 @@ class ExactTeam(Planner[TeamCase, TeamPlan]):
     without the distance, the robots plan again in turn, with the other robots' trajectories as
     moving keep-outs. A robot then may catch all targets that no other robot catches. A new plan
     replaces the old one if it catches more. The distance is therefore kept after every step.
+
+    Attributes:
+        planner: planner of the catches and the recovery of one robot.
+        turns: number of times that a robot plans in turn.
     """
 
     case_type: ClassVar[type] = TeamCase
 
-    planner: RecoveringPlanner[CatchCase, CatchPlan]  # plans catches and recovery of one robot
-    turns: int = struct.field(pytree_node=False, default=3)  # how often a robot plans in turn
+    planner: RecoveringPlanner[CatchCase, CatchPlan]
+    turns: int = struct.field(pytree_node=False, default=3)
 
     @property
     def inner(self) -> Planner:

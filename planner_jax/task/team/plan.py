@@ -14,9 +14,12 @@ class TeamPlan(Plan):
 
     Every robot's plan ends with a recovery trajectory, after which the robot stands still. The cost
     is the sum of the robots' costs.
+
+    Attributes:
+        robots: plans of the N robots, with leaves that have a leading axis N.
     """
 
-    robots: CatchPlan  # plans of the N robots; leaves have a leading axis N
+    robots: CatchPlan
 
     @property
     def taken(self) -> Array:
