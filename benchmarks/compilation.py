@@ -25,8 +25,9 @@ from jaxtyping import PyTree
 from planner_jax.benchmarks.run import Bench, argument_parser, begin
 from planner_jax.core.compiled import quick_options
 from planner_jax.core.protocol import take
-from planner_jax.core.registry import task_named
-from planner_jax.planning.plan import plan, solve
+from planner_jax.core.tasks import task_named
+from planner_jax.planning.plan import plan
+from planner_jax.planning.solve import solve
 
 BATCH = 64  # number of cases of the batch whose programs are listed
 # Tasks whose default planners are examined, as "TASK" or "TASK SUITE": the suite is the family of

@@ -27,7 +27,7 @@ import numpy as np
 import planner_jax as pj
 from planner_jax.benchmarks.cost_gap import cost_gaps
 from planner_jax.benchmarks.run import Bench, argument_parser, at_least, begin
-from planner_jax.core.registry import task_named
+from planner_jax.core.tasks import task_named
 from planner_jax.optimise.settings import NewtonConfig
 from planner_jax.planning.decided import first_choice
 

@@ -21,7 +21,7 @@ import numpy as np
 import planner_jax as pj
 from planner_jax.benchmarks.cost_gap import cost_gaps, gap_figures
 from planner_jax.benchmarks.run import argument_parser, begin
-from planner_jax.core.registry import all_tasks, task_named
+from planner_jax.core.tasks import all_tasks, task_named
 from planner_jax.plane.target import LaterPath
 from planner_jax.runs.timing import measure_plans
 

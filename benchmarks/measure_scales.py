@@ -32,7 +32,7 @@ import numpy as np
 import planner_jax as pj
 import planner_jax.task
 from planner_jax.benchmarks.run import Bench, argument_parser, begin
-from planner_jax.core.registry import task_named
+from planner_jax.core.tasks import task_named
 from planner_jax.cost.quadrotor import limits_along
 from planner_jax.optimise.chain import ChainProblem
 from planner_jax.optimise.multistart import minimise

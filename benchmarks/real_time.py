@@ -21,7 +21,7 @@ import jax
 import numpy as np
 
 from planner_jax.benchmarks.run import argument_parser, begin
-from planner_jax.core.registry import task_named
+from planner_jax.core.tasks import task_named
 from planner_jax.host.machine import processor, usable_cores
 from planner_jax.runs.timing import measure_plans
 

@@ -34,7 +34,8 @@ from planner_jax.benchmarks.cost_gap import COMPARED, cost_gaps, gap_figures
 from planner_jax.benchmarks.run import Bench, argument_parser, begin, parse_names
 from planner_jax.benchmarks.throughput_settings import ThroughputSettings
 from planner_jax.core.choices import require
-from planner_jax.core.registry import Task, all_tasks, task_named
+from planner_jax.core.registry import Task
+from planner_jax.core.tasks import all_tasks, task_named
 from planner_jax.optimise.planner import SearchPlanner
 from planner_jax.planning.decided import DecidedPlanner
 from planner_jax.planning.plan import plan

@@ -8,8 +8,8 @@ import pkgutil
 from typing import ClassVar
 
 from planner_jax.core.choices import EFFORTS, require
-from planner_jax.core.registry import task_named
 from planner_jax.core.room import require_memory
+from planner_jax.core.tasks import task_named
 from planner_jax.runs.settings import Options, SweepSettings, option
 
 _MOST = 100_000  # Maximum of the settings that are counts. Larger counts would take hours.

@@ -9,8 +9,9 @@ import pkgutil
 from typing import Any, ClassVar
 
 from planner_jax.core.choices import require, require_one_of, require_seed
-from planner_jax.core.registry import Task, all_tasks, split_name
+from planner_jax.core.registry import Task, split_name
 from planner_jax.core.room import require_memory
+from planner_jax.core.tasks import all_tasks
 from planner_jax.runs.settings import option, require_count
 from planner_jax.sims.noise import NOISES, PLANE_NOISES, PlaneSensing, Sensing, require_whole
 from planner_jax.sweep.block.settings import require_moderate

@@ -22,7 +22,8 @@ from typing import NamedTuple
 import yaml
 
 from planner_jax.core.choices import CHOICES, EFFORTS
-from planner_jax.core.registry import Task, all_tasks
+from planner_jax.core.registry import Task
+from planner_jax.core.tasks import all_tasks
 from planner_jax.export.api import FORMATS
 from planner_jax.robot.quadrotor_file import to_yaml
 from planner_jax.robot.quadrotor_model import RotorDrag

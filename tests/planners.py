@@ -16,8 +16,9 @@ from planner_jax.baselines.block.library.planner import LibraryBlock
 from planner_jax.baselines.intercept.projection import Projection
 from planner_jax.baselines.intercept.static_paths import PathSource
 from planner_jax.baselines.parts.lbfgs_lite import LiteRule
+from planner_jax.core.outcome import outcome
 from planner_jax.core.planner import Kind
-from planner_jax.core.protocol import BaseAttempt, Plan, outcome
+from planner_jax.core.protocol import BaseAttempt, Plan
 from planner_jax.optimise.levenberg import LevenbergConfig
 from planner_jax.optimise.settings import Attempt, LbfgsConfig
 from planner_jax.plane.reach import Lattice

@@ -6,7 +6,8 @@ import itertools
 import numpy as np
 import pytest
 
-from planner_jax.core.registry import Task, all_tasks
+from planner_jax.core.registry import Task
+from planner_jax.core.tasks import all_tasks
 from planner_jax.runs.columns import RefereedBatch, leaf_columns, rows_of
 from planner_jax.runs.source import Chunk
 from tests.combinations import REFUSED, RUNS, all_combinations, cross, run_all

@@ -14,7 +14,8 @@ from jaxpr import assert_full_precision
 import planner_jax as pj
 from planner_jax.baselines.parts.lbfgs_lite import LitePlanner
 from planner_jax.core import planner as planner_module
-from planner_jax.core.protocol import BaseAttempt, Plan, is_solved, outcome
+from planner_jax.core.outcome import outcome
+from planner_jax.core.protocol import BaseAttempt, Plan, is_solved
 from planner_jax.core.rules import is_sound
 from planner_jax.optimise.planner import SearchPlanner
 from planner_jax.task.intercept.default_planner import SpacetimeIntercept

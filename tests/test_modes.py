@@ -23,8 +23,9 @@ from test_task_reach import reach
 import planner_jax as pj
 from planner_jax import task
 from planner_jax.core.errors import NotOffered
-from planner_jax.core.protocol import BaseAttempt, Plan, outcome
-from planner_jax.core.registry import all_tasks
+from planner_jax.core.outcome import outcome
+from planner_jax.core.protocol import BaseAttempt, Plan
+from planner_jax.core.tasks import all_tasks
 from planner_jax.planning.programs import program_key
 from tests.trees import as_numpy, assert_same
 

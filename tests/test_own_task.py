@@ -15,7 +15,7 @@ import pytest
 
 import planner_jax as pj
 from planner_jax.cli.main import main
-from planner_jax.core.registry import all_tasks
+from planner_jax.core.tasks import all_tasks
 from tests.sweeps import rows_of
 
 OWN_TASK = Path(__file__).parent / "own_task"

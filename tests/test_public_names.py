@@ -3,7 +3,7 @@
 import pytest
 
 import planner_jax as pj
-from planner_jax.core.registry import all_tasks
+from planner_jax.core.tasks import all_tasks
 
 TASKS = [getattr(pj, name) for name in all_tasks()]
 

@@ -8,7 +8,7 @@ from closed_forms import region_of
 
 import planner_jax as pj
 from planner_jax.core.protocol import is_unsolved
-from planner_jax.core.registry import all_tasks
+from planner_jax.core.tasks import all_tasks
 from planner_jax.task.hit import court
 from planner_jax.task.hit.court import landing
 from planner_jax.task.hit.spec import REAL_SCENARIOS

@@ -11,7 +11,7 @@ import pytest
 import planner_jax as pj
 from planner_jax.core import errors
 from planner_jax.core.errors import UnknownName
-from planner_jax.core.registry import all_tasks, task_named
+from planner_jax.core.tasks import all_tasks, task_named
 from planner_jax.runs.settings import WorkersFailed
 from planner_jax.task.catch.suites import draw as draw_catches
 

@@ -6,7 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from planner_jax.core.protocol import Plan, Status, index_of_best, is_better, select, select_into
+from planner_jax.core.decision import index_of_best
+from planner_jax.core.protocol import Plan, Status, is_better, select, select_into
 
 GOOD, BAD = Status.FEASIBLE, Status.MAX_STEPS
 

@@ -13,7 +13,8 @@ from matplotlib.figure import Figure
 
 import planner_jax as pj
 from planner_jax.cli.main import main
-from planner_jax.core.registry import Task, all_tasks
+from planner_jax.core.registry import Task
+from planner_jax.core.tasks import all_tasks
 from planner_jax.runs.run_folder import RunFolder
 from planner_jax.sims import loop as sims_loop
 from planner_jax.sims import settings

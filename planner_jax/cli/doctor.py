@@ -99,7 +99,7 @@ def _plans() -> Iterator[Finding]:
     import numpy as np
 
     from planner_jax.core.protocol import take
-    from planner_jax.core.registry import task_named
+    from planner_jax.core.tasks import task_named
     from planner_jax.planning.plan import plan
 
     hit = task_named("hit")

@@ -15,7 +15,7 @@ from planner_jax.cli.options import (
     warnings_in_one_line,
 )
 from planner_jax.core.errors import PlannerJaxError
-from planner_jax.core.registry import all_tasks, task_named
+from planner_jax.core.tasks import all_tasks, task_named
 from planner_jax.host import signals as stopping
 from planner_jax.live.settings import SERVED
 from planner_jax.runs.environment import find_version

@@ -11,7 +11,6 @@ from collections.abc import Callable, Sequence
 from typing import ClassVar, Generic, Protocol, Self, TypeVar
 
 import jax
-from flax import struct
 from jax import lax
 from jaxtyping import PyTree
 
@@ -248,31 +247,6 @@ class Planner(Generic[CaseT, PlanT]):
             rule = f"feasible for a {type(self).__name__}, which minimises nothing"
             raise ArgumentError("effort", rule, effort)
         return self
-
-
-@struct.dataclass
-class PlannerAround(Planner[CaseT, PlanT]):
-    """A planner that wraps one other planner for cases of the same class.
-
-    Attributes:
-        planner: the wrapped planner.
-    """
-
-    planner: Planner[CaseT, PlanT]
-
-    @property
-    def case_type(self) -> type:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """The class of the planner's cases."""
-        return self.planner.case_type
-
-    @property
-    def inner(self) -> Planner:
-        """The wrapped planner."""
-        return self.planner
-
-    def replanner(self) -> Planner:
-        """Return the planner that continues from existing plans of the wrapped planner."""
-        return self.planner.replanner()
 
 
 def require_planner(planner: object) -> None:

@@ -4,7 +4,7 @@ import dataclasses
 import enum
 import os
 from collections.abc import Sequence
-from typing import ClassVar, Protocol, Self, TypeVar, runtime_checkable
+from typing import ClassVar, Self, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +19,6 @@ from planner_jax.core.checks import (
     require_number,
     require_numbers,
     require_switch,
-    shape_of,
 )
 from planner_jax.core.choices import require_size
 from planner_jax.core.errors import ArgumentError, ArgumentTypeError
@@ -100,27 +99,6 @@ def status_of(cost: Array, violation: Array, stationary: Array | bool) -> Array:
     )
     finite = jnp.isfinite(cost) & jnp.isfinite(violation)
     return jnp.where(finite, status, Status.NON_FINITE).astype(jnp.int32)
-
-
-def outcome(cost: Array, violation: Array, *, stationary: Array | bool = True) -> dict[str, PyTree]:
-    """Return the fields that every `Plan` has, for a planner that does not iterate.
-
-    Args:
-        cost: (), the planner's own objective.
-        violation: (), largest relative excess over a limit that the planner checks.
-        stationary: () bool, whether a further search would not change the plan.
-    """
-    shape = shape_of("cost", cost)
-    for name, value in (("violation", violation), ("stationary", stationary)):
-        if shape_of(name, value) not in ((), shape):
-            raise ArgumentError(name, f"the shape of cost, {shape}", np.shape(value), verb="have")
-    cost, violation, stationary = map(jnp.asarray, (cost, violation, stationary))
-    return {
-        "cost": cost,
-        "violation": violation,
-        "iterations": jnp.zeros(shape, jnp.int32),
-        "status": status_of(cost, violation, stationary),
-    }
 
 
 @struct.dataclass
@@ -255,30 +233,6 @@ class Score:
         return dataclasses.replace(self, status=status.astype(np.int32))
 
 
-@runtime_checkable
-class Decision(Protocol):
-    """A rule that decides what a case leaves open, such as the order of its targets; a pytree.
-
-    Examples are the best of all orders, the output of a network, and a fixed order. A class may
-    inherit the defaults of `check`, `rank` and `explain`.
-    """
-
-    def check(self, cases: PyTree, /) -> None:
-        """Raise `ArgumentError` on the host if this decision is not possible for these cases."""
-
-    def propose(self, case: PyTree, /) -> PyTree:
-        """Return F choices, such as orders of the targets, best first: arrays (F, ...); pure."""
-        ...
-
-    def rank(self, plans: PyTree, /) -> Array:
-        """Return a number for each plan, by default its cost; the least one is selected; pure."""
-        return plans.cost
-
-    def explain(self, case: PyTree, status: Array, /) -> Array:
-        """Return an unsolved case's `status` (), or a status that tells the reason; pure."""
-        return status
-
-
 Tree = TypeVar("Tree")
 
 
@@ -374,13 +328,3 @@ def select_into(plans: PyTree, later: PyTree, lanes: np.ndarray) -> PyTree:
         return old
 
     return jax.tree.map(replace, plans, later)
-
-
-def index_of_best(plans: PyTree, cost: PyTree = None) -> PyTree:
-    """Return the index of the best of K plans (K, ...) per case, by `cost` or the plans' costs."""
-    xp = numpy_of(plans.status)
-    good = is_solved(plans.status)
-    finite = xp.isfinite(plans.cost) & xp.isfinite(plans.violation)
-    by_cost = xp.where(good, plans.cost if cost is None else cost, xp.inf)
-    by_violation = xp.where(finite, plans.violation, xp.inf)
-    return xp.where(good.any(axis=0), by_cost, by_violation).argmin(axis=0)

@@ -13,7 +13,6 @@ This module does not import JAX, so that names can be listed quickly.
 """
 
 import dataclasses
-import functools
 import pkgutil
 import warnings
 from collections.abc import Callable, Collection, Mapping
@@ -27,11 +26,7 @@ if TYPE_CHECKING:
 
     from planner_jax.core.planner import Planner
 
-_GROUP = "planner_jax"
-_OWN = {
-    name: f"planner_jax.task.{name}.spec:TASK"
-    for name in ("hit", "rally", "catch", "team", "intercept", "group", "block", "reach")
-}
+GROUP = "planner_jax"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -176,36 +171,6 @@ def split_name(
     return own, file
 
 
-def task_named(name: object) -> Task:
-    """Return the task with this name, of this library or another package; else `UnknownName`."""
-    tasks = all_tasks()
-    return tasks[require_name(tasks, "task", name)]
-
-
-@functools.cache
-def all_tasks() -> dict[str, Task]:
-    """Return tasks by name; other packages' tasks that fail to load are left out with a warning."""
-    tasks = {name: pkgutil.resolve_name(path) for name, path in _OWN.items()}
-    for entry in metadata.entry_points(group=f"{_GROUP}.tasks"):
-        problem = f"the name is taken by {tasks[entry.name].home}" if entry.name in tasks else ""
-        found: object = None
-        if not problem:
-            try:
-                found = entry.load()
-            except Exception as error:  # of any class: the other package raises it
-                problem = f"{type(error).__name__}: {error}"
-            else:
-                if not isinstance(found, Task) or found.name != entry.name:
-                    problem = f"it is not a Task of that name, got {found!r:.60}"
-        if isinstance(found, Task) and not problem:
-            tasks[entry.name] = found
-        else:
-            warnings.warn(
-                f"task {entry.name!r} of {entry.value} is left out: {problem}", stacklevel=2
-            )
-    return tasks
-
-
 def _other_entries(kind: str, task: str, own: Collection[str]) -> dict[str, metadata.EntryPoint]:
     """Return the entry points by which other packages add planners or suites to a task, by name.
 
@@ -213,7 +178,7 @@ def _other_entries(kind: str, task: str, own: Collection[str]) -> dict[str, meta
     out with a warning.
     """
     found = {}
-    for entry in metadata.entry_points(group=f"{_GROUP}.{kind}"):
+    for entry in metadata.entry_points(group=f"{GROUP}.{kind}"):
         of, _, name = entry.name.partition(".")
         if of == task and name in {*own, *found}:
             warnings.warn(

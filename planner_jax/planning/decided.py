@@ -10,8 +10,10 @@ from jax import Array, lax
 from jax.core import Tracer
 from jaxtyping import PyTree
 
-from planner_jax.core.planner import CaseT, Drive, Planner, PlannerAround, PlanT
-from planner_jax.core.protocol import Decision, index_of_best, is_resident, is_solved, is_unsolved
+from planner_jax.core.decision import Decision, index_of_best
+from planner_jax.core.planner import CaseT, Drive, Planner, PlanT
+from planner_jax.core.planner_around import PlannerAround
+from planner_jax.core.protocol import is_resident, is_solved, is_unsolved
 from planner_jax.planning.programs import call_packed
 
 

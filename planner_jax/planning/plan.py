@@ -1,4 +1,4 @@
-"""`plan`, for one case or a large batch on any devices, and `solve`, its pure counterpart."""
+"""`plan`, for one case or a large batch on any devices."""
 
 import dataclasses
 import time
@@ -12,7 +12,6 @@ from jax.core import Tracer
 from jaxtyping import PyTree
 
 from planner_jax.core.checks import require_scalar
-from planner_jax.core.choices import require_size
 from planner_jax.core.compiled import has_only_cpu, with_own_precision
 from planner_jax.core.errors import ArgumentError, ArgumentTypeError, NotOffered
 from planner_jax.core.origin import with_origin, without_origin
@@ -159,11 +158,15 @@ def plan(
         if watch.waits:
             rule = "left out inside compiled functions"
             raise ArgumentTypeError("time_limit and progress", rule, shown="")
+        from planner_jax.planning.solve import solve  # only compiled functions need it
+
         return solve(planner, cases)
     keep_compiled_programs()
     require_fit(planner, cases)
     if chunk is not None or devices is not None:
-        _require_layout(chunk, devices)
+        from planner_jax.planning.spread import require_layout  # by default neither is passed
+
+        require_layout(chunk, devices)
     _require_own_precision(leaves)
     alone, resident = cases.batch_shape == (), is_resident(cases)
     if not alone:
@@ -205,21 +208,6 @@ def _devices_for(
     return used if len(used) > 1 else first
 
 
-def _require_layout(chunk: object, devices: object) -> None:
-    """Raise unless `chunk` is a whole number >= 1 and `devices` are distinct devices of JAX."""
-    if chunk is not None:
-        require_size("chunk", chunk)
-    if devices is not None:
-        if not isinstance(devices, Sequence | np.ndarray) or not all(
-            isinstance(device, jax.Device) for device in devices
-        ):
-            raise ArgumentTypeError("devices", "a sequence of jax.Device", devices)
-        if not len(devices):
-            raise ArgumentError("devices", "at least one", shown="none")
-        if len(set(devices)) < len(devices):
-            raise ArgumentError("devices", "different", shown=", ".join(map(str, devices)))
-
-
 def _require_own_precision(leaves: list[PyTree]) -> None:
     """Raise `TypeError` if all floating-point arrays are float64 while JAX computes in float32."""
     if jax.config.jax_enable_x64:  # type: ignore[attr-defined]
@@ -242,51 +230,6 @@ def require_batch(cases: Case) -> int:
                 f"cases{name}", f"{batch[0]} lanes", verb="have", shown=f"shape {np.shape(leaf)}"
             )
     return batch[0]
-
-
-def solve(planner: Planner[CaseT, PlanT], cases: CaseT) -> PlanT:
-    """Plan cases as a pure function, for compiled functions, `vmap` and `scan`.
-
-    After the first attempt (search) only unsolved cases are searched again. This holds for hits,
-    catches, rallies, and every `SearchPlanner`; other planners repeat each attempt for all cases
-    while one case is unsolved. `vmap` of this function plans its lanes as one batch. As for `plan`,
-    compiled programs are stored on the disk.
-
-    Args:
-        planner: as for `plan`.
-        cases: one case or a batch, as for `plan`.
-
-    Returns:
-        The plans, with jax arrays as leaves.
-
-    Raises:
-        TypeError: the planner works on the host, or the result is differentiated: the derivative of
-            a solver's iterations is not the derivative of the optimum.
-    """
-    keep_compiled_programs()
-    require_fit(planner, cases)
-    require_pure(planner)
-    require_shapes(cases)
-    if cases.batch_shape == () and planner.kind is Kind.COMPOSITE:
-        plans = solve(planner, jax.tree.map(lambda leaf: leaf[None], cases))
-        return jax.tree.map(lambda leaf: leaf[0], plans)
-    return with_origin(_solve(planner, without_origin(cases)), cases)
-
-
-@jax.custom_jvp
-def _solve(planner: PyTree, cases: PyTree) -> PyTree:
-    """Return plans; a derivative of this function raises `TypeError`."""
-    from planner_jax.planning.pure import plan_mapped  # only compiled functions need it
-
-    return plan_mapped(Driver(is_pure=True), planner, cases)
-
-
-@_solve.defjvp
-def _raise(primals: tuple, tangents: tuple) -> tuple:
-    raise NotOffered(
-        "plan and solve cannot be differentiated: for gradients of plans there are pj.gradient, "
-        "and pj.optimal_plan inside a loss"
-    )
 
 
 @dataclasses.dataclass(frozen=True)

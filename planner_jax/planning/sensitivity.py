@@ -13,7 +13,8 @@ from jaxtyping import PyTree
 
 from planner_jax.core.errors import NotOffered
 from planner_jax.core.planner import PlanT
-from planner_jax.core.registry import Task, all_tasks
+from planner_jax.core.registry import Task
+from planner_jax.core.tasks import all_tasks
 from planner_jax.cost.quadrotor import flight_excess, flight_names, relative_excess
 from planner_jax.optimise.sensitivity import Numbers, members_of, part_of
 from planner_jax.planning.gradient import gradient

@@ -15,6 +15,8 @@ from jax import Array
 from jax.sharding import Mesh, NamedSharding, PartitionSpec, Sharding
 from jaxtyping import PyTree
 
+from planner_jax.core.choices import require_size
+from planner_jax.core.errors import ArgumentError, ArgumentTypeError
 from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import BaseAttempt, is_resident
 from planner_jax.host.threads import as_here, borrow_threads
@@ -24,6 +26,21 @@ from planner_jax.planning.resident import take_lanes
 
 # Plans the share of one device; the arguments are the device, its watch and its cases.
 Solve = Callable[[Device, Watch, PyTree], PyTree]
+
+
+def require_layout(chunk: object, devices: object) -> None:
+    """Raise unless `chunk` is a whole number >= 1 and `devices` are distinct devices of JAX."""
+    if chunk is not None:
+        require_size("chunk", chunk)
+    if devices is not None:
+        if not isinstance(devices, Sequence | np.ndarray) or not all(
+            isinstance(device, jax.Device) for device in devices
+        ):
+            raise ArgumentTypeError("devices", "a sequence of jax.Device", devices)
+        if not len(devices):
+            raise ArgumentError("devices", "at least one", shown="none")
+        if len(set(devices)) < len(devices):
+            raise ArgumentError("devices", "different", shown=", ".join(map(str, devices)))
 
 
 def plan_shares(

@@ -11,7 +11,8 @@ from jaxtyping import PyTree
 
 from planner_jax.core.choices import RECOVERIES, require_one_of
 from planner_jax.core.errors import NotOffered
-from planner_jax.core.planner import CaseT, Drive, Planner, PlannerAround, PlanT
+from planner_jax.core.planner import CaseT, Drive, Planner, PlanT
+from planner_jax.core.planner_around import PlannerAround
 from planner_jax.core.protocol import Status, is_solved
 from planner_jax.cost.moving import MovingKeepOut
 from planner_jax.optimise.planner import SearchPlanner

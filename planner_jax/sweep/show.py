@@ -7,7 +7,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from planner_jax.core.errors import ArgumentError
-from planner_jax.core.registry import all_tasks
+from planner_jax.core.tasks import all_tasks
 from planner_jax.runs.style import context
 from planner_jax.sweep.sweep import Picture, sweep_of
 from planner_jax.task.block.drawing import SIZE, draw_motion

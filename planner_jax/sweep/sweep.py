@@ -16,7 +16,8 @@ from planner_jax.core.choices import require
 from planner_jax.core.errors import ArgumentError, MissingExtra, UnknownName
 from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import Plan
-from planner_jax.core.registry import Task, task_named
+from planner_jax.core.registry import Task
+from planner_jax.core.tasks import task_named
 from planner_jax.planning.plan import plan
 from planner_jax.runs.columns import Column, RefereedBatch, leaf_columns, rows_of
 from planner_jax.runs.manifest import Entries, Row

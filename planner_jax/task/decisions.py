@@ -6,8 +6,8 @@ from collections.abc import Collection, Mapping
 import numpy as np
 from jax.typing import ArrayLike
 
+from planner_jax.core.decision import Decision
 from planner_jax.core.errors import ArgumentError, ArgumentTypeError
-from planner_jax.core.protocol import Decision
 from planner_jax.core.registry import split_name
 
 

@@ -23,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import planner_jax as pj
-from planner_jax.core.registry import all_tasks
+from planner_jax.core.tasks import all_tasks
 
 LONGEST = 20  # [s] of one call
 # Functions that compile programs, and the arguments of which one is always unusable.

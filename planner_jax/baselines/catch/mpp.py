@@ -14,8 +14,9 @@ from planner_jax.ball.target import state_at
 from planner_jax.baselines.parts.minimum_jerk import minimum_jerk_after_ramp
 from planner_jax.core.choices import require
 from planner_jax.core.errors import ArgumentError
+from planner_jax.core.outcome import outcome
 from planner_jax.core.planner import Planner
-from planner_jax.core.protocol import BaseAttempt, outcome, require_settings, take
+from planner_jax.core.protocol import BaseAttempt, require_settings, take
 from planner_jax.cost.quadrotor import relative
 from planner_jax.penalties.flight import (
     body_rate_excess,

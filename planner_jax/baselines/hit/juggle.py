@@ -11,8 +11,9 @@ from planner_jax.ball.flight import solve_impact
 from planner_jax.ball.flight_table import FlightTable
 from planner_jax.baselines.hit.common import largest_violation, make_impact, motion_excess
 from planner_jax.baselines.parts.minimum_jerk import minimum_jerk_after_ramp
+from planner_jax.core.outcome import outcome
 from planner_jax.core.planner import Planner
-from planner_jax.core.protocol import BaseAttempt, outcome, require_settings
+from planner_jax.core.protocol import BaseAttempt, require_settings
 from planner_jax.task.hit.case import HitCase
 from planner_jax.task.hit.context import HitContext, Impact, prepare_hit
 from planner_jax.task.hit.plan import HitPlan

@@ -7,8 +7,8 @@ from jax import Array
 from planner_jax.ball.flight import BallState
 from planner_jax.ball.prediction import PathTable
 from planner_jax.ball.target import BallPath, HarmonicPath, TargetPath
+from planner_jax.core.decision import Decision
 from planner_jax.core.planner import Planner
-from planner_jax.core.protocol import Decision
 from planner_jax.planning.decided import DecidedPlanner
 from planner_jax.referee.catch import CatchVerdict, referee_catches
 from planner_jax.task.arguments import judge_by

@@ -1,6 +1,6 @@
 """Public functions of the task `pj.group`: make and judge plans of a car that meets targets."""
 
-from planner_jax.core.protocol import Decision
+from planner_jax.core.decision import Decision
 from planner_jax.planning.decided import DecidedPlanner
 from planner_jax.referee.intercept import InterceptVerdict, referee_intercepts
 from planner_jax.referee.intercept_group import referee_groups

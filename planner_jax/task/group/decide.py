@@ -16,7 +16,8 @@ from flax import struct
 from jax import Array
 
 from planner_jax.core.choices import require
-from planner_jax.core.protocol import Decision, require_settings
+from planner_jax.core.decision import Decision
+from planner_jax.core.protocol import require_settings
 from planner_jax.task.decisions import require_orders
 from planner_jax.task.group.case import GroupChoice, InterceptGroup
 from planner_jax.task.group.order import Departure, improve, make_table

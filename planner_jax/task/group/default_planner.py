@@ -63,7 +63,7 @@ class GroupIntercept(Planner):
 
     def plan_once(self, cases: InterceptGroup) -> GroupPlan:
         """Return the plans that `pj.solve` makes."""
-        from planner_jax.planning.plan import solve  # only gradients need it
+        from planner_jax.planning.solve import solve  # only gradients need it
 
         return solve(self, cases)
 

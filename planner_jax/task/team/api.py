@@ -1,6 +1,6 @@
 """The public functions `planner` and `judge` of the task `pj.team`."""
 
-from planner_jax.core.protocol import Decision
+from planner_jax.core.decision import Decision
 from planner_jax.planning.decided import DecidedPlanner
 from planner_jax.recovery.with_recovery import add_recovery
 from planner_jax.referee.catch import referee_catches
