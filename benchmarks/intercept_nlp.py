@@ -41,7 +41,7 @@ import numpy as np
 
 import planner_jax as pj
 from planner_jax.benchmarks.run import Bench, argument_parser, at_least, begin
-from planner_jax.core.errors import install_line
+from planner_jax.core.missing_extra import install_line
 from planner_jax.optimise.levenberg import LevenbergConfig
 from planner_jax.referee.clearance import edges
 from planner_jax.runs.table import rate_cells

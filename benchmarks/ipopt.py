@@ -40,7 +40,7 @@ from planner_jax.baselines.protocols import BY_ROW
 from planner_jax.benchmarks.cost_gap import gap_figures
 from planner_jax.benchmarks.run import Bench, argument_parser, at_least, begin, parse_names
 from planner_jax.core.choices import EFFORTS
-from planner_jax.core.errors import install_line
+from planner_jax.core.missing_extra import install_line
 from planner_jax.core.protocol import FEASIBILITY_TOLERANCE
 from planner_jax.cost.along import BETWEEN_NODES
 from planner_jax.planning.decided import DecidedPlanner

@@ -24,6 +24,7 @@ PAGES = {
     "benchmarks/GPU_LOG.md": "gpu_log.md",
 }
 LINK = re.compile(r"(!?)\[([^\]]*)\]\((?!\w+:|#)([^)#\s]+)(#[^)\s]*)?\)")
+FIELD = re.compile(r"^ {8}(\w+): (.+(?:\n {12}.+)*)", re.MULTILINE)  # a field and its text
 CODE = re.compile(r"(^```.*?^```)", re.MULTILINE | re.DOTALL)
 
 
@@ -85,6 +86,19 @@ def public_names(package: str) -> list[str]:
     return names
 
 
+def inherited_fields(name: str) -> list[str]:
+    """Return lines with the fields that a class inherits, each with its text; none for a function.
+
+    The fields are stated in the sections "Attributes" of the docstrings of the bases.
+    """
+    package, _, own = name.rpartition(".")
+    bases = getattr(getattr(importlib.import_module(package), own), "__mro__", ())[1:]
+    sections = [(base.__doc__ or "").partition("Attributes:\n")[2] for base in bases]
+    fields = [FIELD.findall(section) for section in sections]
+    lines = [f"- `{field}`: {' '.join(text.split())}" for own in fields for field, text in own]
+    return ["Inherited fields:\n", *lines, ""] if lines else []
+
+
 def write_api() -> None:
     """Add an entry for each public function and class to the API page, below its package."""
     page = STAGE / "api.md"
@@ -96,6 +110,7 @@ def write_api() -> None:
             for name in public_names(line.removeprefix("::: ")):
                 lines.append(f"::: {name}\n    options:\n      show_root_heading: true")
                 lines.append("      heading_level: 3\n      show_root_full_path: false\n")
+                lines += inherited_fields(name)
     page.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 

@@ -2,7 +2,7 @@
 
 import importlib.util
 
-from planner_jax.core.errors import MissingExtra
+from planner_jax.core.missing_extra import MissingExtra
 
 if importlib.util.find_spec("mujoco.mjx") is None:
     raise MissingExtra("a flight", "MuJoCo MJX", "sims")

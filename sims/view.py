@@ -17,7 +17,8 @@ from typing import Any
 import numpy as np
 
 from planner_jax.core.choices import require
-from planner_jax.core.errors import ArgumentError, MissingExtra
+from planner_jax.core.errors import ArgumentError
+from planner_jax.core.missing_extra import MissingExtra
 from planner_jax.runs.style import BLUE, GREEN, GREY, INK, RED, SKY
 from planner_jax.sims.film import BALL_COLOURS
 from planner_jax.sims.guard import guard_server

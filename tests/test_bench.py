@@ -23,7 +23,7 @@ from planner_jax.benchmarks.flown_by_rotorpy import model_of, track
 from planner_jax.benchmarks.real_time import measure as measure_real_time
 from planner_jax.benchmarks.run import Bench
 from planner_jax.benchmarks.throughput import report
-from planner_jax.core import registry
+from planner_jax.core import registry, tasks
 from planner_jax.core.errors import ArgumentError
 from planner_jax.runs import style
 
@@ -165,7 +165,7 @@ def judge(cases, plans):
 @pytest.fixture
 def halving(monkeypatch):
     card = registry.Task("halve", "halves numbers", __name__, {"half": ""}, {"counted": ""})
-    monkeypatch.setattr(registry, "all_tasks", lambda: {"halve": card})
+    monkeypatch.setattr(tasks, "all_tasks", lambda: {"halve": card})
 
 
 def test_a_case_counts_in_real_time_if_its_own_plan_is_good_and_soon():
@@ -204,7 +204,7 @@ def test_costs_without_rounds_are_compared_with_those_of_the_tasks_yardstick():
 def test_a_yardstick_for_cases_of_another_class_is_none():
     cases = pj.hit.draw(2)
     plans = pj.plan(pj.hit.planner("bat-fitted"), cases)  # test_baselines compiles it, too.
-    assert cost_gaps(Half(), cases, plans, card=registry.task_named("intercept")) is None
+    assert cost_gaps(Half(), cases, plans, card=tasks.task_named("intercept")) is None
 
 
 def test_a_planner_without_rounds_has_no_iterations_to_set(halving, tmp_path):

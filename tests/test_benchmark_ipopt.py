@@ -11,7 +11,7 @@ import pytest
 
 import planner_jax as pj
 from planner_jax.benchmarks import ipopt
-from planner_jax.core.errors import install_line
+from planner_jax.core.missing_extra import install_line
 from planner_jax.cost.along import BETWEEN_NODES
 
 HAS_CASADI = importlib.util.find_spec("casadi") is not None

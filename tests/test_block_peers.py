@@ -18,7 +18,7 @@ from planner_jax.baselines.block.path_timing import PIECES, time_path
 from planner_jax.baselines.block.pose_by_pose import Goal
 from planner_jax.baselines.parts.bang_bang import bang_bang
 from planner_jax.benchmarks.block_peers import motion_torques
-from planner_jax.core.errors import MissingExtra, install_line
+from planner_jax.core.missing_extra import MissingExtra, install_line
 from planner_jax.robot.arm import REGIMES
 from planner_jax.robot.arm_dynamics import inverse_dynamics
 from planner_jax.robot.arm_file import irb1600

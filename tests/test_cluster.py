@@ -12,7 +12,8 @@ import pytest
 
 import planner_jax as pj
 from planner_jax.cli.main import main
-from planner_jax.core.errors import ArgumentError, MissingExtra, install_line
+from planner_jax.core.errors import ArgumentError
+from planner_jax.core.missing_extra import MissingExtra, install_line
 from planner_jax.host import machine
 from planner_jax.runs.run_folder import RunFolder
 from planner_jax.runs.settings import WorkersFailed

@@ -9,7 +9,8 @@ import pytest
 from flown_plans import PLANS, arm, bag, car, export_plan, matrices, pieces, quadrotor, table
 
 import planner_jax as pj
-from planner_jax.core.errors import ArgumentError, MissingExtra, install_line
+from planner_jax.core.errors import ArgumentError
+from planner_jax.core.missing_extra import MissingExtra, install_line
 from planner_jax.export import csv_rows, ros2
 from planner_jax.export.api import stream
 from planner_jax.export.crazyflie import poly4d

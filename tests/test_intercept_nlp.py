@@ -9,7 +9,7 @@ import pytest
 
 import planner_jax as pj
 from planner_jax.benchmarks import intercept_nlp
-from planner_jax.core.errors import install_line
+from planner_jax.core.missing_extra import install_line
 from planner_jax.referee.clearance import edges, separation
 from planner_jax.task.intercept.plan import make_plan
 

@@ -1,6 +1,11 @@
 """The names a user imports from the top of the package, and from a task."""
 
+import dataclasses
+import re
+
+import numpy as np
 import pytest
+from jax import Array
 
 import planner_jax as pj
 from planner_jax.core.tasks import all_tasks
@@ -48,3 +53,32 @@ def test_a_draw_says_which_suites_there_are(task):
 def test_unknown_name_is_an_attribute_error():
     with pytest.raises(AttributeError, match="attribute plans"):
         pj.plans  # noqa: B018
+
+
+def _described(kind: type) -> dict[str, str]:
+    """Return the texts of the fields in the section "Attributes" of a class's docstring."""
+    section = (kind.__doc__ or "").partition("Attributes:\n")[2]
+    return dict(re.findall(r"^ {8}(\w+): (.+)$", section, re.MULTILINE))
+
+
+def _public_dataclasses() -> list[type]:
+    packages = (pj, pj.ball, pj.live, pj.perception, *TASKS)
+    values = [getattr(package, name) for package in packages for name in package.__all__]
+    return [
+        value for value in values if isinstance(value, type) and dataclasses.is_dataclass(value)
+    ]
+
+
+@pytest.mark.parametrize("kind", _public_dataclasses(), ids=lambda kind: kind.__qualname__)
+def test_every_public_field_is_described_with_the_shape_of_an_array(kind):
+    texts = {}
+    for base in reversed(kind.__mro__):
+        own = _described(base) if "__doc__" in vars(base) else {}
+        assert own.keys() <= vars(base).get("__annotations__", {}).keys(), base
+        texts |= own
+    fields = {field.name: field for field in dataclasses.fields(kind) if field.name[0] != "_"}
+    assert fields.keys() <= texts.keys()
+    arrays = [name for name, field in fields.items() if field.type in (Array, np.ndarray)]
+    assert [
+        name for name in arrays if not re.match(r"\([^)]*\)|\[|bool|probability", texts[name])
+    ] == []

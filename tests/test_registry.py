@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import planner_jax as pj
-from planner_jax.core import errors
+from planner_jax.core import errors, missing_extra
 from planner_jax.core.errors import UnknownName
 from planner_jax.core.tasks import all_tasks, task_named
 from planner_jax.runs.settings import WorkersFailed
@@ -152,7 +152,7 @@ def test_a_suite_of_another_package_is_drawn_by_its_name(others):
 
 def test_names_are_listed_without_jax():
     code = (
-        "import sys; from planner_jax.core.registry import task_named; task = task_named('hit'); "
+        "import sys; from planner_jax.core.tasks import task_named; task = task_named('hit'); "
         "assert 'exact' in task.all_planners() and 'court' in task.all_suites(); "
         "sys.exit('jax' in sys.modules)"
     )
@@ -160,9 +160,11 @@ def test_names_are_listed_without_jax():
 
 
 def test_a_missing_extra_is_installed_from_the_checkout_or_the_index(monkeypatch, tmp_path):
-    assert errors.install_line("view") == "pip install -c constraints.txt -e '.[view]'"
-    monkeypatch.setattr(errors, "__file__", str(tmp_path / "planner_jax" / "core" / "errors.py"))
-    assert errors.install_line("view") == "pip install 'planner-jax[view]'"
+    assert missing_extra.install_line("view") == "pip install -c constraints.txt -e '.[view]'"
+    monkeypatch.setattr(
+        missing_extra, "__file__", str(tmp_path / "planner_jax" / "core" / "missing_extra.py")
+    )
+    assert missing_extra.install_line("view") == "pip install 'planner-jax[view]'"
 
 
 ERRORS = [
@@ -172,7 +174,7 @@ ERRORS = [
     errors.ArgumentTypeError("num", "a whole number", "x"),
     errors.CaseError("speed", "finite", np.float32(np.nan), (2, 0)),
     errors.UnknownName("task", "one of hit, catch", "hot"),
-    errors.MissingExtra("paper", "numba", "baselines"),
+    missing_extra.MissingExtra("paper", "numba", "baselines"),
     errors.NoRecovery("no recovery trajectory keeps the limits"),
     errors.NotOffered("DirectBlock cannot plan again"),
     WorkersFailed("workers must be able to start the run"),
@@ -180,7 +182,8 @@ ERRORS = [
 
 
 def test_errors_of_every_class_are_listed():
-    classes = {value for value in vars(errors).values() if isinstance(value, type)}
+    modules = *vars(errors).values(), *vars(missing_extra).values()
+    classes = {value for value in modules if isinstance(value, type)}
     defined = {each for each in classes if issubclass(each, errors.PlannerJaxError)}
     assert defined <= {type(error) for error in ERRORS}
 
@@ -191,6 +194,6 @@ def test_an_error_is_the_same_in_another_process(error):
     copied = pickle.loads(pickle.dumps(error))
     assert type(copied) is type(error) and str(copied) == str(error)
     assert vars(copied).keys() == vars(error).keys()
-    if isinstance(error, (errors.ArgumentError, errors.MissingExtra)):
+    if isinstance(error, (errors.ArgumentError, missing_extra.MissingExtra)):
         name = {getattr(error, "feature", error.name): "--other"}
         assert str(copied.with_names(name)) == str(error.with_names(name))

@@ -14,7 +14,8 @@ import yaml
 
 import planner_jax as pj
 from planner_jax.cli.main import main
-from planner_jax.core.errors import ArgumentError, MissingExtra, UnknownName
+from planner_jax.core.errors import ArgumentError, UnknownName
+from planner_jax.core.missing_extra import MissingExtra
 from planner_jax.robot.quadrotor_file import UNITS, RobotError, model_of, parse_numbers, to_yaml
 from planner_jax.robot.quadrotor_models import MODELS
 from planner_jax.runs.settings import settings_to_resume

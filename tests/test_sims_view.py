@@ -15,7 +15,8 @@ import pytest
 
 import planner_jax as pj
 from planner_jax.cli.main import main
-from planner_jax.core.errors import ArgumentError, install_line
+from planner_jax.core.errors import ArgumentError
+from planner_jax.core.missing_extra import install_line
 from planner_jax.runs.dataset import Dataset
 from planner_jax.runs.run_folder import RunFolder
 from planner_jax.sims import recording as recordings

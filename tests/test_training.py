@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from planner_jax.cli.main import main
-from planner_jax.core.errors import ArgumentError, install_line
+from planner_jax.core.errors import ArgumentError
+from planner_jax.core.missing_extra import install_line
 from planner_jax.planning.decided import first_choice
 from planner_jax.policies.checkpoint import save_checkpoint
 from planner_jax.policies.curves import draw_curves

@@ -7,7 +7,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from planner_jax.core.errors import install_line
+from planner_jax.core.missing_extra import install_line
 from planner_jax.host.compile_cache import LIMIT, SWITCH, cache_folder, keep_compiled_programs
 from planner_jax.host.machine import usable_cores
 from planner_jax.runs.environment import environment, require_backend

@@ -16,7 +16,8 @@ from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from typing import Any, NoReturn
 
-from planner_jax.core.errors import ArgumentError, MissingExtra, PlannerJaxError, format_value
+from planner_jax.core.errors import ArgumentError, PlannerJaxError, format_value
+from planner_jax.core.missing_extra import MissingExtra
 from planner_jax.core.registry import Task
 from planner_jax.runs.settings import SweepSettings
 

@@ -12,7 +12,8 @@ from pathlib import Path
 
 from planner_jax.baselines.block.library.options import add_commands
 from planner_jax.cli.options import Options, Parser, Unfinished, add_settings, pop_out
-from planner_jax.core.errors import ArgumentError, MissingExtra
+from planner_jax.core.errors import ArgumentError
+from planner_jax.core.missing_extra import MissingExtra
 from planner_jax.core.registry import Task
 from planner_jax.host import signals as stopping
 from planner_jax.host.compile_cache import keep_compiled_programs

@@ -3,7 +3,6 @@
 import copy
 import numbers
 from collections.abc import Mapping
-from pathlib import Path
 from typing import ClassVar, Self
 
 
@@ -82,35 +81,8 @@ class NotOffered(PlannerJaxError, TypeError):
     """A planner does not offer what is requested, such as a gradient; the text says what does."""
 
 
-class MissingExtra(PlannerJaxError, ModuleNotFoundError):
-    """A feature needs a package that is not installed; the text says how to install it.
-
-    Args:
-        feature: argument or command that needs the package.
-        package: package that is missing.
-        extra: extra of `planner-jax` that installs the package.
-    """
-
-    _names = ("feature",)
-
-    def __init__(self, feature: str, package: str | None, extra: str):
-        super().__init__(feature, package, extra)
-        self.feature, self.name = feature, package
-        self.install = install_line(extra)
-
-    def __str__(self) -> str:
-        return f"{self.feature} needs {self.name}: {self.install}"
-
-
 class NoRecovery(PlannerJaxError, ValueError):
     """Every trajectory from the end of a plan to standstill exceeds a limit, named in the text."""
-
-
-def install_line(extra: str) -> str:
-    """Return the command that installs an extra (optional packages), in a checkout or elsewhere."""
-    if (Path(__file__).parents[2] / "pyproject.toml").is_file():
-        return f"pip install -c constraints.txt -e '.[{extra}]'"
-    return f"pip install 'planner-jax[{extra}]'"
 
 
 def format_value(value: object) -> str:

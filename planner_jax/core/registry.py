@@ -39,22 +39,19 @@ class Task:
         name: name of the task on the command line.
         summary: one line about the task, without a full stop.
         home: name of the module with the functions `case`, `draw`, `planner` and `judge`.
-        planners: for each planner's name, the class or function that makes the planner; the default
-            planner is the first one.
-        suites: for each suite's name, a sentence about its cases; the default suite is the first
-            one.
-        from_file: for each planner that reads a file, as in "library:motions.bin", the command that
-            writes the file.
+        planners: class or function that makes each planner, by name; the default planner is the
+            first.
+        suites: a sentence about the cases of each suite, by name; the default suite is the first.
+        from_file: command that writes the file of each planner that reads one, such as "library".
         sweep: name of the class with the settings of the task's sweeps (runs of many cases).
-        flight: name of the class with the settings of the task's simulated flights; None: the task
-            has none.
+        flight: class with the settings of the task's simulated flights; None: no flights.
         single: name of the class with the options of `planner-jax plan`, which specify one case;
             None: no such command.
         bench: keyword arguments with which speed benchmarks call `planner`.
         contact: dotted name of the contact times in a plan, such as "stroke.time".
-        yardstick: keyword arguments of `planner`. They select the planner with whose costs the
-            costs of other planners are compared; empty: no such planner. Planners that minimise a
-            cost are compared with a longer search of their own.
+        yardstick: keyword arguments of `planner` for the planner with whose costs others are
+            compared; empty: none. Planners that minimise a cost are compared with a longer search
+            of their own.
     """
 
     name: str

@@ -40,11 +40,18 @@ class KeepOut:
 
 @struct.dataclass
 class _Box:
+    """A box along the world's axes.
+
+    Attributes:
+        low: (3,) [m], least coordinates.
+        high: (3,) [m], greatest coordinates.
+    """
+
     rules: ClassVar[Table] = (Field("low", None, below("high")),)
     positions: ClassVar[dict] = {"low": (), "high": ()}
 
-    low: Numbers  # (3,) [m]
-    high: Numbers  # (3,) [m]
+    low: Numbers
+    high: Numbers
 
 
 @struct.dataclass

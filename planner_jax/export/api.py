@@ -9,13 +9,8 @@ from pathlib import Path
 
 from planner_jax.core.checks import require_path_name
 from planner_jax.core.choices import RECOVERIES, require, require_one_of
-from planner_jax.core.errors import (
-    ArgumentError,
-    MissingExtra,
-    NoRecovery,
-    UnknownName,
-    format_value,
-)
+from planner_jax.core.errors import ArgumentError, NoRecovery, UnknownName, format_value
+from planner_jax.core.missing_extra import MissingExtra
 from planner_jax.core.protocol import Plan
 from planner_jax.core.rules import Case
 from planner_jax.export.setpoints import DEFAULT_RATE, joints_of, require_one, robot_of

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import PyTree
 
-from planner_jax.core.errors import MissingExtra
+from planner_jax.core.missing_extra import MissingExtra
 from planner_jax.core.protocol import Plan
 from planner_jax.export.frames import rotate
 from planner_jax.export.setpoints import DEFAULT_RATE, Joints, joints_of, setpoints_of

@@ -100,9 +100,8 @@ class NewtonConfig:
         tolerance: predicted relative decrease of the cost below which a problem is stationary.
         trusted: greatest damping at which a predicted decrease is reliable.
         patience: number of iterations without progress after which a problem is stationary.
-        slack: rounding error of a cost, in units of machine epsilon times the cost. A step may
-            raise the cost by this error; such a step counts as progress if the predicted decrease
-            halves.
+        slack: rounding error of a cost, in units of machine epsilon times the cost. A step that
+            raises the cost by less counts as progress if the predicted decrease halves.
         stragglers: size of a group as a fraction of the batch, number of iterations of a group, and
             greatest number of groups. After `max_steps`, unfinished problems continue in groups, by
             falling predicted decrease; None: no problem continues.

@@ -27,7 +27,8 @@ from typing import NamedTuple
 
 import yaml
 
-from planner_jax.core.errors import ArgumentTypeError, MissingExtra, PlannerJaxError
+from planner_jax.core.errors import ArgumentTypeError, PlannerJaxError
+from planner_jax.core.missing_extra import MissingExtra
 from planner_jax.host.files import open_plain
 from planner_jax.host.yaml_files import Value, read_fields
 from planner_jax.robot.quadrotor_model import (

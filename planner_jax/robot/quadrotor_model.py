@@ -38,8 +38,7 @@ class Tool:
         height: [m], height of the disc's centre above the propeller plane.
         radius: [m], radius of the disc.
         restitution: coefficient of restitution beta of a racket.
-        max_angle: [rad], greatest angle theta_safe between a net's axis and the ball's reversed
-            velocity.
+        max_angle: [rad], greatest angle theta_safe of a net's axis to the ball's reversed velocity.
     """
 
     kind: str

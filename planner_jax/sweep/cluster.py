@@ -21,7 +21,8 @@ import jax
 import jax.numpy as jnp
 
 from planner_jax.core.choices import require
-from planner_jax.core.errors import ArgumentError, MissingExtra
+from planner_jax.core.errors import ArgumentError
+from planner_jax.core.missing_extra import MissingExtra
 from planner_jax.host import signals as stopping
 from planner_jax.host.compile_cache import keep_compiled_programs
 from planner_jax.host.machine import threads_of_a_computation

@@ -13,7 +13,8 @@ from jaxtyping import PyTree
 from matplotlib.figure import Figure
 
 from planner_jax.core.choices import require
-from planner_jax.core.errors import ArgumentError, MissingExtra, UnknownName
+from planner_jax.core.errors import ArgumentError, UnknownName
+from planner_jax.core.missing_extra import MissingExtra
 from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import Plan
 from planner_jax.core.registry import Task

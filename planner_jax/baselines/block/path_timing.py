@@ -10,7 +10,7 @@ from types import ModuleType
 
 import numpy as np
 
-from planner_jax.core.errors import MissingExtra
+from planner_jax.core.missing_extra import MissingExtra
 
 PIECES = 128  # greatest number of polynomial pieces of a timed motion
 DEGREE = 6  # degree of a piece: a cubic in the path length, which is quadratic in time

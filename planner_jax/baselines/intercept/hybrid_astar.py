@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from planner_jax.core.choices import require
-from planner_jax.core.errors import MissingExtra
+from planner_jax.core.missing_extra import MissingExtra
 from planner_jax.plane.obstacles import Obstacles
 
 _DISCS = 3  # number of discs that cover the car's body

@@ -68,8 +68,7 @@ class HitLimits:
     """Limits on speed at impact and on the returned ball's apex [Yu2023bat, eqs 18f and 18g].
 
     Attributes:
-        hitting_speed: (3,) [m/s], greatest speed of the quadrotor at the impact on each axis of the
-            world.
+        hitting_speed: (3,) [m/s], greatest speed of the quadrotor at the impact on each world axis.
         min_apex: () [m], least height of the apex of the returned ball.
         max_apex: () [m], greatest height of the apex of the returned ball.
     """

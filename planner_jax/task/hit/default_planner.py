@@ -126,9 +126,8 @@ class HitProblem(ChainProblem[HitCase, HitPlan]):
     on apex and hitting speed [Yu2023bat, eqs 21 and 24a].
 
     Attributes:
-        proportions: durations of the trajectory's polynomial pieces, relative to each other. The
-            first pieces are short, so that the jerk can change fast and a hovering quadrotor starts
-            to turn early.
+        proportions: relative durations of the trajectory's polynomial pieces. The first pieces are
+            short, so that the jerk can change fast and a hovering quadrotor starts to turn early.
         nodes: number of intervals of each piece, at whose ends penalties are evaluated.
         time_weight: weight of the time of the impact.
         energy_weight: [s^8/m^2], weight of the integral of |snap|^2.

@@ -25,6 +25,7 @@ from jax import Array, lax
 
 from planner_jax.core import protocol
 from planner_jax.core.choices import EFFORTS, require, require_one_of
+from planner_jax.core.decision import index_of_best
 from planner_jax.core.planner import Planner
 from planner_jax.core.shapes import fit_resident
 from planner_jax.task.intercept.case import InterceptCase
@@ -212,7 +213,7 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
         direct = problem.guess_directly(case, attempt.is_late)
         guesses = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), direct, guesses)
         plans = jax.vmap(solve_from)(guesses)
-        best = protocol.index_of_best(plans)
+        best = index_of_best(plans)
         plan = jax.tree.map(lambda leaf: leaf[best], plans)
         plan = problem.refine_solved(case, field, plan, late)
         return self._explain(case, attempt, found.is_reached, plan)
