@@ -228,7 +228,7 @@ def test_pairs_and_solved_programs_are_among_the_compared_speed_planners(name):
     assert weights == ({None, 300.0} if name == "PAPER" else {None})
 
 
-@pytest.mark.parametrize("name", ["qu-2", "qu-4", "bat-7"])
+@pytest.mark.parametrize("name", paper_figures.FIGURES)
 def test_a_figure_of_a_paper_has_its_axes_and_the_same_data_each_time(name):
     drawing, again = (paper_figures.FIGURES[name](30, 0) for _ in range(2))
     assert drawing.to_csv() == again.to_csv()
@@ -252,6 +252,36 @@ def test_only_the_uniform_drive_of_the_figure_of_speeds_enters_an_obstacle():
         lower, upper = (np.interp(times, box.x[:2], each) for each in (box.y[:2], box.y[:1:-1]))
         met[name] |= bool(((station > lower) & (station < upper)).any())
     assert met == {"uniform": True, "EM": False, "lines of the paper": False}
+
+
+@pytest.mark.parametrize(
+    ("plan", "panels", "judge"),
+    [
+        (paper_figures.plan_hits, paper_figures.HIT_PANELS, pj.hit.judge),
+        (paper_figures.plan_three_catches, paper_figures.CATCH_PANELS, pj.catch.judge),
+        (paper_figures.plan_throws, paper_figures.CATCH_PANELS, pj.catch.judge),
+    ],
+)
+def test_the_peaks_of_a_figure_of_flights_are_the_referees(plan, panels, judge):
+    flights = plan(30, 0)
+    curves = paper_figures.draw_flights(flights, panels).curves
+    peaks = {(each.name, each.panel): each.y for each in curves}
+    for name, (cases, plans) in flights.items():
+        verdict = judge(cases, plans)
+        for panel in {"speed", "body rate", "thrust"}.intersection(panels):
+            (peak,) = getattr(verdict, f"max_{panel.replace(' ', '_')}")
+            assert peaks[name, panel].max() == pytest.approx(peak, rel=1e-3)
+
+
+def test_the_figure_of_mpp_has_the_time_of_the_planner_catch_and_exceeds_a_limit(monkeypatch):
+    flights = paper_figures.plan_throws(30, 0)
+    (case, catch), (_, mpp) = flights.values()
+    np.testing.assert_array_equal(catch.times, mpp.times)
+    assert not pj.catch.judge(case, mpp).success.any()
+    good = SimpleNamespace(success=np.ones(30, bool))
+    monkeypatch.setattr(pj.catch, "judge", lambda *_, **__: good)
+    with pytest.raises(LookupError, match="^no throw of 30 has the required outcomes$"):
+        paper_figures.plan_throws(30, 0)
 
 
 def test_a_figure_of_speeds_without_a_suitable_problem_says_so(monkeypatch):
