@@ -16,6 +16,7 @@ no latest time of a catch, so a further column has the rate without this limit (
 """
 
 import argparse
+import dataclasses
 import functools
 import time
 from typing import Any
@@ -42,7 +43,7 @@ def run_row(bench: Bench, suite: str, name: str, options: argparse.Namespace) ->
     warm = time.perf_counter() - began
     verdict = pj.catch.judge(cases, plans)
     protocol = functools.partial(pj.catch.judge, plans=plans, tolerance=0.05, net_test="ball")
-    ever = cases.replace(horizon=np.full_like(cases.horizon, np.inf))
+    ever = dataclasses.replace(cases, horizon=np.full_like(cases.horizon, np.inf))
     success, gaps = verdict.success, cost_gaps(planner, cases, plans)
     bench.count(success, gaps)
     ratio = pj.catch.optimal_time_ratio(cases, plans)
