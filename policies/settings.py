@@ -10,11 +10,13 @@ from planner_jax.task.catch.spec import SUITES
 
 _MOST_DECISIONS = 1e12  # greatest accepted number of decisions in one part of a training
 _CASE_BYTES = 20_000  # [bytes] estimated memory of one case in a batch
+PUBLISHED = "published"  # name of the policy of [Yu2023catch, Section IV]
 NETWORK_NAMES = ("attention", "mlp")  # names of the policy networks that can be trained
 # Default weights of the terms of the reward: whether the case is solved, earlier last catch, ratio
 # of decided and planned catch times, more catches, and greatest relative excess over a limit.
 WEIGHTS = {"solved": 1.0, "last": 5.0, "ratio": -5.0, "caught": 5.0, "violation": -0.5}
 LEARNING_RATE = 1e-4  # default learning rate at the start of each part of a training
+LEAST_TIME = 0.3  # [s], least time of a catch that the policy `published` proposes
 _PAPER = ("parabola1", "parabola2", "harmonic2", "triangle3", "hexagon6")
 
 
