@@ -36,6 +36,8 @@ from planner_jax.trajectory.polynomial import evaluate, sample_pieces
 
 SCALE = 4.0  # [m], [m/s]: divisor of the observed positions and velocities
 TOLERANCE = 0.05  # relative excess over a limit that counts as kept, as in the authors' C++ code
+# The arguments of `pj.catch.judge` for the rule of success of [Yu2023catch].
+PAPER_RULE: dict[str, Any] = {"tolerance": TOLERANCE, "net_test": "ball"}
 _NODES = 16  # number of intervals per polynomial piece at whose ends the limits are checked
 
 
