@@ -55,34 +55,27 @@ def draw_policy(suite: str, seed: int, t_min: float) -> PublishedPolicy:
 
 
 def train_all(options: argparse.Namespace, suite: str) -> list[Path]:
-    """Train the networks of a suite that are missing, and return the folders of finished trainings."""
+    """Train the missing networks of a suite; return the folders of finished trainings."""
     folders = [Path(options.trained) / f"{suite}-{seed}" for seed in range(options.seeds)]
     if options.train:
         from planner_jax.policies.training import published_training, train  # needs Brax
 
         for seed, folder in enumerate(folders):
-            asked = published_training(
-                suite,
-                (options.decisions,),
-                options.num_envs,
-                iterations=(options.iterations,),
-                seed=seed,
-                starts="random",
-                t_min=options.t_min,
-                eval_cases=0,
-            )
-            train(asked, folder)
+            how = {"seed": seed, "iterations": (options.iterations,), "t_min": options.t_min}
+            size = (options.decisions,), options.num_envs
+            train(published_training(suite, *size, **how, starts="random", eval_cases=0), folder)
     return [folder for folder in folders if (folder / "policy.npz").exists()]
 
 
-def measure(cases: Any, decision: Any) -> dict[str, Any]:
+def measure(bench: Bench, cases: Any, decision: Any) -> dict[str, Any]:
     """Plan cases from a decision; return rates, the OTR, and the half width of its interval."""
     plans = pj.plan(DecidedPlanner(paper_planner(), decision), cases)
     good = pj.catch.judge(cases, plans, **PAPER_RULE).success
     ratio = pj.catch.optimal_time_ratio(cases, plans)[good]
     spread = 1.96 * ratio.std(ddof=1) / np.sqrt(good.sum()) if good.sum() > 1 else np.nan
+    bench.count(accepted := pj.catch.judge(cases, plans).success)
     return {
-        "accepted": pj.catch.judge(cases, plans).success,
+        "referee": accepted.mean(),
         "rule": good.mean(),
         "rule_95": wilson_interval(int(good.sum()), len(good)),
         "ratio": ratio.mean() if good.any() else np.nan,
@@ -110,12 +103,9 @@ def run_suite(bench: Bench, suite: str, options: argparse.Namespace) -> None:
         drawn = pj.catch.draw(options.num, suite, options.seed, starts=starts)
         cases: Any = jax.tree.map(np.asarray, drawn)
         for name, some in decisions.items():
-            rows = [measure(cases, decision) for decision in some]
-            for row in rows:
-                bench.count(row["accepted"])
-                row["referee"] = row.pop("accepted").mean()
-            if not rows:
+            if not some:
                 continue
+            rows = [measure(bench, cases, decision) for decision in some]
             learned = rewards if name == "policy:published" else []
             bench.row(suite=suite, starts=starts, decide=name, seeds=rows, rewards=learned)
             rates = [span([100.0 * row[key] for row in rows], 1) for key in ("rule", "referee")]
@@ -148,6 +138,7 @@ def main() -> None:
     if options.num_envs % 25:
         parser.error(f"argument --num-envs: must be a multiple of 25, got {options.num_envs}")
     with begin(parser, options) as bench:
+        pj.keep_compiled_programs()  # all seeds of a suite are trained by the same program
         bench.say(
             f"{options.num} cases each, seed {options.seed}, {jax.devices()[0]}",
             "| suite | starts | decision | rule | referee | OTR | reward | published rate "

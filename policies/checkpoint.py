@@ -51,13 +51,8 @@ def save_checkpoint(
         about: suites (families of cases) and seed of the training, as JSON values.
     """
     name, sizes = name_and_sizes(network)
-    head = {
-        "format": FORMAT,
-        "features": num_features(network),
-        "network": name,
-        "sizes": sizes,
-        **about,
-    }
+    features = num_features(network)
+    head = {"format": FORMAT, "features": features, "network": name, "sizes": sizes, **about}
     flat = traverse_util.flatten_dict(params, sep="/")
     arrays: Any = {key: np.asarray(leaf, np.float32) for key, leaf in flat.items()}
     with replacing(path) as scratch, open(scratch, "wb") as file:

@@ -84,8 +84,7 @@ class PublishedMlp(nn.Module):
     def __call__(self, seen: Array) -> Array:
         """Map observations (..., 10 + 6 N) to mean (N) and logarithm (N) of the deviation."""
         mean = nn.Dense(self.size)(_apply_relu_layers(self.width, seen))
-        start = nn.initializers.constant(np.log(0.5))
-        log_std = self.param("log_std", start, (self.size,))
+        log_std = self.param("log_std", nn.initializers.constant(np.log(0.5)), (self.size,))
         return jnp.concatenate([mean, jnp.broadcast_to(log_std, mean.shape)], axis=-1)
 
 

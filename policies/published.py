@@ -84,8 +84,7 @@ def times_of(
         t_max: (N,) [s], greatest time of the catch of each target.
         present: (N,) bool, whether each target exists; absent targets are last in the order.
     """
-    middle, half = 0.5 * (t_max + t_min), 0.5 * (t_max - t_min)
-    wanted = jnp.clip(middle + half * action, t_min, t_max)
+    wanted = jnp.clip(t_min + 0.5 * (t_max - t_min) * (1.0 + action), t_min, t_max)
     order = jnp.argsort(jnp.where(present, wanted, jnp.inf), stable=True).astype(jnp.int32)
     steps = jnp.asarray(INSTANT * np.arange(wanted.size), wanted.dtype)
     rising = lax.cummax(wanted[order] - steps)
@@ -104,21 +103,16 @@ def published_reward(
 ) -> Array:
     """Return the reward () of one decision [Yu2023catch, eq. 8].
 
-    With the symbols of the paper, r = l_n (e^(n - N) - e^-N) - l_c ln J - l_t |T_p - T_o|. The
-    gradient of the last term is zero at T_p = T_o.
-
-    Args:
-        caught: () n, number of caught targets.
-        total: () N, number of all targets.
-        cost: () J > 0, cost of the planned trajectory [Yu2023catch, eq. 18].
-        decided: (N,) T_p [s], times of the catches by the policy.
-        optimised: (N,) T_o [s], times of the catches by the planner, in the same order.
-        weights: the coefficients l_n, l_c and l_t.
+    It is r = l_n (e^(n - N) - e^-N) - l_c ln J - l_t |T_p - T_o|. Of N = `total` () targets
+    n = `caught` () are caught, and J = `cost` () > 0 is the cost of the planned trajectory
+    [Yu2023catch, eq. 18]. T_p = `decided` (N,) and T_o = `optimised` (N,) [s] are the times of the
+    catches before and after planning, in the same order. The gradient of the last term is zero at
+    T_p = T_o.
     """
     caught, total, cost = (jnp.asarray(each, decided.dtype) for each in (caught, total, cost))
-    catches = jnp.exp(caught - total) - jnp.exp(-total)
-    change = length(decided - optimised)
-    return weights.caught * catches - weights.cost * jnp.log(cost) - weights.time * change
+    catches = weights.caught * (jnp.exp(caught - total) - jnp.exp(-total))
+    change = weights.time * length(decided - optimised)
+    return catches - weights.cost * jnp.log(cost) - change
 
 
 def count_caught(case: CatchCase, plan: CatchPlan, tolerance: float = TOLERANCE) -> Array:
@@ -161,10 +155,7 @@ class PublishedPolicy(CatchDecision):
         require_number("t_min", self.t_min, POSITIVE)
 
     def check(self, cases: CatchCase) -> None:
-        """Raise `ValueError` unless the cases have the network's number of targets, all required.
-
-        The error is an `ArgumentError`.
-        """
+        """Raise `ValueError` unless the cases have the network's number of required targets."""
         size, num = self.network.size, cases.num_targets
         require(num == size, "cases", f"cases of {size} targets for this policy", num)
         require(not cases.optional, "cases", "cases without optional targets for this policy", True)

@@ -50,7 +50,6 @@ class PublishedEnv(CatchEnv):
         self,
         suite: str,
         planner: SearchPlanner,
-        *,
         t_min: float = LEAST_TIME,
         weights: RewardWeights = USUAL_WEIGHTS,
         starts: str = "random",
@@ -60,9 +59,8 @@ class PublishedEnv(CatchEnv):
 
     def _score(self, cases: tuple[CatchCase, ...], action: Array) -> tuple[Array, dict[str, Array]]:
         (drawn,) = cases
-        choices = jax.vmap(times_of, (0, None, 0, 0))(
-            action, self.t_min, drawn.horizon, drawn.present
-        )
+        decide = jax.vmap(times_of, (0, None, 0, 0))
+        choices = decide(action, self.t_min, drawn.horizon, drawn.present)
         decided = drawn.with_choice(choices)
         plans = self.planner.solve_lanes(decided, self.planner.attempts[0])
         num = jax.vmap(count_caught)(decided, plans)
@@ -80,9 +78,8 @@ class PublishedEnv(CatchEnv):
             "caught": num,
             "violation": plans.violation,
         }
-        clip = lambda term: jnp.nan_to_num(jnp.asarray(term, jnp.float32), nan=2.0)  # noqa: E731
-        reward = jnp.nan_to_num(reward, nan=_LEAST_REWARD)
-        return jnp.maximum(reward, _LEAST_REWARD), jax.tree.map(clip, terms)
+        reward = jnp.maximum(jnp.nan_to_num(reward, nan=_LEAST_REWARD), _LEAST_REWARD)
+        return reward, {k: jnp.nan_to_num(1.0 * term, nan=2.0) for k, term in terms.items()}
 
     def _observe(self, cases: tuple[CatchCase, ...]) -> Array:
         return jax.vmap(observe_published)(cases[0])

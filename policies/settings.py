@@ -67,15 +67,14 @@ class TrainSettings:
             known = ", ".join(SUITES)
             require(suite in SUITES, "suite", f"one or more of {known}", suite)
         require_one_of(("extended", PUBLISHED), "policy", self.policy)
-        known = (None, *NETWORK_NAMES)
-        require(self.network in known, "network", " or ".join(NETWORK_NAMES), self.network)
+        network = self.network
+        require(network in (None, *NETWORK_NAMES), "network", " or ".join(NETWORK_NAMES), network)
         require_one_of(STARTS, "starts", self.first_states)
         if self.policy == PUBLISHED:
             rule = "one suite in which every target must be caught, for the policy `published`"
             alone = len(self.suites) == 1 and not SUITES[self.suite].optional
             require(alone, "suite", rule, self.suite)
-            rule = "left out for the policy `published`"
-            require(self.network is None, "network", rule, self.network)
+            require(network is None, "network", "left out for the policy `published`", network)
         for each in self.decisions:
             rule = f"from 1 to {_MOST_DECISIONS:g} in each part"
             require(1.0 <= each <= _MOST_DECISIONS, "decisions", rule, each)

@@ -45,7 +45,7 @@ from planner_jax.policies.checkpoint import checkpoint_of, name_and_sizes, save_
 from planner_jax.policies.curves import draw_curves
 from planner_jax.policies.environment import CatchEnv
 from planner_jax.policies.kept import KeptParts
-from planner_jax.policies.networks import KINDS, LEAST_STD, PublishedMlp, Value
+from planner_jax.policies.networks import LEAST_STD, NETWORKS, PublishedMlp, Value
 from planner_jax.policies.observation import FEATURES, PER_TARGET
 from planner_jax.policies.policy import Policy
 from planner_jax.policies.progress import SETTINGS, Progress, read_settings, report_terms
@@ -168,10 +168,9 @@ def _train_parts(
 
 
 def _network(training: Training) -> Any:
-    sizes = (
-        {"size": SUITES[training.suites[0]].num_targets} if training.network == PUBLISHED else {}
-    )
-    return KINDS[training.network](**sizes)
+    if training.network == PUBLISHED:
+        return PublishedMlp(SUITES[training.suites[0]].num_targets)
+    return NETWORKS[training.network]()
 
 
 def _decision(training: Training, network: Any, params: Any) -> CatchDecision:
@@ -205,19 +204,12 @@ def published_training(
 
 def train_from_settings(settings: TrainSettings, out: str | os.PathLike) -> CatchDecision:
     """Train a policy with the options of `planner-jax train`; calls `train`."""
-    given: dict[str, Any] = dict(
-        seed=settings.seed,
-        init_from=settings.init_from,
-        eval_cases=settings.eval_cases,
-        starts=settings.first_states,
-    )
+    given = {name: getattr(settings, name) for name in ("seed", "init_from", "eval_cases")}
+    given["starts"] = settings.first_states
     if settings.policy == PUBLISHED:
         lanes = (settings.num_envs or 100) // _MINIBATCH * _MINIBATCH
-        rate = settings.learning_rate
-        training = published_training(
-            settings.suite, settings.parts, lanes, learning_rate=rate, **given
-        )
-        return train(training, out)
+        given["learning_rate"] = settings.learning_rate
+        return train(published_training(settings.suite, settings.parts, lanes, **given), out)
     lanes = settings.num_envs or (510 if jax.default_backend() == "cpu" else 8190)
     minibatches = 6
     # The cases are divided evenly among the suites and among the minibatches.
@@ -248,9 +240,8 @@ def evaluate_policy(training: Training, network: Any, params: Any) -> dict[str, 
     decided = DecidedPlanner(planner, _decision(training, network, params))
     figures = {}
     for suite in training.suites:
-        cases: Any = jax.tree.map(
-            np.asarray, draw(training.eval_cases, suite, _EVAL_SEED, starts=training.starts)
-        )
+        drawn = draw(training.eval_cases, suite, _EVAL_SEED, starts=training.starts)
+        cases: Any = jax.tree.map(np.asarray, drawn)
         plans = plan(decided, cases)
         good = judge(cases, plans, **PAPER_RULE).success if published else are_solved(plans)
         figures[suite] = {
@@ -288,7 +279,7 @@ def _record_settings(folder: Path, training: Training) -> None:
 
 def _first_params(training: Training, network: Any) -> Any:
     env = _environment(training, training.parts[0])
-    nets = _factory(network, env.size)()
+    nets = _networks(network, env.size)
     one, other = jax.random.split(jax.random.key(training.seed))
     size = specs.Array((env.observation_size,), jnp.dtype("float32"))
     normaliser = running_statistics.init_state(size)
@@ -314,10 +305,8 @@ def _words(network: Any) -> str:
 def _environment(training: Training, part: Part) -> CatchEnv:
     weights: dict[str, Any] = dict(training.weights)
     if training.network == PUBLISHED:
-        (suite,), own = training.suites, RewardWeights(**weights)
-        planner = paper_planner(*part.iterations)
-        how: dict[str, Any] = {"t_min": training.t_min, "starts": training.starts}
-        return PublishedEnv(suite, planner, weights=own, **how)
+        planner, own = paper_planner(*part.iterations), RewardWeights(**weights)
+        return PublishedEnv(training.suites[0], planner, training.t_min, own, training.starts)
     iterations = part.iterations or (0,) * len(training.suites)
     return CatchEnv(training.suites, iterations, weights, training.starts)
 
@@ -357,7 +346,7 @@ def _train_part(
         num_updates_per_batch=training.updates,
         clipping_epsilon=0.2,
         max_grad_norm=1.0,
-        network_factory=_factory(network, env.size),
+        network_factory=functools.partial(_networks, network, env.size),
         seed=training.seed * 1000 + number,
         restore_params=params,
         run_evals=False,
@@ -370,13 +359,9 @@ def _train_part(
     return jax.device_get(found)
 
 
-def _factory(network: Any, size: int) -> Callable[..., ppo_networks.PPONetworks]:
-    if isinstance(network, PublishedMlp):
-        return lambda *_, **__: published_networks(network)
-    return functools.partial(_networks, network, size)
-
-
 def _networks(network: Any, size: int, *_: Any, **__: Any) -> ppo_networks.PPONetworks:
+    if isinstance(network, PublishedMlp):
+        return published_networks(network)
     value = Value()
 
     def unflatten(flat: Array) -> Array:

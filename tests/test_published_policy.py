@@ -145,15 +145,8 @@ def test_caught_targets_are_those_that_the_referee_accepts_by_the_rule_of_the_pa
         heads = jnp.concatenate([case.head_state[None], tails[:-1]])
         pieces = jax.vmap(minco)(heads, tails, jnp.zeros((3, 0, 3)), durations[:, None])
         path = PiecewisePolynomial(coeffs=pieces.coeffs[:, 0], durations=durations)
-        zero = jnp.zeros(())
-        return CatchPlan(
-            trajectory=path,
-            gravity=case.gravity,
-            order=order,
-            decided_times=times,
-            times=times,
-            **pending(zero),
-        )
+        own = {"order": order, "decided_times": times, "times": times}
+        return CatchPlan(trajectory=path, gravity=case.gravity, **own, **pending(jnp.zeros(())))
 
     plans = plan_of(cases, order, durations, tails)
     widest = np.linspace(1.3, 1.8, NUM, dtype=np.float32)
