@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 
 import planner_jax as pj
 from planner_jax import benchmarks
-from planner_jax.benchmarks import paper_figures
+from planner_jax.benchmarks import paper_figures, published_policy
 from planner_jax.benchmarks.cost_gap import cost_gaps, gap_figures
 from planner_jax.benchmarks.first_plan import ROWS as FIRST_PLANS
 from planner_jax.benchmarks.first_plan import plan_in_new_process
@@ -70,6 +70,21 @@ def test_a_robot_of_rotorpy_has_the_thrusts_of_its_plan_and_turns_to_the_feedbac
 
 def read(folder, name="manifest.json"):
     return json.loads((folder / name).read_text())
+
+
+def test_decisions_are_compared_on_the_same_cases(tmp_path, monkeypatch):
+    options = "--suites parabola1 --starts random --num 16 --seeds 2 --trained none --out".split()
+    monkeypatch.setattr("sys.argv", ["published_policy", *options, str(tmp_path / "run")])
+    published_policy.main()
+    rows = {row["decide"]: row["seeds"] for row in read(tmp_path / "run", "rows.json")}
+    assert {name: len(seeds) for name, seeds in rows.items()} == {
+        **{"greedy": 1, "best": 1, "policy": 1},
+        "untrained": 2,
+    }
+    assert rows["greedy"] == rows["best"] and rows["untrained"][0] != rows["untrained"][1]
+    for row in (row for seeds in rows.values() for row in seeds):
+        assert 0.0 <= row["referee"] <= row["rule"] and row["rule"] >= 0.5 and row["ratio"] > 0.0
+    assert read(tmp_path / "run")["summary"]["num"] == 5 * 16
 
 
 def test_a_run_folder_says_what_was_run_where_and_with_what_success(tmp_path, capsys):

@@ -91,6 +91,11 @@ bench throughput --devices 1000              | --devices must
 bench throughput --batch 16 0                | --batch must be >= 1
 robots nobody                                | robot must be one of
 train --suite x                              | --suite must be one or more of
+train --starts moving                        | --starts must be one of hover, random
+train --policy x                             | --policy must be one of extended, published
+train --policy published                     | --suite must be one suite in which every target
+train --policy published --suite swarm8      | --suite must be one suite in which every target
+train --policy published --suite hexagon6 --network mlp | --network must be left out
 view folder --port x                         | --port must be a whole number, got 'x'
 report gone                                  | RUN must be
 nobody                                       | nobody
