@@ -27,6 +27,7 @@ from planner_jax.sweep.block.settings import BlockSettings
 from planner_jax.sweep.block.sweep import BlockSweep
 from planner_jax.task.block.spec import TASK
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
+from tests.trees import assert_same
 
 LIMITS = REGIMES["R2"].limits
 # Planner options for scenes without a pole: 6 control points, and up to 20 s of search a throw.
@@ -251,17 +252,38 @@ def test_the_best_spline_of_one_joint_takes_nearly_the_least_time_of_its_control
     least = np.sqrt(turn / (limit * -far.fun))
     goal = np.array(case.angles) + turn * np.eye(6)[5]
     planner, free = pj.block.planner("insat", **QUICK), FreeSpace(case, 0.0)
-    first = State(np.asarray(case.angles, float), 0.0, spline=np.asarray(case.angles)[None])
+    planner.compile(case)
 
     def spline_within(available):
-        end = State(goal, np.inf, first)
-        return planner.best_spline(case, free, Goal(goal, available), end, True)
+        end, aim = goal.astype(float), Goal(goal, available)
+        first = planner.open_states(case, aim).pop()
+        return planner.lifts(case, free, aim, [State(end, np.inf, first[0])], True)
 
-    points, time, length, _ = spline_within(1.0)
-    np.testing.assert_allclose(points[[0, 1, -2, -1]], [case.angles] * 2 + [goal] * 2, atol=1e-6)
-    assert 0.999 * least <= time <= 1.1 * least
-    assert length == pytest.approx(turn, rel=1e-3)
-    assert spline_within(0.99 * least) is None
+    (found,) = spline_within(1.0)
+    ends = found.points[[0, 1, -2, -1]]
+    np.testing.assert_allclose(ends, [case.angles] * 2 + [goal] * 2, atol=1e-6)
+    assert 0.999 * least <= found.time <= 1.1 * least
+    assert found.length == pytest.approx(turn, rel=1e-3)
+    assert not spline_within(0.99 * least)
+
+
+def test_pinsat_of_width_one_is_insat_and_wider_searches_are_confirmed():
+    """A pole stands between the arm and some balls, so that searches expand states."""
+    cases = jax.tree.map(np.array, pj.block.draw(3, "pole", seed=0, regime="R1"))
+    options = {"points": 4, "budget": 10.0, "longest": 10.0}
+    one, same, wide, late = (
+        pj.plan(pj.block.planner(name, **options, **more), cases)
+        for name, more in (
+            ("insat", {}),
+            ("pinsat", {"width": 1}),
+            ("pinsat", {"width": 4}),
+            ("insat", {"lift": "expansion"}),
+        )
+    )
+    assert_same(one, same)
+    for plans in (one, wide, late):
+        assert pj.are_solved(plans).any()
+        np.testing.assert_array_equal(pj.block.judge(cases, plans).success, pj.are_solved(plans))
 
 
 @pytest.mark.parametrize("name", ["direct", "insat", "epase"])
