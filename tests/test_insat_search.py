@@ -11,6 +11,7 @@ from scipy.sparse.csgraph import dijkstra
 from planner_jax.baselines.block.b_spline import basis, hodograph
 from planner_jax.baselines.block.epase import OpenStates, State, find_path, is_independent
 from planner_jax.baselines.block.insat import InsatBlock, Terms, _optimise
+from planner_jax.baselines.block.library.insat_pairs import find_steps
 from planner_jax.core.errors import ArgumentError
 from planner_jax.optimise.lbfgs import LbfgsConfig
 
@@ -184,6 +185,20 @@ def test_splines_have_the_least_cost_that_slsqp_finds_and_the_least_time_in_clos
     assert optimise(ends, (1.0, 0.0))[0][1] == pytest.approx(
         np.sqrt(48 * 0.2 / (11 * ACCELERATION)), rel=1e-3
     )
+
+
+@pytest.mark.parametrize("rests", [True, False])
+def test_a_stored_motion_ends_where_its_spline_ends_and_reaches_a_limit(rests):
+    points = np.random.default_rng(1).normal(size=(7, 6))
+    points[1] = points[0]
+    points[-2] = points[-1] if rests else points[-2]
+    steps, duration = find_steps(points, 10, VELOCITY, np.full(6, ACCELERATION))
+    knots = np.concatenate([np.zeros((1, 6)), steps])
+    turned = 0.05 * (knots[1:] + knots[:-1]).sum(axis=0)
+    np.testing.assert_allclose(points[0] + turned, points[-1], atol=1e-12)
+    assert not rests or np.abs(steps[-1]).max() < 1e-12
+    rates, rises = np.abs(steps) / duration, 10 * np.abs(np.diff(knots, axis=0)) / duration**2
+    assert max(np.max(rates / VELOCITY), np.max(rises / ACCELERATION)) == pytest.approx(1, abs=1e-3)
 
 
 @pytest.mark.parametrize(
