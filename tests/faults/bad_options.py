@@ -80,6 +80,7 @@ serve hit --robot nobody                     | --robot must be
 library build new --home 1                   | --home must be six angles
 library build new --home nan nan nan nan nan nan | --home must be finite
 library build new --layout x                 | --layout must be one of
+library build new --planner rrt              | --planner must be one of
 library repair junk --pole 1 --out new       | --pole
 library check junk --num 0                   | --num must be >= 1
 bench throughput --planner mpp               | --planner must be one of exact, bat .. got 'mpp'
