@@ -275,7 +275,7 @@ def test_the_best_spline_of_one_joint_takes_nearly_the_least_time_of_its_control
 def test_pinsat_of_width_one_is_insat_and_wider_searches_are_confirmed():
     """A pole stands between the arm and some balls, so that searches expand states."""
     cases = jax.tree.map(np.array, pj.block.draw(3, "pole", seed=0, regime="R1"))
-    options = {"points": 4, "budget": 10.0, "longest": 10.0}
+    options = {"points": 4, "budget": 4.0, "longest": 4.0}
     one, same, wide, late = (
         pj.plan(pj.block.planner(name, **options, **more), cases)
         for name, more in (
@@ -285,7 +285,8 @@ def test_pinsat_of_width_one_is_insat_and_wider_searches_are_confirmed():
             ("insat", {"lift": "expansion"}),
         )
     )
-    assert_same(one, same)
+    solved = np.flatnonzero(pj.are_solved(one))
+    assert_same(pj.take(one, solved), pj.take(same, solved))
     for plans in (one, wide, late):
         assert pj.are_solved(plans).any()
         np.testing.assert_array_equal(pj.block.judge(cases, plans).success, pj.are_solved(plans))
