@@ -29,9 +29,10 @@ class FlightCases:
         return len(self.index)
 
     def __getitem__(self, rows: Any) -> Self:
-        """Return the cases that a NumPy index selects."""
+        """Return the cases that a NumPy index selects; numbers that all cases share remain."""
         fields = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
-        return type(self)(**jax.tree.map(lambda leaf: leaf[rows], fields))
+        pick = lambda leaf: leaf[rows] if np.ndim(leaf) else leaf  # noqa: E731
+        return type(self)(**jax.tree.map(pick, fields))
 
 
 @dataclasses.dataclass(frozen=True)
