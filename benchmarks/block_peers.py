@@ -1,11 +1,15 @@
 """Compare all block planners on the same throws, beside Tables I and II of [Natarajan2024].
 
-    python -m benchmarks.block_peers [--suite pole] [--regime R1] [--num 100] [--out DIR]
+    python -m benchmarks.block_peers [--suite pole] [--regime R1] [--num 100] [--width W]
 
 A robot arm blocks thrown balls with a shield. A ball counts as blocked only if the referee, an
 independent check in float64, accepts the plan, whatever the planner reports. The column `found`
 counts motions without a collision, even if they are too late for the ball. One call plans one throw
 on one core, from NumPy arrays to NumPy arrays. Compile time is not counted.
+
+`insat-expansion` computes a spline for each expanded state instead of each edge of the search. The
+last table has the states that the searches of `insat` and `pinsat` expand in a second of planning.
+With --width, `pinsat` and `epase` expand up to W states at once; on a GPU wide batches pay.
 
 For the column `with query time`, the planning time and the motion must together fit between the
 time at which the arm may start and the contact. Motions of `online` and `brisk` always end at the
@@ -36,6 +40,9 @@ from flax import struct
 from jax import Array
 
 import planner_jax as pj
+from planner_jax.baselines.block.epase import OpenStates
+from planner_jax.baselines.block.insat import InsatBlock
+from planner_jax.baselines.block.pose_by_pose import Goal
 from planner_jax.baselines.protocols import BY_ROW
 from planner_jax.benchmarks.run import Bench, argument_parser, begin, parse_names
 from planner_jax.core import GRAVITY
@@ -44,6 +51,7 @@ from planner_jax.robot.arm import Arm
 from planner_jax.robot.arm_dynamics import inverse_dynamics
 from planner_jax.runs.timing import measure_plans
 from planner_jax.sweep.block.settings import REGIMES
+from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.plan import BlockPlan
 from planner_jax.task.block.spec import SUITES
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate, total_duration
@@ -63,7 +71,10 @@ PLANNERS: dict[str, tuple[str, dict[str, Any]]] = {
     "epase": ("epase", {}),
     "epase-plain": ("epase", {"patient": False, "longest": 2.0}),
     "insat": ("insat", {}),
+    "insat-expansion": ("insat", {"lift": "expansion"}),
+    "pinsat": ("pinsat", {}),
 }
+OF_WIDTH = ("pinsat", "epase")  # planners with the option --width
 NEED_PEERS = ("rrt-connect", "epase")
 LASTS_UNTIL_CONTACT = ("online", "brisk")
 # [%] Quantile of the planning times of `online` and `brisk`. They plan for an arm that starts later
@@ -260,6 +271,41 @@ def table_of_torques(bench: Bench, outcomes: dict[str, Outcome], common: np.ndar
                 )
 
 
+def count_expansions(planner: Any, cases: Any) -> tuple[int, float, float, int]:
+    """Plan throws one by one; return expanded states, seconds, median cost and number of plans.
+
+    The median is over the motions [s] in time for the ball.
+    """
+    opened: list[OpenStates] = []
+
+    class Counted(type(planner)):
+        def open_states(self, case: BlockCase, goal: Goal) -> OpenStates:
+            opened.append(super().open_states(case, goal))
+            return opened[-1]
+
+    counted = Counted(**vars(planner))
+    plans, seconds = measure_plans(counted, cases)
+    solved = pj.are_solved(plans)
+    expanded = sum(states.num_expanded for states in opened)
+    median = float(np.median(np.asarray(plans.cost)[solved])) if solved.any() else np.nan
+    return expanded, float(seconds.sum()), median, int(solved.sum())
+
+
+def table_of_expansions(bench: Bench, planners: dict[str, Any], cases: Any, warm: Any) -> None:
+    """Print how many states the searches of INSAT expand in a second, planning time included."""
+    bench.say("", "| search | width | solved | median motion [s] | expansions/s | s a plan |")
+    bench.say("|---|---|---|---|---|---|")
+    for name, planner in planners.items():
+        pj.plan(planner, pj.take(warm, 0))
+        expanded, seconds, median, solved = count_expansions(planner, cases)
+        rate, num = expanded / seconds, cases.batch_shape[0]
+        bench.say(
+            f"| {name} | {planner.width} | {solved} of {num} | {median:.4f} | {rate:.1f} "
+            f"| {seconds / num:.3f} |"
+        )
+        bench.row(table="expansions", planner=name, width=planner.width, rate=rate, cost=median)
+
+
 def main() -> None:
     parser = argument_parser("block_peers", __doc__, num=100, seed=0)
     parser.add_argument("--suite", choices=list(SUITES), default="pole", help="default: pole")
@@ -275,6 +321,7 @@ def main() -> None:
     parser.add_argument(
         "--planners", default=",".join(PLANNERS), help="names, comma-separated; default: all"
     )
+    parser.add_argument("--width", type=int, help="states expanded at once by pinsat and epase")
     options = parser.parse_args()
     names = parse_names(parser, "--planners", options.planners, PLANNERS)
     if not 0.0 <= options.delay < np.inf:
@@ -294,16 +341,20 @@ def main() -> None:
             "",
         )
         names = leave_out_missing(bench, names)
-        outcomes = {}
+        outcomes, searches = {}, {}
         for name in names:
             kind, changes = PLANNERS[name]
+            if options.width is not None and kind in OF_WIDTH:
+                changes = changes | {"width": options.width}
             lasts = kind in LASTS_UNTIL_CONTACT
-            outcomes[name] = run_planner(
-                pj.block.planner(kind, **changes), cases, warm, lasts=lasts
-            )
+            planner: Any = pj.block.planner(kind, **changes)
+            outcomes[name] = run_planner(planner, cases, warm, lasts=lasts)
+            if isinstance(planner, InsatBlock):
+                searches[name] = planner
         common = np.all([one.verdict.success for one in outcomes.values()], axis=0)
         table_of_rates(bench, outcomes, common)
         table_of_torques(bench, outcomes, common)
+        table_of_expansions(bench, searches, cases, warm)
         bench.count(outcomes[names[0]].verdict.success)
 
 

@@ -11,14 +11,18 @@ and uses the best plan. The planners are `exact`, the default; `catch`, which re
 The referee, an independent check in float64, judges every plan with a relative tolerance of 1e-3.
 The planner `catch` treats limits as penalties, so its plans exceed limits slightly. Every plan is
 therefore judged a second time by the protocol of the published C++ program, which accepts limits
-exceeded by up to 5 % and requires the ball within the net's radius of its centre.
+exceeded by up to 5 % and requires the ball within the net's radius of its centre. The paper states
+no latest time of a catch, so a further column has the rate without this limit ("at any time").
 """
 
 import argparse
+import dataclasses
+import functools
 import time
 from typing import Any
 
 import jax
+import numpy as np
 
 import planner_jax as pj
 from planner_jax.baselines.catch.published import find_number
@@ -38,7 +42,8 @@ def run_row(bench: Bench, suite: str, name: str, options: argparse.Namespace) ->
     plans = pj.plan(planner, cases)
     warm = time.perf_counter() - began
     verdict = pj.catch.judge(cases, plans)
-    loose = pj.catch.judge(cases, plans, tolerance=0.05, net_test="ball")
+    protocol = functools.partial(pj.catch.judge, plans=plans, tolerance=0.05, net_test="ball")
+    ever = dataclasses.replace(cases, horizon=np.full_like(cases.horizon, np.inf))
     success, gaps = verdict.success, cost_gaps(planner, cases, plans)
     bench.count(success, gaps)
     ratio = pj.catch.optimal_time_ratio(cases, plans)
@@ -50,7 +55,8 @@ def run_row(bench: Bench, suite: str, name: str, options: argparse.Namespace) ->
         "seed": seed,
         "success": success.mean(),
         "wilson_95": wilson_interval(int(success.sum()), num),
-        "success_protocol": loose.success.mean(),
+        "success_protocol": protocol(cases).success.mean(),
+        "success_protocol_any_time": protocol(ever).success.mean(),
         "caught": verdict.num_caught.mean() / SUITES[suite].num_targets,
         "optimal_time_ratio": ratio[success].mean() if success.any() else None,
         "mean_last_catch": plans.times[success, -1].mean() if success.any() else None,
@@ -79,9 +85,9 @@ def main() -> None:
         bench.say(
             f"{options.num} cases each, seed {options.seed}, decide {options.decide}, "
             f"{jax.devices()[0]}",
-            "| suite | planner | success | 95 % | by the protocol | paper | OTR | last catch "
-            "| warm |",
-            "|---|---|---|---|---|---|---|---|---|",
+            "| suite | planner | success | 95 % | by the protocol | at any time | paper | OTR "
+            "| last catch | warm |",
+            "|---|---|---|---|---|---|---|---|---|---|",
         )
         for suite, name in ((suite, name) for suite in suites for name in names):
             row = run_row(bench, suite, name, options)
@@ -93,6 +99,7 @@ def main() -> None:
             bench.say(
                 f"| {suite} | {name} | {100 * row['success']:.2f} % | "
                 f"{100 * low:.2f}..{100 * high:.2f} | {100 * row['success_protocol']:.2f} % | "
+                f"{100 * row['success_protocol_any_time']:.2f} % | "
                 f"{find_number('success', suite) or '-'} | {ratio} | {last} s | "
                 f"{row['warm_seconds']:.2f} s |"
             )

@@ -7,6 +7,7 @@ again for the ball that is then nearer. The program compares ways to write this 
 steps:
 * a Python loop that calls `pj.plan` for all robots in each step;
 * one compiled `lax.scan` over the steps, with `pj.solve` of all robots in each step;
+* the same with only the first two attempts of the planner, or only the first one;
 * `jax.vmap` of the compiled loop of a single robot, which calls `pj.solve`;
 * a Python loop and a scan that make first plans, and in each step re-plan by `pj.replan`.
 
@@ -46,9 +47,9 @@ def advance(case: PyTree, plan: PyTree) -> PyTree:
     return case.replace(head_state=jnp.stack(state), targets=targets, horizon=case.horizon - PERIOD)
 
 
-def plan_anew(move: Move, cases: PyTree) -> tuple[PyTree, PyTree]:
+def plan_anew(move: Move, cases: PyTree, planner: pj.Planner = PLANNER) -> tuple[PyTree, PyTree]:
     """Plan cases from scratch; return the cases one period later, and (cases, plans)."""
-    plans = pj.plan(PLANNER, cases)  # `pj.solve` inside a compiled function
+    plans = pj.plan(planner, cases)  # `pj.solve` inside a compiled function
     return move(cases, plans), (cases, plans)
 
 
@@ -91,10 +92,18 @@ def ways(steps: int) -> dict[str, Callable[[PyTree], tuple[PyTree, PyTree]]]:
     )
     anew_on_host = functools.partial(plan_anew, on_host)
     again_on_host = functools.partial(plan_again, on_host)
+    few = {}
+    for num in (2, 1):
+        planner = pj.catch.planner("exact", attempts=pj.catch.CatchProblem.attempts[:num])
+        anew_by = functools.partial(anew, planner=planner)
+        few[f"scan, pj.solve, attempts[:{num}]"] = jax.jit(
+            lambda cases, step=anew_by: scan(step, cases, steps)
+        )
     alone = jax.vmap(lambda case: scan(each, case, steps), out_axes=1)
     return {
         "Python loop, pj.plan": lambda cases: loop(anew_on_host, cases, steps),
         "scan, pj.solve of the batch": jax.jit(lambda cases: scan(anew, cases, steps)),
+        **few,
         "vmap of a scan, pj.solve": jax.jit(alone),
         "Python loop, pj.replan": lambda cases: loop(again_on_host, with_first_plans(cases), steps),
         "scan, pj.replan of the batch": jax.jit(

@@ -1,15 +1,16 @@
 """Measure success of catches and hits in closed-loop simulation of quadrotors.
 
     python -m benchmarks.fly_rows [--num 1000] [--seed 0] [--limit 300]
-                                  [--rows exact,catch,hit,hit-once,ablate,published]
+                          [--rows exact,catch,hit,hit-once,ablate,published,robot-filter]
 
 The option --rows selects groups of lines: `exact` without noise, `catch` and `hit` with noise,
 `hit-once` for hits that are planned once, at several times after the serve, `ablate`, which leaves
-out one part of the control loop at a time, and `published`, which estimates the balls as the papers
-do. The noise is `lab`, that is the noise of a motion-capture hall, with a latency of 20 ms. The
-initial estimate of the ball's drag is 15 % too large or too small. Catches are re-planned 100 times
-per second. Hits are re-planned 50 times per second or, as in [Yu2023bat], not at all. A flight of
-several balls succeeds if all balls are caught.
+out one part of the control loop at a time, `published`, which estimates the balls by the default
+observers and as the papers do, and `robot-filter`, in which the quadrotor's own state has random
+errors or comes from a Kalman filter. The noise is `lab`, that is the noise of a motion-capture
+hall, with a latency of 20 ms. The initial estimate of the ball's drag is 15 % too large or too
+small. Catches are re-planned 100 times per second. Hits are re-planned 50 times per second or, as
+in [Yu2023bat], not at all. A flight of several balls succeeds if all balls are caught.
 
 Each line prints the success rate with its 95 % Wilson interval, and the required rate if there is
 one. Every simulation runs twice, and the time of the second run, without compilation, is printed.
@@ -33,7 +34,7 @@ import numpy as np
 from planner_jax.core.protocol import are_solved
 from planner_jax.runs.summary import percent, wilson_interval
 from planner_jax.sims.loop_state import Flown, Loop
-from planner_jax.sims.noise import NOISES
+from planner_jax.sims.noise import NOISES, RobotSensing
 from planner_jax.sims.tasks.catch import CATCH_WORLD, CatchFlights, fly_catches, throws
 from planner_jax.sims.tasks.hit import HIT_WORLD, SEEN, HitFlights, fly_hits, volleys
 from planner_jax.task import catch, hit
@@ -133,12 +134,13 @@ def prediction_errors(flown: Flown) -> None:
     for low, high in HORIZONS:
         chosen = error[(horizon > low) & (horizon < high)]
         if chosen.size:
-            p50, p99 = (
+            p50, p99, most = (
                 np.array2string(100.0 * np.quantile(chosen, q, axis=0), precision=1)
-                for q in (0.5, 0.99)
+                for q in (0.5, 0.99, 1.0)
             )
             print(
-                f"  prediction {low:g} to {high:g} s ahead, |x| |y| |z|: p50 {p50} cm, p99 {p99} cm"
+                f"  prediction {low:g} to {high:g} s ahead, |x| |y| |z|: p50 {p50} cm, "
+                f"p99 {p99} cm, greatest {most} cm"
             )
 
 
@@ -328,14 +330,26 @@ def ablation_rows(args: Any) -> None:
 
 
 def published_rows(args: Any) -> None:
-    """Print lines for catches and hits whose balls the published observers estimate."""
-    loop = Loop(CATCH_WORLD, LAB, replan=CATCH_RATE, observer="linear", record=True)
-    if flights := catches("lab, one ball, published observer", loop, args, DRAG_ERROR):
-        prediction_errors(flights.flown)
-    loop = Loop(HIT_WORLD, LAB, replan=HIT_RATE, observer="rls", record=True)
-    title = "lab, S.1, published observer"
-    if flights := hits(title, loop, REAL_SCENARIOS["S.1"], args, DRAG_ERROR):
-        prediction_errors(flights.flown)
+    """Print lines for catches and hits whose balls the default and published observers estimate."""
+    for observer in ("energy", "linear"):
+        loop = Loop(CATCH_WORLD, LAB, replan=CATCH_RATE, observer=observer, record=True)
+        if flights := catches(f"lab, one ball, observer {observer}", loop, args, DRAG_ERROR):
+            prediction_errors(flights.flown)
+    regions = REAL_SCENARIOS["S.1"]
+    for observer in ("energy", "rls"):
+        loop = Loop(HIT_WORLD, LAB, replan=HIT_RATE, observer=observer, record=True)
+        if flights := hits(f"lab, S.1, observer {observer}", loop, regions, args, DRAG_ERROR):
+            prediction_errors(flights.flown)
+
+
+def filter_rows(args: Any) -> None:
+    """Print lines for catches and hits without and with a filter of the quadrotor's own state."""
+    for sensing in (None, RobotSensing()):
+        own = f"own state {'with random errors' if sensing is None else 'by a filter'}"
+        loop = Loop(CATCH_WORLD, LAB, replan=CATCH_RATE, robot_filter=sensing)
+        catches(f"lab, one ball, {own}", loop, args, DRAG_ERROR)
+        loop = Loop(HIT_WORLD, LAB, replan=HIT_RATE, robot_filter=sensing)
+        hits(f"lab, S.1, {own}", loop, REAL_SCENARIOS["S.1"], args, DRAG_ERROR)
 
 
 ROWS = {
@@ -345,6 +359,7 @@ ROWS = {
     "hit-once": once_rows,
     "ablate": ablation_rows,
     "published": published_rows,
+    "robot-filter": filter_rows,
 }
 
 

@@ -1,13 +1,17 @@
 """Draw figures of the papers from runs of this library: the data as CSV, and a PNG.
 
-    python -m benchmarks.paper_figures [qu-2] [qu-4] [bat-7] [--out DIR]
+    python -m benchmarks.paper_figures [qu-2] [qu-4] [bat-7] [catch-6] [catch-7] [--out DIR]
 
 * qu-2: predicted paths of a straight and a curved target [Qu2022, Fig. 2].
 * qu-4: station, speed and acceleration of a uniform drive, of EM and of the lines of [Qu2022], past
   moving obstacles [Qu2022, Fig. 4], on the first of `--num` own problems where the uniform drive
   hits an obstacle and the other two plans are good.
-* bat-7: height, body rate, velocity and thrust of three planners on one serve of S.6, with ten
-  times the limits for `bat-lite` and `juggle`, as in the paper [Yu2023bat, Fig. 7].
+* bat-7: height, body rate, speed and thrust of three planners on one serve of S.6, with ten times
+  the limits for `bat-lite` and `juggle`, as in the paper [Yu2023bat, Fig. 7].
+* catch-6: speed, body rate, thrust and jerk of one plan of `exact` with three catches, instead of
+  the paper's recorded flight [Yu2023catch, Fig. 6].
+* catch-7: the same for `catch`, and for `mpp` with the catching time of `catch`, on the first of
+  `--num` throws where `catch` succeeds by the paper's rule and `mpp` fails [Yu2023catch, Fig. 7].
 
 Without names all figures are drawn, into the run folder. The CSV has one line for each point of a
 curve, with the panel, the curve, x and y. The printed table has the greatest values of all curves.
@@ -17,6 +21,7 @@ import csv
 import dataclasses
 import io
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -24,6 +29,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import planner_jax as pj
+from planner_jax.baselines.catch.mpp import MppCatch
 from planner_jax.baselines.intercept.speed import plan_speed
 from planner_jax.benchmarks.intercept_prediction import NOISE, TIMES, sample_path
 from planner_jax.benchmarks.intercept_speed import PAPER, constant_speed, judge, planners
@@ -32,9 +38,22 @@ from planner_jax.benchmarks.speed_problems import speed_problems
 from planner_jax.core.protocol import is_solved
 from planner_jax.runs import style
 from planner_jax.sims.prediction.polynomial_fit import fit_polynomial
+from planner_jax.task.catch.context import CatchContext
 
 COLOURS = (style.BLUE, style.ORANGE, style.GREEN, style.PURPLE)
-OBSTACLE, POINTS = "obstacle", "observed"  # beginnings of the names of filled curves, and of points
+# Beginning of the names of filled curves, names of points, and the name of dashed lines.
+OBSTACLE, POINTS, LIMIT = "obstacle", ("observed", "catches"), "limit"
+# Panels of flights: label of the y axis, field of a flight, and names of its limits.
+QUANTITIES = {
+    "height": ("z [m]", "height", ()),
+    "speed": ("|v| [m/s]", "vel", ("speed",)),
+    "body rate": ("|ω| [rad/s]", "body_rate", ("body_rate",)),
+    "thrust": ("|τ| [m/s²]", "thrust", ("min_thrust", "max_thrust")),
+    "jerk": ("|j| [m/s³]", "jerk", ()),
+}
+HIT_PANELS = ("height", "body rate", "speed", "thrust")
+CATCH_PANELS = ("speed", "body rate", "thrust", "jerk")
+STEPS = 1000  # number of intervals between the samples of a flight
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,7 +87,7 @@ class Drawing:
 def draw_panels(figure: Figure, drawing: Drawing) -> None:
     """Draw all panels side by side; curves of one name have one colour."""
     names = {curve.name: None for curve in drawing.curves if not curve.name.startswith(OBSTACLE)}
-    colours = dict(zip(names, (style.INK, *COLOURS), strict=False))
+    colours = dict(zip(names, (style.INK, *COLOURS), strict=False)) | {LIMIT: style.RED}
     every = np.atleast_1d(figure.subplots(1, len(drawing.panels)))
     for axes, (panel, labels) in zip(every, drawing.panels.items(), strict=True):
         style.label(axes, *labels, title=panel)
@@ -76,7 +95,7 @@ def draw_panels(figure: Figure, drawing: Drawing) -> None:
             if curve.name.startswith(OBSTACLE):
                 axes.fill(curve.x, curve.y, color=style.PALE)
             else:
-                line = "o" if curve.name.startswith(POINTS) else "-"
+                line = "o" if curve.name in POINTS else "--" if curve.name == LIMIT else "-"
                 look: style.Look = {"color": colours[curve.name], "markersize": 4.0}
                 axes.plot(curve.x, curve.y, line, label=curve.name, **look)
     figure.legend(*every[0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
@@ -140,32 +159,82 @@ def draw_speeds(num: int, seed: int) -> Drawing:
     return Drawing({name: ("t [s]", label) for name, label in panels.items()}, curves)
 
 
-def draw_hits(_: int, seed: int) -> Drawing:
-    """Plan one serve of S.6 by three planners; the limits are relaxed for two of them."""
-    panels = {
-        "height": "z [m]",
-        "body rate": "|ω| [rad/s]",
-        "velocity": "|v| [m/s]",
-        "thrust": "|τ| [m/s²]",
-    }
-    curves = []
+@jax.tree_util.register_static
+@dataclasses.dataclass(frozen=True)
+class TimedMpp(MppCatch):
+    """The planner `mpp` with catches at the times of each case, and not at a fixed height."""
+
+    def times(self, context: CatchContext) -> tuple[jax.Array, jax.Array]:
+        """Return the times of the case (N,) [s], and violations (N,) of -1: none is missed."""
+        return context.times, jnp.full_like(context.times, -1.0)
+
+
+def plan_hits(_: int, seed: int) -> dict[str, tuple[Any, Any]]:
+    """Plan one serve of S.6 by three planners; return by planner a batch of one case and plan."""
+    found = {}
     for name, scale in (("bat", 1.0), ("bat-lite", 10.0), ("juggle", 10.0)):
         case = pj.hit.draw(1, "S.6", seed, limit_scale=scale)
-        plan = pj.plan(pj.hit.planner(name), case)
-        flight = jax.tree.map(np.asarray, pj.take(plan, 0)).sample(100.0)
-        rate, speed = (np.linalg.norm(each, axis=1) for each in (flight.body_rate, flight.vel))
-        values = (flight.pos[:, 2], rate, speed, flight.thrust)
-        curves += [
-            Curve(panel, name, flight.time, each)
-            for panel, each in zip(panels, values, strict=True)
-        ]
-    return Drawing({name: ("t [s]", label) for name, label in panels.items()}, curves)
+        found[name] = case, pj.plan(pj.hit.planner(name), case)
+    return found
+
+
+def plan_three_catches(_: int, seed: int) -> dict[str, tuple[Any, Any]]:
+    """Plan the catches of three targets; return a batch of one case and plan."""
+    case = pj.catch.draw(1, "triangle3", seed)
+    return {"exact": (case, pj.plan(pj.catch.planner(), case))}
+
+
+def plan_throws(num: int, seed: int) -> dict[str, tuple[Any, Any]]:
+    """Plan a throw by `catch`, and by `mpp` with the same time; return batches of one.
+
+    Raises:
+        LookupError: on none of `num` throws `catch` succeeds and `mpp` fails.
+    """
+    cases = pj.catch.draw(num, "paper-throws", seed)
+    plans = pj.plan(pj.catch.planner("catch"), cases)
+    timed = pj.plan(TimedMpp(), dataclasses.replace(cases, times=plans.times))
+    good, other = (
+        pj.catch.judge(cases, each, tolerance=0.05, net_test="ball").success
+        for each in (plans, timed)
+    )
+    if not (good & ~other).any():
+        raise LookupError(f"no throw of {num} has the required outcomes")
+    lane = int(np.argmax(good & ~other))
+    one = lambda tree: jax.tree.map(lambda leaf: leaf[lane : lane + 1], tree)  # noqa: E731
+    return {"catch": (one(cases), one(plans)), "mpp": (one(cases), one(timed))}
+
+
+def draw_flights(flights: dict[str, tuple[Any, Any]], panels: tuple[str, ...]) -> Drawing:
+    """Draw quantities of flights over time, and the limits of the first case as dashed lines.
+
+    `flights` has a batch of one case and plan by name, and `panels` names keys of `QUANTITIES`.
+    """
+    limits, curves, end = next(iter(flights.values()))[0].limits, [], 0.0
+    for name, (_, plans) in flights.items():
+        plan = jax.tree.map(np.asarray, pj.take(plans, 0))
+        flight = plan.sample(STEPS / float(np.sum(plan.trajectory.durations)))
+        end, catches = max(end, flight.time[-1]), getattr(plan, "times", np.zeros(0))
+        for panel in panels:
+            field = QUANTITIES[panel][1]
+            value = flight.pos[:, 2] if field == "height" else getattr(flight, field)
+            size = np.linalg.norm(value, axis=1) if value.ndim == 2 else value
+            curves.append(Curve(panel, name, flight.time, size))
+            if catches.size > 1:
+                at = np.interp(catches, flight.time, size)
+                curves.append(Curve(panel, "catches", catches, at))
+    for panel in panels:
+        for field in QUANTITIES[panel][2]:
+            if (limit := getattr(limits, field)) is not None:
+                curves.append(Curve(panel, LIMIT, np.array([0.0, end]), np.tile(limit, 2)))
+    return Drawing({name: ("t [s]", QUANTITIES[name][0]) for name in panels}, curves)
 
 
 FIGURES: dict[str, Callable[[int, int], Drawing]] = {
     "qu-2": draw_predictions,
     "qu-4": draw_speeds,
-    "bat-7": draw_hits,
+    "bat-7": lambda num, seed: draw_flights(plan_hits(num, seed), HIT_PANELS),
+    "catch-6": lambda num, seed: draw_flights(plan_three_catches(num, seed), CATCH_PANELS),
+    "catch-7": lambda num, seed: draw_flights(plan_throws(num, seed), CATCH_PANELS),
 }
 
 

@@ -12,7 +12,7 @@ The tasks are `hit`, `rally`, `catch`, `team`, `intercept`, `group`, `block` and
 
 * `plan`: plans one case or a batch, on all devices; `solve`: plans inside `jax.jit` or `jax.vmap`
 * `keep_compiled_programs`: stores on disk programs that are compiled before the first plan;
-  `quick_options`: compiler options with which loops over single cases compile faster on a CPU
+  `quick_options`: makes XLA compile faster on a CPU; `explain`: prints what compiles it anew
 * `replan`: updates a plan while a robot executes it
 * `gradient`: differentiates one number of every plan by parts of its case; `sensitivity`: the main
   numbers by all parts; `optimal_plan`: a plan that `jax.grad` can differentiate in a loss function

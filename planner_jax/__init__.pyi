@@ -42,6 +42,7 @@ from .plane.obstacles import Obstacles as Obstacles
 from .plane.target import ControlledPath as ControlledPath
 from .plane.target import PolynomialPath as PolynomialPath
 from .plane.target import TurningPath as TurningPath
+from .planning.explain import explain as explain
 from .planning.gradient import gradient as gradient
 from .planning.plan import Progress as Progress
 from .planning.plan import plan as plan

@@ -20,8 +20,7 @@ from planner_jax.core.checks import require_path_name
 from planner_jax.core.errors import ArgumentError, format_value
 from planner_jax.core.plan_files import UNREADABLE, name_damage, read_archive
 from planner_jax.host.files import LARGEST, replacing
-from planner_jax.policies.networks import NETWORKS
-from planner_jax.policies.observation import FEATURES
+from planner_jax.policies.networks import KINDS, num_features
 
 FORMAT = 2  # version number of the format of checkpoints
 # Names of the trained policies in the package: "catch" is trained on eight suites (families of
@@ -52,7 +51,8 @@ def save_checkpoint(
         about: suites (families of cases) and seed of the training, as JSON values.
     """
     name, sizes = name_and_sizes(network)
-    head = {"format": FORMAT, "features": FEATURES, "network": name, "sizes": sizes, **about}
+    features = num_features(network)
+    head = {"format": FORMAT, "features": features, "network": name, "sizes": sizes, **about}
     flat = traverse_util.flatten_dict(params, sep="/")
     arrays: Any = {key: np.asarray(leaf, np.float32) for key, leaf in flat.items()}
     with replacing(path) as scratch, open(scratch, "wb") as file:
@@ -60,8 +60,8 @@ def save_checkpoint(
 
 
 def name_and_sizes(network: Any) -> tuple[str, dict[str, int]]:
-    """Return a network's name, "attention" or "mlp", and its sizes, such as {"width": 64}."""
-    (name,) = (name for name, kind in NETWORKS.items() if isinstance(network, kind))
+    """Return a network's name, a key of `KINDS`, and its sizes, such as {"width": 64}."""
+    (name,) = (name for name, kind in KINDS.items() if isinstance(network, kind))
     fields = (field.name for field in dataclasses.fields(network))
     return name, {field: getattr(network, field) for field in fields if field not in _OF_FLAX}
 
@@ -86,14 +86,10 @@ def load_checkpoint(path: str | os.PathLike) -> Checkpoint:
             "one that `planner-jax train` wrote",
             shown=f"{name!r} ({name_damage(error)})",
         ) from error
-    if (found, features) != (FORMAT, FEATURES):
-        rule = f"of format {FORMAT} with {FEATURES} features of a target"
-        shown = format_value(f"format {found} with {features} in {name}")
-        raise ArgumentError("checkpoint", rule, shown=shown)
-    if not isinstance(network, str) or network not in NETWORKS:
+    if not isinstance(network, str) or network not in KINDS:
         shown = f"{network!r:.60} in {name!r}"
-        raise ArgumentError("network", f"one of {', '.join(NETWORKS)}", shown=shown)
-    kind = NETWORKS[network]
+        raise ArgumentError("network", f"one of {', '.join(KINDS)}", shown=shown)
+    kind = KINDS[network]
     known = [field.name for field in dataclasses.fields(kind) if field.name not in _OF_FLAX]
     for size, value in sizes.items():
         most = _MOST_LAYERS if size == "layers" else _MOST
@@ -103,6 +99,10 @@ def load_checkpoint(path: str | os.PathLike) -> Checkpoint:
             shown = f"{size:.40} {value!r:.40} in {name!r}"
             raise ArgumentError(f"sizes of network {network!r}", rule, shown=shown)
     made = kind(**sizes)
+    if (found, features) != (FORMAT, num_features(made)):
+        rule = f"of format {FORMAT} with {num_features(made)} features"
+        shown = format_value(f"format {found} with {features} in {name}")
+        raise ArgumentError("checkpoint", rule, shown=shown)
     _require_weights(arrays, made, name)
     params = traverse_util.unflatten_dict(arrays, sep="/")
     return Checkpoint(params=params, network=made, about=about)
@@ -110,7 +110,7 @@ def load_checkpoint(path: str | os.PathLike) -> Checkpoint:
 
 def _require_weights(arrays: dict[str, np.ndarray], network: Any, name: str) -> None:
     """Raise unless there is one array of finite numbers for each weight of a network."""
-    seen = jax.ShapeDtypeStruct((1, FEATURES), np.float32)
+    seen = jax.ShapeDtypeStruct((1, num_features(network)), np.float32)
     try:
         shapes = jax.eval_shape(lambda seen: network.init(jax.random.key(0), seen), seen)
     except (TypeError, ValueError) as error:

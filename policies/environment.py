@@ -22,6 +22,7 @@ from jax import Array
 with contextlib.redirect_stdout(io.StringIO()):  # hides the message that Warp is not installed
     from brax.envs.base import Env, State
 
+from planner_jax.core.choices import STARTS
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.protocol import is_solved
 from planner_jax.optimise.rows import Group, Table, load_group
@@ -52,6 +53,7 @@ class CatchEnv(Env):
             by an estimate of how far a point of bounded acceleration misses the targets.
         weights: weights of the reward terms of `evaluate_actions`, by name. A weight is one number,
             or one number for each suite.
+        starts: states of the quadrotor at time 0: "hover" or "random", see `draw`.
     """
 
     def __init__(
@@ -59,8 +61,9 @@ class CatchEnv(Env):
         suites: tuple[str, ...],
         iterations: tuple[int, ...],
         weights: Mapping[str, float | tuple[float, ...]] = WEIGHTS,
+        starts: str = STARTS[0],
     ):
-        self.suites, self.iterations = tuple(suites), tuple(iterations)
+        self.suites, self.iterations, self.starts = tuple(suites), tuple(iterations), starts
         self.weights = {
             name: np.broadcast_to(np.asarray(value, np.float32), len(self.suites))
             for name, value in weights.items()
@@ -99,10 +102,7 @@ class CatchEnv(Env):
         """
         key, own = jax.random.split(state.info["key"])
         num = action.shape[0]
-        actions = action.reshape(len(self.suites), -1, self.size, PER_TARGET)
-        terms = self._evaluate(state.info["cases"], actions)
-        share = num // len(self.suites)
-        reward = weight_terms(terms, {k: np.repeat(one, share) for k, one in self.weights.items()})
+        reward, terms = self._score(state.info["cases"], action)
         cases, one = self._draw(own, num), jnp.ones(num)
         steps = {"sum_reward": reward, "length": one}
         info = {
@@ -113,6 +113,13 @@ class CatchEnv(Env):
             "episode_metrics": {**steps, **terms},
         }
         return state.replace(obs=self._observe(cases), reward=reward, done=one, info=info)
+
+    def _score(self, cases: tuple[CatchCase, ...], action: Array) -> tuple[Array, dict[str, Array]]:
+        """Return the rewards (B,) of actions (B, 2 N), and their unweighted terms (B,) by name."""
+        actions = action.reshape(len(self.suites), -1, self.size, PER_TARGET)
+        terms, share = self._evaluate(cases, actions), action.shape[0] // len(self.suites)
+        weights = {k: np.repeat(one, share) for k, one in self.weights.items()}
+        return weight_terms(terms, weights), terms
 
     def _evaluate(self, cases: tuple[CatchCase, ...], actions: Array) -> dict[str, Array]:
         alike: dict[Any, list[int]] = {}
@@ -133,8 +140,8 @@ class CatchEnv(Env):
 
     def _draw(self, key: Array, num: int) -> tuple[CatchCase, ...]:
         share = num // len(self.suites)
-        keys = jax.random.split(key, len(self.suites))
-        return tuple(draw_by_key(k, share, s) for k, s in zip(keys, self.suites, strict=True))
+        keys = zip(jax.random.split(key, len(self.suites)), self.suites, strict=True)
+        return tuple(draw_by_key(k, share, suite, self.starts) for k, suite in keys)
 
     def _observe(self, cases: tuple[CatchCase, ...]) -> Array:
         def of_suite(cases: CatchCase) -> Array:

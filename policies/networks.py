@@ -3,8 +3,8 @@
 A policy network maps features (..., N, F), F for each of N targets, to the parameters (..., N, 4)
 of a normal distribution of actions. An action is the tanh of a sample, and has two components per
 target. The first two parameters are means, and the softplus of the other two gives standard
-deviations. The networks are immutable and hashable, so that a JAX pytree can hold one as a static
-field.
+deviations. `PublishedMlp` has another observation and action. The networks are immutable and
+hashable, so that a JAX pytree can hold one as a static field.
 """
 
 from typing import Any
@@ -14,7 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from planner_jax.policies.observation import PER_TARGET
+from planner_jax.policies.observation import FEATURES, PER_TARGET
+from planner_jax.policies.settings import PUBLISHED
 
 LEAST_STD = 0.03  # least standard deviation of actions before tanh; it ensures exploration
 _FIRST_STD = 0.15  # standard deviation of actions before tanh at the start of training
@@ -64,6 +65,46 @@ class Attention(nn.Module):
         return _head(_apply_attention(self, seen))
 
 
+class PublishedMlp(nn.Module):
+    """The policy network of [Yu2023catch, Section IV-B]: two layers of 64 units with ReLU.
+
+    The action has a normal distribution [Yu2023catch, eq. 7b], whose standard deviation does not
+    depend on the observation.
+    """
+
+    size: int = 1  # number N of targets
+    width: int = 64  # number of units in each hidden layer
+
+    @property
+    def features(self) -> int:
+        """Number of features of a case: the length of its observation."""
+        return 10 + 6 * self.size
+
+    @nn.compact
+    def __call__(self, seen: Array) -> Array:
+        """Map observations (..., 10 + 6 N) to mean (N) and logarithm (N) of the deviation."""
+        mean = nn.Dense(self.size)(_apply_relu_layers(self.width, seen))
+        log_std = self.param("log_std", nn.initializers.constant(np.log(0.5)), (self.size,))
+        return jnp.concatenate([mean, jnp.broadcast_to(log_std, mean.shape)], axis=-1)
+
+
+class PublishedValue(nn.Module):
+    """The value network of the published policy, with hidden layers like `PublishedMlp`."""
+
+    width: int = 64  # number of units in each hidden layer
+
+    @nn.compact
+    def __call__(self, seen: Array) -> Array:
+        """Return the expected reward (...) of each case, from observations (..., 10 + 6 N)."""
+        return nn.Dense(1)(_apply_relu_layers(self.width, seen))[..., 0]
+
+
+def _apply_relu_layers(width: int, hidden: Array) -> Array:
+    for _ in range(2):
+        hidden = nn.relu(nn.Dense(width)(hidden))
+    return hidden
+
+
 class Value(nn.Module):
     """The value network of PPO: self-attention over targets, then a mean over present targets."""
 
@@ -109,3 +150,9 @@ def _attend(module: Any, hidden: Array, mask: Array) -> Array:
 
 
 NETWORKS = {"attention": Attention, "mlp": Mlp}
+KINDS = {**NETWORKS, PUBLISHED: PublishedMlp}  # networks of the extended and the published policy
+
+
+def num_features(network: Any) -> int:
+    """Return the number of input features of a network: of each target, or of the whole case."""
+    return network.features if isinstance(network, PublishedMlp) else FEATURES

@@ -14,8 +14,10 @@ from planner_jax.core.choices import require_size
 from planner_jax.core.errors import ArgumentTypeError
 from planner_jax.core.rules import NOT_NEGATIVE, POSITIVE
 from planner_jax.policies.checkpoint import checkpoint_of
-from planner_jax.policies.networks import LEAST_STD
+from planner_jax.policies.networks import LEAST_STD, PublishedMlp
 from planner_jax.policies.observation import PER_TARGET, STRETCH, choice_of, observe
+from planner_jax.policies.published import PublishedPolicy
+from planner_jax.policies.settings import LEAST_TIME
 from planner_jax.task.catch.case import CatchCase, CatchChoice
 from planner_jax.task.catch.decide import CatchDecision, in_several_lengths
 from planner_jax.task.catch.estimate import timetable
@@ -85,7 +87,7 @@ class Policy(CatchDecision):
         return in_several_lengths(case, choices)
 
 
-def policy(file: str | os.PathLike = "catch", **options: Any) -> Policy:
+def policy(file: str | os.PathLike = "catch", **options: Any) -> Policy | PublishedPolicy:
     """Load a trained policy from a file.
 
     Args:
@@ -94,7 +96,8 @@ def policy(file: str | os.PathLike = "catch", **options: Any) -> Policy:
             cases of six targets with deadlines.
         **options: `proposals`, number of proposals for a case (default 1); `spread`, factor on the
             standard deviations of drawn proposals (1); `stretch`, factor on catch times (0.95);
-            `width`, number of partial orders in the search if targets are optional (8).
+            `width`, number of partial orders in the search if targets are optional (8). A published
+            policy of [Yu2023catch] has the one option `t_min`, the least time of a catch [s].
 
     Raises:
         TypeError: an option has the wrong type.
@@ -105,4 +108,7 @@ def policy(file: str | os.PathLike = "catch", **options: Any) -> Policy:
     found = checkpoint_of(file)
     # Copy the weights to the device once, so that later calls need not copy them.
     params = jax.tree.map(jnp.asarray, found.params)
+    if isinstance(found.network, PublishedMlp):
+        trained = {"t_min": found.about.get("t_min", LEAST_TIME)}
+        return PublishedPolicy(params, found.network, **trained | options)
     return Policy(params=params, network=found.network, **{"stretch": _EARLIER, **options})

@@ -16,7 +16,7 @@ import json
 import math
 import os
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +34,7 @@ from brax.training.agents.ppo import train as ppo
 from brax.training.distribution import NormalTanhDistribution
 from jax import Array
 
+from planner_jax.core.choices import STARTS
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.protocol import are_solved
 from planner_jax.host import signals as stopping
@@ -44,12 +45,18 @@ from planner_jax.policies.checkpoint import checkpoint_of, name_and_sizes, save_
 from planner_jax.policies.curves import draw_curves
 from planner_jax.policies.environment import CatchEnv
 from planner_jax.policies.kept import KeptParts
-from planner_jax.policies.networks import LEAST_STD, NETWORKS, Value
+from planner_jax.policies.networks import LEAST_STD, NETWORKS, PublishedMlp, Value
 from planner_jax.policies.observation import FEATURES, PER_TARGET
 from planner_jax.policies.policy import Policy
 from planner_jax.policies.progress import SETTINGS, Progress, read_settings, report_terms
+from planner_jax.policies.published import PAPER_RULE, PublishedPolicy, RewardWeights
+from planner_jax.policies.published_env import PublishedEnv, paper_planner, published_networks
 from planner_jax.policies.settings import (
     LEARNING_RATE,
+    LEAST_TIME,
+    NETWORK_NAMES,
+    PAPER_DECISIONS,
+    PUBLISHED,
     WEIGHTS,
     TrainSettings,
     usual_iterations,
@@ -57,10 +64,13 @@ from planner_jax.policies.settings import (
 from planner_jax.runs.environment import code_digest, find_version
 from planner_jax.runs.manifest import to_write
 from planner_jax.runs.run_folder import RunFolder
-from planner_jax.task.catch.decide import optimal_time_ratio
+from planner_jax.task.catch.api import judge
+from planner_jax.task.catch.decide import CatchDecision, optimal_time_ratio
 from planner_jax.task.catch.default_planner import CatchProblem
+from planner_jax.task.catch.spec import SUITES
 from planner_jax.task.catch.suites import draw
 
+_MINIBATCH = 25  # number of decisions in a minibatch of the published policy
 _ROWS = 50  # greatest number of rows in the learning curve of one part (call of PPO)
 _EVAL_SEED = 4242  # seed of the evaluation cases, which no published figure uses
 
@@ -71,7 +81,7 @@ class Part:
 
     steps: int  # number of decisions
     # Number of planner iterations for each suite. If it is empty, rewards come from an estimate of
-    # how far the quadrotor misses the targets.
+    # how far the quadrotor misses the targets; the published policy then has the usual iterations.
     iterations: tuple[int, ...] = ()
     # Learning rate at the start of the part. PPO adapts it to the KL divergence of the updates.
     learning_rate: float = LEARNING_RATE
@@ -83,20 +93,23 @@ class Training:
 
     suites: tuple[str, ...]  # names of the suites from which cases are drawn
     parts: tuple[Part, ...]
-    network: str = "attention"  # key of `networks.NETWORKS`
+    network: str = "attention"  # key of `networks.KINDS`
+    starts: str = STARTS[0]  # states of the quadrotor at time 0: "hover" or "random"
+    t_min: float = LEAST_TIME  # [s], least time of a catch by the published policy
     seed: int = 0  # seed of initial weights and cases
     num_envs: int = 8190  # number of cases in parallel; a multiple of the number of suites
     updates: int = 4  # number of passes over each batch of decisions
     minibatches: int = 6  # number of minibatches into which a pass divides the batch
     divergence: float = 0.01  # desired KL divergence of an update, which adapts the learning rate
     entropy: float = 1e-4  # weight of the entropy bonus in the loss of PPO
-    # Weights of the reward terms by name: one number, or one number for each entry of `suites`.
+    # Weights of the reward terms by name: one number, or one number for each entry of `suites`. Of
+    # the published policy, the fields of `RewardWeights`.
     weights: tuple[tuple[str, float | tuple[float, ...]], ...] = tuple(WEIGHTS.items())
     init_from: str | None = None  # file or name of a policy with the initial weights
     eval_cases: int = 256  # number of cases of each suite in an evaluation; 0 for no evaluation
 
 
-def train(training: Training, out: str | os.PathLike, *, progress: bool = True) -> Policy:
+def train(training: Training, out: str | os.PathLike, *, progress: bool = True) -> CatchDecision:
     """Train a policy for the order and times of catches, or resume the run in a folder.
 
     Args:
@@ -114,7 +127,7 @@ def train(training: Training, out: str | os.PathLike, *, progress: bool = True) 
     """
     brax_compat.install()
     folder = Path(out)
-    network = NETWORKS[training.network]()
+    network = _network(training)
     params = _first_params(training, network)  # before anything is written
     with RunFolder(folder).lock():
         _record_settings(folder, training)
@@ -123,7 +136,7 @@ def train(training: Training, out: str | os.PathLike, *, progress: bool = True) 
 
 def _train_parts(
     training: Training, folder: Path, network: Any, params: Any, progress: bool
-) -> Policy:
+) -> CatchDecision:
     keeper = KeptParts(folder / "parts")
     rows, before = Progress(folder, progress), 0
     for number, part in enumerate(training.parts):
@@ -147,13 +160,56 @@ def _train_parts(
                 print(f"{title}: {_sentence(suites)}", file=sys.stderr)
         draw_curves([folder], folder / "curves.png")
         keeper.save(number, params)
-    about = {"suites": list(training.suites), "seed": training.seed}
+    about = {"suites": list(training.suites), "seed": training.seed, "starts": training.starts}
+    if training.network == PUBLISHED:
+        about["t_min"] = training.t_min
     save_checkpoint(folder / "policy.npz", params[1], network, about)
-    return Policy(params=params[1], network=network)
+    return _decision(training, network, params[1])
 
 
-def train_from_settings(settings: TrainSettings, out: str | os.PathLike) -> Policy:
+def _network(training: Training) -> Any:
+    if training.network == PUBLISHED:
+        return PublishedMlp(SUITES[training.suites[0]].num_targets)
+    return NETWORKS[training.network]()
+
+
+def _decision(training: Training, network: Any, params: Any) -> CatchDecision:
+    if training.network == PUBLISHED:
+        return PublishedPolicy(params, network, training.t_min)
+    return Policy(params=params, network=network)
+
+
+def published_training(
+    suite: str, decisions: Sequence[float] = (PAPER_DECISIONS,), num_envs: int = 100, **others: Any
+) -> Training:
+    """Return the training of the published policy for one suite [Yu2023catch, Section IV-B].
+
+    Args:
+        suite: name of the suite, without optional targets.
+        decisions: number of decisions of each part.
+        num_envs: number of cases in parallel, a multiple of 25, the size of a minibatch.
+        others: further fields of `Training`, and the fields of `Part` other than `steps`.
+    """
+    own = {name: others.pop(name) for name in ("iterations", "learning_rate") if name in others}
+    return Training(
+        suites=(suite,),
+        parts=tuple(Part(int(steps), **own) for steps in decisions),
+        network=PUBLISHED,
+        num_envs=num_envs,
+        minibatches=num_envs // _MINIBATCH,
+        weights=tuple(dataclasses.asdict(RewardWeights()).items()),
+        **others,
+    )
+
+
+def train_from_settings(settings: TrainSettings, out: str | os.PathLike) -> CatchDecision:
     """Train a policy with the options of `planner-jax train`; calls `train`."""
+    given = {name: getattr(settings, name) for name in ("seed", "init_from", "eval_cases")}
+    given["starts"] = settings.first_states
+    if settings.policy == PUBLISHED:
+        lanes = (settings.num_envs or 100) // _MINIBATCH * _MINIBATCH
+        given["learning_rate"] = settings.learning_rate
+        return train(published_training(settings.suite, settings.parts, lanes, **given), out)
     lanes = settings.num_envs or (510 if jax.default_backend() == "cpu" else 8190)
     minibatches = 6
     # The cases are divided evenly among the suites and among the minibatches.
@@ -162,14 +218,12 @@ def train_from_settings(settings: TrainSettings, out: str | os.PathLike) -> Poli
     training = Training(
         suites=settings.suites,
         parts=tuple(
-            Part(int(steps), iterations, settings.learning_rate) for steps in settings.decisions
+            Part(int(steps), iterations, settings.learning_rate) for steps in settings.parts
         ),
-        network=settings.network,
-        seed=settings.seed,
+        network=settings.network or NETWORK_NAMES[0],
         num_envs=lanes // step * step,
         minibatches=minibatches,
-        init_from=settings.init_from,
-        eval_cases=settings.eval_cases,
+        **given,
     )
     return train(training, out)
 
@@ -179,13 +233,17 @@ def evaluate_policy(training: Training, network: Any, params: Any) -> dict[str, 
 
     The results are the success rate, and means over solved cases: the time [s] of the last catch,
     the optimal time ratio (relative difference of decided and planned catch times), iterations.
+    The published policy is evaluated with the planner and the rule of success of its paper.
     """
-    decided = DecidedPlanner(CatchProblem.planner(), Policy(params=params, network=network))
+    published = training.network == PUBLISHED
+    planner = paper_planner() if published else CatchProblem.planner()
+    decided = DecidedPlanner(planner, _decision(training, network, params))
     figures = {}
     for suite in training.suites:
-        cases: Any = jax.tree.map(np.asarray, draw(training.eval_cases, suite, _EVAL_SEED))
+        drawn = draw(training.eval_cases, suite, _EVAL_SEED, starts=training.starts)
+        cases: Any = jax.tree.map(np.asarray, drawn)
         plans = plan(decided, cases)
-        good = are_solved(plans)
+        good = judge(cases, plans, **PAPER_RULE).success if published else are_solved(plans)
         figures[suite] = {
             "success": float(good.mean()),
             "last": float(plans.times[good, -1].mean()) if good.any() else None,
@@ -221,11 +279,11 @@ def _record_settings(folder: Path, training: Training) -> None:
 
 def _first_params(training: Training, network: Any) -> Any:
     env = _environment(training, training.parts[0])
+    nets = _networks(network, env.size)
     one, other = jax.random.split(jax.random.key(training.seed))
-    seen = jnp.zeros((1, env.size, FEATURES))
     size = specs.Array((env.observation_size,), jnp.dtype("float32"))
     normaliser = running_statistics.init_state(size)
-    own = jax.jit(network.init)(one, seen)
+    own = jax.jit(nets.policy_network.init)(one)
     if training.init_from is not None:
         given = checkpoint_of(training.init_from)
         if given.network != network:
@@ -236,7 +294,7 @@ def _first_params(training: Training, network: Any) -> Any:
                 shown=_words(given.network),
             )
         own = given.params
-    return jax.device_get((normaliser, own, jax.jit(Value().init)(other, seen)))
+    return jax.device_get((normaliser, own, jax.jit(nets.value_network.init)(other)))
 
 
 def _words(network: Any) -> str:
@@ -245,8 +303,12 @@ def _words(network: Any) -> str:
 
 
 def _environment(training: Training, part: Part) -> CatchEnv:
+    weights: dict[str, Any] = dict(training.weights)
+    if training.network == PUBLISHED:
+        planner, own = paper_planner(*part.iterations), RewardWeights(**weights)
+        return PublishedEnv(training.suites[0], planner, training.t_min, own, training.starts)
     iterations = part.iterations or (0,) * len(training.suites)
-    return CatchEnv(training.suites, iterations, dict(training.weights))
+    return CatchEnv(training.suites, iterations, weights, training.starts)
 
 
 def _rows_and_updates(part: Part, lanes: int) -> tuple[int, int]:
@@ -298,6 +360,8 @@ def _train_part(
 
 
 def _networks(network: Any, size: int, *_: Any, **__: Any) -> ppo_networks.PPONetworks:
+    if isinstance(network, PublishedMlp):
+        return published_networks(network)
     value = Value()
 
     def unflatten(flat: Array) -> Array:

@@ -24,6 +24,7 @@ from planner_jax.sims.loop_state import FlightState, Loop
 from planner_jax.sims.model import at_rest, place_balls
 from planner_jax.sims.scoring import no_contact
 from planner_jax.sims.sensing import Estimate
+from planner_jax.sims.state_filter import first_belief
 
 
 def flight_keys(seed: int, index: np.ndarray) -> Array:
@@ -78,6 +79,20 @@ def turn_robots(flights: FlightState, heading: Heading | None) -> FlightState:
     quat = jax.vmap(turn_quaternion)(qpos[:, 3:7], heading.start[:, 0])
     physics = dataclasses.replace(flights.physics, qpos=qpos.at[:, 3:7].set(quat))
     return dataclasses.replace(flights, physics=physics)
+
+
+@functools.partial(jax.jit, static_argnames="loop")
+def begin_filters(loop: Loop, flights: FlightState) -> FlightState:
+    """Return flights of B robots at standstill with first beliefs, if the loop has a filter."""
+    if loop.robot_filter is None:
+        return flights
+
+    def one(flight: FlightState) -> FlightState:
+        key, own_key = jax.random.split(flight.key)
+        belief = first_belief(loop, loop.world.robot.state(flight.physics), own_key)
+        return dataclasses.replace(flight, key=key, belief=belief)
+
+    return jax.vmap(one)(flights)
 
 
 def launch_ball(

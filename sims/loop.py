@@ -25,9 +25,11 @@ from jax import Array, lax
 
 from planner_jax.ball.flight import BallState, fly
 from planner_jax.core.compiled import QUICK_OPTIONS
+from planner_jax.core.errors import ArgumentError
 from planner_jax.host.threads import as_here
 from planner_jax.sims import sensing as sight
-from planner_jax.sims.loop_state import FlightState, Loop, Outlook, Pilot, Record
+from planner_jax.sims import state_filter as own
+from planner_jax.sims.loop_state import FlightState, Loop, Outlook, Pilot, Record, RobotBelief
 from planner_jax.sims.model import ball_states, ball_velocity, step
 from planner_jax.sims.robot import Physics
 from planner_jax.sims.scoring import moment, nearest
@@ -37,7 +39,12 @@ _FEW = 1024  # largest batch for which compiling takes longer than the flights t
 
 
 def track(
-    loop: Loop, physics: Physics, reference: Any, noise: Array, drag: Array
+    loop: Loop,
+    physics: Physics,
+    reference: Any,
+    noise: Array,
+    drag: Array,
+    belief: RobotBelief | None = None,
 ) -> tuple[Any, Physics]:
     """Simulate one physics step in which the robot tracks a reference (a planned state).
 
@@ -47,13 +54,21 @@ def track(
         reference: the planned state.
         noise: standard normal errors of the robot's estimated state.
         drag: (N,), true drag coefficients K_D [1/m] of the balls.
+        belief: the robot's estimate of its own state, if the loop has a `robot_filter`.
 
     Returns:
         The robot's estimated state before the step, and the physics after the step.
+
+    Raises:
+        ValueError: the loop has a `robot_filter`, but the flight has no belief.
     """
     world, robot = loop.world, loop.world.robot
     state = robot.state(physics)
-    if any(loop.sensing.robot_stds):
+    if loop.robot_filter is not None:
+        if belief is None:
+            raise ArgumentError("robot_filter", "None in this task", shown="sensors")
+        state = own.estimate_state(belief, world.timestep)
+    elif any(loop.sensing.robot_stds):
         state = robot.sense(state, noise, loop.sensing.robot_stds)
     return state, step(world, physics, robot.command(state, reference, world), drag)
 
@@ -61,16 +76,20 @@ def track(
 def _fly_to_observation(loop: Loop, pilot: Pilot, flight: FlightState, drag: Array) -> FlightState:
     world, robot, dtype = loop.world, loop.world.robot, flight.time.dtype
     key, noise_key, look_key = jax.random.split(flight.key, 3)
-    noise = jax.random.normal(noise_key, robot.noise_shape, dtype)
-    times = flight.time + world.timestep * jnp.arange(loop.steps_per_observation, dtype=dtype)
+    is_filtered, steps = flight.belief is not None, loop.steps_per_observation
+    shape = (steps + 1, 2, 3) if is_filtered else robot.noise_shape
+    noise = jax.random.normal(noise_key, shape, dtype)
+    times = flight.time + world.timestep * jnp.arange(steps, dtype=dtype)
     references = robot.references(flight.plan, times - flight.began, world)
     planned = flight.began + pilot.times(flight.plan)
     last = jnp.max(jnp.where(flight.present, planned, -jnp.inf))
 
-    def advance(carry: tuple, now: tuple) -> tuple[tuple, None]:
-        physics, before, contact, worst, squared, tracked = carry
-        reference, time = now
-        physics = track(loop, physics, reference, noise, drag)[1]
+    def advance(carry: tuple, now: tuple) -> tuple[tuple, Any]:
+        earlier, before, contact, worst, squared, tracked, belief = carry
+        (reference, time, errors), measured = now, None
+        physics = track(loop, earlier, reference, noise, drag, belief)[1]
+        if belief is not None:
+            belief, measured = own.advance_belief(loop, belief, earlier, physics, errors)
         after = moment(world, physics)
         passes, later = pilot.passage(world, before, after, time, planned, reference.pos)
         contact = nearest(contact, passes & flight.launched, later)
@@ -79,14 +98,16 @@ def _fly_to_observation(loop: Loop, pilot: Pilot, flight: FlightState, drag: Arr
         worst = jnp.where(counts, jnp.maximum(worst, away), worst)
         squared = squared + jnp.where(counts, away * world.timestep, 0.0)
         tracked = tracked + jnp.where(counts, world.timestep, 0.0)
-        return (physics, after, contact, worst, squared, tracked), None
+        return (physics, after, contact, worst, squared, tracked, belief), measured
 
     before = moment(world, flight.physics)
     sums = (flight.worst_tracking**2, flight.squared_tracking, flight.tracked)
-    carry, _ = lax.scan(
-        advance, (flight.physics, before, flight.contact, *sums), (references, times)
-    )
-    physics, _, contact, worst, squared, tracked = carry
+    first = (flight.physics, before, flight.contact, *sums, flight.belief)
+    errors = noise[:-1] if is_filtered else None
+    carry, measured = lax.scan(advance, first, (references, times, errors))
+    physics, _, contact, worst, squared, tracked, belief = carry
+    if belief is not None:
+        belief = own.receive_pose(loop, belief, measured, robot.state(physics), noise[-1])
     shown = jnp.concatenate([flight.shown, ball_states(world, physics)[0][None]])
     seen = sight.observe(look_key, shown[0], loop.sensing)
     seen = jnp.where(flight.launched[:, None], seen, jnp.nan)
@@ -101,6 +122,7 @@ def _fly_to_observation(loop: Loop, pilot: Pilot, flight: FlightState, drag: Arr
         tracked=tracked,
         time=flight.time + 1.0 / loop.sensing.rate,
         key=key,
+        belief=belief,
     )
 
 

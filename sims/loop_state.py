@@ -13,8 +13,9 @@ from jax import Array
 from planner_jax.ball.flight import BallState
 from planner_jax.core.choices import require, require_one_of
 from planner_jax.optimise.planner import Problem
+from planner_jax.perception.robot_filter import BodyState, RobotFilterState
 from planner_jax.sims.model import World
-from planner_jax.sims.noise import OBSERVERS, Sensing, require_whole
+from planner_jax.sims.noise import OBSERVERS, RobotSensing, Sensing, require_whole
 from planner_jax.sims.robot import Physics
 from planner_jax.sims.scoring import Contact
 from planner_jax.sims.sensing import Estimate
@@ -88,9 +89,9 @@ class Loop:
     """The settings that determine a flight's compiled program; static under `jax.jit`.
 
     Raises:
-        ValueError: the observer is unknown or needs the Kalman filter; the time between plans or
-            the latency is not a multiple of the observation period; or the observation period is
-            not a multiple of the time step.
+        ValueError: the observer is unknown or needs the Kalman filter; the time between plans or a
+            latency is not a multiple of the observation period; or the observation period is not a
+            multiple of the time step.
     """
 
     world: World
@@ -99,6 +100,8 @@ class Loop:
     kalman: bool = True  # whether the observations of the balls are filtered
     estimate_drag: bool = True  # whether drag is estimated from the energy that a ball loses
     observer: str = "energy"  # key of `noise.OBSERVERS`
+    # Sensors of the robot's own state, which a Kalman filter estimates; None: errors `robot_stds`
+    robot_filter: RobotSensing | None = None
     record: bool = False  # whether path and prediction errors are stored at every observation
 
     def __post_init__(self) -> None:
@@ -109,7 +112,8 @@ class Loop:
         rule = f"a divisor of {control_rate:g} Hz"
         require_whole(control_rate / sensing.rate, "rate", rule, sensing.rate)
         rule = f"a multiple of the observations' {1.0 / sensing.rate:g} s"
-        require_whole(sensing.latency * sensing.rate, "latency", rule, sensing.latency)
+        for each in (sensing, self.robot_filter or sensing):
+            require_whole(each.latency * sensing.rate, "latency", rule, each.latency)
         sensing.observations_per_plan(self.replan)
 
     @property
@@ -132,9 +136,26 @@ class Loop:
         """The latency of an observation, as a number of observation periods."""
         return round(self.sensing.latency * self.sensing.rate)
 
+    @property
+    def late_poses(self) -> int:
+        """The latency of a captured pose of the robot, as a number of observation periods."""
+        return round(self.robot_filter.latency * self.sensing.rate) if self.robot_filter else 0
+
     def num_periods(self, duration: float) -> int:
         """Return the number of planning periods that cover a duration [s]."""
         return int(np.ceil(duration / self.period - 1e-6))
+
+
+@struct.dataclass
+class RobotBelief:
+    """A quadrotor's estimate of its own state, and the measurements that are not yet used."""
+
+    past: RobotFilterState  # at the capture of the last pose that has arrived
+    imu: Array  # (M, 6), measured specific forces [m/s^2] and body rates [rad/s] since then
+    poses: Array  # (L, 7), captured positions [m] and quaternions that have not arrived
+    now: BodyState  # mean that `imu` predicts from `past`
+    rate: Array  # (3,) [rad/s], last measured body rate
+    biases: Array  # (6,), true biases of accelerometer [m/s^2] and gyroscope [rad/s]
 
 
 @struct.dataclass
@@ -155,6 +176,7 @@ class FlightState:
     tracked: Array  # () [s], duration over which the squared distance is integrated
     time: Array  # () [s]
     key: Array
+    belief: RobotBelief | None = None  # the robot's estimate of its own state, by its filter
 
 
 @struct.dataclass

@@ -28,11 +28,15 @@ import mujoco
 import numpy as np
 from jax import Array
 
+from planner_jax.core.errors import ArgumentError, ArgumentTypeError, MissingExtra
+
 with contextlib.redirect_stdout(io.StringIO()):  # hides the message that Warp is not installed
-    from mujoco import mjx
+    try:
+        from mujoco import mjx
+    except ModuleNotFoundError as error:  # a package that MJX imports, such as trimesh
+        raise MissingExtra("a flight", error.name, "sims") from None
 
 from planner_jax.ball.flight import BallState, ball_acceleration
-from planner_jax.core.errors import ArgumentError, ArgumentTypeError
 from planner_jax.sims.robot import Physics, Robot, ToolRobot
 from planner_jax.sims.scenery import (
     GROUND_COLOUR,

@@ -4,6 +4,7 @@ This module needs neither JAX nor MuJoCo, so that settings can be checked before
 """
 
 import dataclasses
+import math
 
 from planner_jax.core.errors import ArgumentError
 
@@ -59,6 +60,37 @@ class Sensing:
         rule = f"a divisor of the observations' {self.rate:g} Hz"
         require_whole(self.rate / replan, "replan", rule, replan)
         return round(self.rate / replan)
+
+
+@dataclasses.dataclass(frozen=True)
+class RobotSensing:
+    """Errors of a quadrotor's IMU and captured poses, for its own filter; static under `jax.jit`.
+
+    [Yu2023catch] and [Yu2023bat] filter both sensors, but report none of these numbers; all are
+    assumptions. The IMU measures at every physics step, and its biases are constant during a
+    flight. A pose is captured at every observation of the balls, and none is lost.
+
+    Raises:
+        ValueError: a value is not positive, or the latency is negative.
+    """
+
+    # Spectral densities of accelerometer [m^2/s^3] and gyroscope [rad^2/s]: errors of 0.1 m/s^2 and
+    # 0.01 rad/s at 250 Hz.
+    force_density: float = 0.1**2 / 250.0
+    rate_density: float = 0.01**2 / 250.0
+    pos_std: float = 0.001  # [m], of a coordinate of a captured position
+    attitude_std: float = math.radians(0.3)  # [rad], of each component of a captured attitude
+    latency: float = 0.02  # [s], age of a pose when it arrives
+    # Standard deviations of the biases [m/s^2] and [rad/s], and of the velocity [m/s] that the
+    # filter assumes first. Its first pose has the errors of a captured pose.
+    force_bias_std: float = 0.1
+    rate_bias_std: float = 0.01
+    vel_std: float = 0.01
+
+    def __post_init__(self) -> None:
+        for name, value in dataclasses.asdict(self).items():
+            if not (value > 0.0 or (name == "latency" and value == 0.0)):
+                raise ArgumentError(name, ">= 0" if name == "latency" else "> 0", value)
 
 
 # Observers of a thrown ball, by name. All but the first use a linear Kalman filter, whose

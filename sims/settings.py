@@ -13,7 +13,14 @@ from planner_jax.core.registry import Task, split_name
 from planner_jax.core.room import require_memory
 from planner_jax.core.tasks import all_tasks
 from planner_jax.runs.settings import option, require_count
-from planner_jax.sims.noise import NOISES, PLANE_NOISES, PlaneSensing, Sensing, require_whole
+from planner_jax.sims.noise import (
+    NOISES,
+    PLANE_NOISES,
+    PlaneSensing,
+    RobotSensing,
+    Sensing,
+    require_whole,
+)
 from planner_jax.sweep.block.settings import require_moderate
 from planner_jax.sweep.quadrotor_settings import WIND, resolve_robot, robot_option
 from planner_jax.task.catch.spec import DECISIONS, TRAINED
@@ -143,6 +150,11 @@ class BallFly(FlySettings):
         """The observer of the balls, a key of `noise.OBSERVERS`."""
         return "energy"
 
+    @property
+    def robot_sensing(self) -> RobotSensing | None:
+        """The sensors of the filter of the robot's own state; None for errors `robot_stds`."""
+        return None
+
     def known_robot(self) -> Any:
         """Return the robot as plans know it, with an error of its drag; None for the default."""
         if not self.rotor_drag_error:
@@ -179,6 +191,10 @@ class ThrownFly(BallFly):
         "default", "NAME", "estimator of the balls: default, or published, as in the papers"
     )
 
+    robot_filter: bool = option(
+        False, "", "a Kalman filter of IMU and captured poses estimates the robot's own state"
+    )
+
     PUBLISHED: ClassVar[str]  # key of `noise.OBSERVERS`: the published observer
 
     def __post_init__(self) -> None:
@@ -189,6 +205,11 @@ class ThrownFly(BallFly):
     def loop_observer(self) -> str:
         """The observer of the balls, a key of `noise.OBSERVERS`."""
         return super().loop_observer if self.observer == "default" else self.PUBLISHED
+
+    @property
+    def robot_sensing(self) -> RobotSensing | None:
+        """The sensors of the filter of the robot's own state; None for errors `robot_stds`."""
+        return RobotSensing() if self.robot_filter else None
 
 
 @dataclasses.dataclass(frozen=True)

@@ -29,9 +29,10 @@ class FlightCases:
         return len(self.index)
 
     def __getitem__(self, rows: Any) -> Self:
-        """Return the cases that a NumPy index selects."""
+        """Return the cases that a NumPy index selects; numbers that all cases share remain."""
         fields = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
-        return type(self)(**jax.tree.map(lambda leaf: leaf[rows], fields))
+        pick = lambda leaf: leaf[rows] if np.ndim(leaf) else leaf  # noqa: E731
+        return type(self)(**jax.tree.map(pick, fields))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -177,6 +178,8 @@ class BallTask(FlightTask):
         words = (
             f"Noise {settings.noise}, {100 * settings.drag_error:g} % error of the estimated drag"
         )
+        if settings.robot_sensing is not None:
+            words += ", own state by a Kalman filter of IMU and captured poses"
         if settings.robot is None or settings.robot.drag is None:
             return words
         wind = " ".join(f"{speed:g}" for speed in settings.wind or (0.0, 0.0, 0.0))
@@ -199,8 +202,14 @@ class BallTask(FlightTask):
         """Return the closed loop's settings; `record`: whether robot and ball states are stored."""
         settings = self.settings
         sensing = NOISES[settings.noise]
-        observer = settings.loop_observer
-        return Loop(self.world(), sensing, replan=settings.rate, observer=observer, record=record)
+        return Loop(
+            self.world(),
+            sensing,
+            replan=settings.rate,
+            observer=settings.loop_observer,
+            robot_filter=settings.robot_sensing,
+            record=record,
+        )
 
 
 @dataclasses.dataclass(frozen=True)

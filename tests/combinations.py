@@ -69,6 +69,7 @@ def options_of(task: Task) -> dict[str, list[tuple[str, ...]]]:
         "robot": [("--robot", model.name) for model in ROBOTS.values()],
         "wind": [wind, *((*wind, "--robot", file) for file in windy)],
         "observer": [("--observer", "published")],
+        "robot_filter": [("--robot-filter",)],
         "resume": [("--resume",)],
         "workers": [("--workers", "ray")],
     }

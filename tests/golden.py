@@ -26,9 +26,9 @@ PLANNERS = {  # of each task, the default one first
     "catch": ("exact", "catch", "mpp"),
     "intercept": ("spacetime", "quick", "best", "lattice", "paper", "em", "constant"),
     "group": ("spacetime",),
-    "block": ("online", "brisk", "direct", "rrt-connect", "epase", "insat"),
+    "block": ("online", "brisk", "direct", "rrt-connect", "epase", "insat", "pinsat"),
 }
-SLOW = ("paper", "rrt-connect", "epase", "insat")  # planners with few cases
+SLOW = ("paper", "rrt-connect", "epase", "insat", "pinsat")  # planners with few cases
 OPTIONS = (  # task, option of the default planner, its values, suite
     ("hit", "effort", ("good", "best"), None),
     ("catch", "recovery", ("brake", "home"), None),

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 
 import planner_jax as pj
 from planner_jax import benchmarks
-from planner_jax.benchmarks import paper_figures
+from planner_jax.benchmarks import paper_figures, published_policy
 from planner_jax.benchmarks.cost_gap import cost_gaps, gap_figures
 from planner_jax.benchmarks.first_plan import ROWS as FIRST_PLANS
 from planner_jax.benchmarks.first_plan import plan_in_new_process
@@ -70,6 +70,21 @@ def test_a_robot_of_rotorpy_has_the_thrusts_of_its_plan_and_turns_to_the_feedbac
 
 def read(folder, name="manifest.json"):
     return json.loads((folder / name).read_text())
+
+
+def test_decisions_are_compared_on_the_same_cases(tmp_path, monkeypatch):
+    options = "--suites parabola1 --starts random --num 16 --seeds 2 --trained none --out".split()
+    monkeypatch.setattr("sys.argv", ["published_policy", *options, str(tmp_path / "run")])
+    published_policy.main()
+    rows = {row["decide"]: row["seeds"] for row in read(tmp_path / "run", "rows.json")}
+    assert {name: len(seeds) for name, seeds in rows.items()} == {
+        **{"greedy": 1, "best": 1, "policy": 1},
+        "untrained": 2,
+    }
+    assert rows["greedy"] == rows["best"] and rows["untrained"][0] != rows["untrained"][1]
+    for row in (row for seeds in rows.values() for row in seeds):
+        assert 0.0 <= row["referee"] <= row["rule"] and row["rule"] >= 0.5 and row["ratio"] > 0.0
+    assert read(tmp_path / "run")["summary"]["num"] == 5 * 16
 
 
 def test_a_run_folder_says_what_was_run_where_and_with_what_success(tmp_path, capsys):
@@ -228,7 +243,7 @@ def test_pairs_and_solved_programs_are_among_the_compared_speed_planners(name):
     assert weights == ({None, 300.0} if name == "PAPER" else {None})
 
 
-@pytest.mark.parametrize("name", ["qu-2", "qu-4", "bat-7"])
+@pytest.mark.parametrize("name", paper_figures.FIGURES)
 def test_a_figure_of_a_paper_has_its_axes_and_the_same_data_each_time(name):
     drawing, again = (paper_figures.FIGURES[name](30, 0) for _ in range(2))
     assert drawing.to_csv() == again.to_csv()
@@ -252,6 +267,36 @@ def test_only_the_uniform_drive_of_the_figure_of_speeds_enters_an_obstacle():
         lower, upper = (np.interp(times, box.x[:2], each) for each in (box.y[:2], box.y[:1:-1]))
         met[name] |= bool(((station > lower) & (station < upper)).any())
     assert met == {"uniform": True, "EM": False, "lines of the paper": False}
+
+
+@pytest.mark.parametrize(
+    ("plan", "panels", "judge"),
+    [
+        (paper_figures.plan_hits, paper_figures.HIT_PANELS, pj.hit.judge),
+        (paper_figures.plan_three_catches, paper_figures.CATCH_PANELS, pj.catch.judge),
+        (paper_figures.plan_throws, paper_figures.CATCH_PANELS, pj.catch.judge),
+    ],
+)
+def test_the_peaks_of_a_figure_of_flights_are_the_referees(plan, panels, judge):
+    flights = plan(30, 0)
+    curves = paper_figures.draw_flights(flights, panels).curves
+    peaks = {(each.name, each.panel): each.y for each in curves}
+    for name, (cases, plans) in flights.items():
+        verdict = judge(cases, plans)
+        for panel in {"speed", "body rate", "thrust"}.intersection(panels):
+            (peak,) = getattr(verdict, f"max_{panel.replace(' ', '_')}")
+            assert peaks[name, panel].max() == pytest.approx(peak, rel=1e-3)
+
+
+def test_the_figure_of_mpp_has_the_time_of_the_planner_catch_and_exceeds_a_limit(monkeypatch):
+    flights = paper_figures.plan_throws(30, 0)
+    (case, catch), (_, mpp) = flights.values()
+    np.testing.assert_array_equal(catch.times, mpp.times)
+    assert not pj.catch.judge(case, mpp).success.any()
+    good = SimpleNamespace(success=np.ones(30, bool))
+    monkeypatch.setattr(pj.catch, "judge", lambda *_, **__: good)
+    with pytest.raises(LookupError, match="^no throw of 30 has the required outcomes$"):
+        paper_figures.plan_throws(30, 0)
 
 
 def test_a_figure_of_speeds_without_a_suitable_problem_says_so(monkeypatch):

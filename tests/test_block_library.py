@@ -520,3 +520,31 @@ def test_the_referee_confirms_a_built_library(regime, starts, tmp_path, monkeypa
     again = check(fixed, 200)
     assert not (again.claimed & ~again.verdict.success).any()
     assert table.unpack_rows(fixed.table.rows).duration[fixed.found].max() < 3.0
+
+
+def test_insat_builds_refereed_motions_and_continues_an_interrupted_build(tmp_path, monkeypatch):
+    """Plan for three of all pairs. Any ball through two cells with a motion must be blocked."""
+    layout, pairs, planned = LAYOUTS["A"], [1237, 2396, 3516], []
+    tunnel = dataclasses.replace(
+        tunnels_of(layout), is_feasible=np.isin(np.arange(layout.num_pairs), pairs)
+    )
+    plan_rows = building.plan_pairs_by_insat
+
+    def plan_some(setting, home, tunnel, pairs):
+        planned.extend(pairs)
+        if len(planned) == 2:
+            raise KeyboardInterrupt
+        return plan_rows(setting, home, tunnel, pairs, budget=5.0)
+
+    monkeypatch.setattr(building, "tunnels", lambda *args: tunnel)
+    monkeypatch.setitem(building.PLANNERS, "insat", 1)
+    monkeypatch.setattr(building, "plan_pairs_by_insat", plan_some)
+    settings = tmp_path / "a.lib", setting("R1"), irb1600().home, layout
+    with pytest.raises(KeyboardInterrupt):
+        building.build(*settings, planner="insat", progress=False)
+    library = building.build(*settings, planner="insat", progress=False)
+    assert planned == [1237, 2396, 2396, 3516]
+    assert_same(load_library(tmp_path / "a.lib").table, library.table)
+    np.testing.assert_array_equal(np.flatnonzero(library.found[0]), pairs)
+    found = check(library, 30)
+    assert found.claimed.all() and found.verdict.success.all()

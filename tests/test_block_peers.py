@@ -1,7 +1,10 @@
 """Tests of published planners of blocks: bang-bang motions, torques, and accepted plans."""
 
+import dataclasses
 import re
 import sys
+import time
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -14,6 +17,8 @@ import planner_jax as pj
 from planner_jax.baselines.block.b_spline import hodograph
 from planner_jax.baselines.block.epase import State
 from planner_jax.baselines.block.free_space import FreeSpace
+from planner_jax.baselines.block.insat import InsatBlock
+from planner_jax.baselines.block.library.insat_pairs import find_steps
 from planner_jax.baselines.block.path_timing import PIECES, time_path
 from planner_jax.baselines.block.pose_by_pose import Goal
 from planner_jax.baselines.parts.bang_bang import bang_bang
@@ -22,11 +27,12 @@ from planner_jax.core.missing_extra import MissingExtra, install_line
 from planner_jax.robot.arm import REGIMES
 from planner_jax.robot.arm_dynamics import inverse_dynamics
 from planner_jax.robot.arm_file import irb1600
-from planner_jax.robot.arm_motion import least_times
+from planner_jax.robot.arm_motion import least_times, polynomial
 from planner_jax.sweep.block.settings import BlockSettings
 from planner_jax.sweep.block.sweep import BlockSweep
 from planner_jax.task.block.spec import TASK
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
+from tests.trees import assert_same
 
 LIMITS = REGIMES["R2"].limits
 # Planner options for scenes without a pole: 6 control points, and up to 20 s of search a throw.
@@ -251,17 +257,77 @@ def test_the_best_spline_of_one_joint_takes_nearly_the_least_time_of_its_control
     least = np.sqrt(turn / (limit * -far.fun))
     goal = np.array(case.angles) + turn * np.eye(6)[5]
     planner, free = pj.block.planner("insat", **QUICK), FreeSpace(case, 0.0)
-    first = State(np.asarray(case.angles, float), 0.0, spline=np.asarray(case.angles)[None])
+    planner.compile(case)
 
     def spline_within(available):
-        end = State(goal, np.inf, first)
-        return planner.best_spline(case, free, Goal(goal, available), end, True)
+        end, aim = goal.astype(float), Goal(goal, available)
+        first = planner.open_states(case, aim).pop()
+        return planner.lifts(case, free, aim, [State(end, np.inf, first[0])], True)
 
-    points, time, length, _ = spline_within(1.0)
-    np.testing.assert_allclose(points[[0, 1, -2, -1]], [case.angles] * 2 + [goal] * 2, atol=1e-6)
-    assert 0.999 * least <= time <= 1.1 * least
-    assert length == pytest.approx(turn, rel=1e-3)
-    assert spline_within(0.99 * least) is None
+    (found,) = spline_within(1.0)
+    ends = found.points[[0, 1, -2, -1]]
+    np.testing.assert_allclose(ends, [case.angles] * 2 + [goal] * 2, atol=1e-6)
+    assert 0.999 * least <= found.time <= 1.1 * least
+    assert found.length == pytest.approx(turn, rel=1e-3)
+    assert not spline_within(0.99 * least)
+
+
+def test_pinsat_of_width_one_is_insat_and_wider_searches_are_confirmed():
+    """A pole stands between the arm and some balls, so that searches expand states."""
+    cases = jax.tree.map(np.array, pj.block.draw(3, "pole", seed=0, regime="R1"))
+    options = {"points": 4, "budget": 4.0, "longest": 4.0}
+    one, same, wide, late = (
+        pj.plan(pj.block.planner(name, **options, **more), cases)
+        for name, more in (
+            ("insat", {}),
+            ("pinsat", {"width": 1}),
+            ("pinsat", {"width": 4}),
+            ("insat", {"lift": "expansion"}),
+        )
+    )
+    solved = np.flatnonzero(pj.are_solved(one))
+    assert_same(pj.take(one, solved), pj.take(same, solved))
+    for plans in (one, wide, late):
+        assert pj.are_solved(plans).any()
+        np.testing.assert_array_equal(pj.block.judge(cases, plans).success, pj.are_solved(plans))
+
+
+def test_motions_between_published_poses_are_confirmed_by_the_referee_of_reaches():
+    folder = Path(__file__).parents[2] / "shared" / "data" / "foreign" / "pinsat"
+    if not folder.is_dir():
+        pytest.skip("the start and goal poses of nrkumar93/pinsat are not in ../shared")
+    starts, goals = (np.loadtxt(folder / f"{name}.txt")[::50] for name in ("starts", "goals"))
+    scene = pj.reach.make_scene(floor=-0.45)
+    reaches = [
+        pj.reach.case(goal, angles=start, scene=scene)
+        for start, goal in zip(starts, goals, strict=True)
+    ]
+    some = jax.tree.map(np.array, pj.block.draw(1, "open", seed=8, regime="R3"))
+    planner = InsatBlock(duration=(0.1, 5.0))
+    solved = free_ones = 0
+    for reach in reaches:
+        case = dataclasses.replace(
+            pj.take(some, 0), arm=reach.arm, limits=reach.limits, scene=reach.scene
+        )
+        case, goal = dataclasses.replace(case, angles=reach.angles), Goal(reach.goals[0], 5.0)
+        planner.compile(case)
+        free, until = FreeSpace(case, 0.003), time.perf_counter() + 5.0
+        if not free.is_free(np.stack([reach.angles, reach.goals[0]])).all():
+            continue
+        free_ones += 1
+        found = planner.find_spline(case, free, goal, lambda end=until: end - time.perf_counter())
+        if found is None:
+            continue
+        limits = (np.asarray(x, float) for x in (reach.limits.velocity, reach.limits.acceleration))
+        steps, duration = find_steps(found.points, 20, *limits)
+        motion = polynomial(
+            case.angles, jnp.zeros(6), jnp.asarray(steps, jnp.float32), jnp.float32(duration)
+        )
+        plan = dataclasses.replace(pj.plan(pj.reach.planner(), reach), motion=motion)
+        verdict: Any = pj.reach.judge(reach, plan)
+        assert verdict.success, verdict.sentence()
+        solved += 1
+    assert solved > 0.5 * free_ones > 0
 
 
 @pytest.mark.parametrize("name", ["direct", "insat", "epase"])

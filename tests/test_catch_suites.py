@@ -214,7 +214,9 @@ def test_balls_of_a_swarm_sink_all_around_and_may_be_left(name):
     assert np.histogram(angle, bins=4, range=(-np.pi, np.pi))[0].min() > 0.15 * angle.size
 
 
-@pytest.mark.parametrize("name", ["hard", "harmonic2", "hexagon6"])
+@pytest.mark.parametrize(
+    "name", ["hard", "paper-throws", "harmonic2", "paper-harmonic2", "hexagon6"]
+)
 def test_padding_leaves_the_present_targets_alone(name):
     plain, padded = draw(5, name, 2), draw(5, name, 2, num_targets=8)
     own = SUITES[name].num_targets

@@ -90,15 +90,45 @@ def test_converged_costs_are_the_published_optima():
     assert verdict.success.all(), [verdict.sentence(k) for k in np.flatnonzero(~verdict.success)]
 
 
+def lite_gaps(num, rule, factors=(1.0,)):
+    """Return relative costs above the published optima, (F, B), from F factors on the guess's T_p.
+
+    The rows are the first `num` of both files.
+    """
+    (easy, published), (hard, of_hard) = (rows(name, num) for name in NAMES)
+    cases = jax.tree.map(lambda *leaves: np.concatenate(leaves), easy, hard)
+    reference = np.concatenate([published["cost_ref"], of_hard["cost_ref"]])
+    guesses = (cases.replace(times=factor * cases.times) for factor in factors)
+    costs = [pj.plan(LitePlanner(PROBLEM, UNIT, rule), each).cost for each in guesses]
+    return UNIT * np.stack(costs) / reference - 1.0
+
+
 @pytest.mark.parametrize("num", [4, pytest.param(120, marks=pytest.mark.slow)])
 def test_the_search_of_lbfgs_lite_ends_at_the_published_optima(num):
-    tight = LiteRule(gradient=1e-9, decrease=1e-14, max_steps=20000)
-    for name in NAMES:
-        cases, published = rows(name, num)
-        plans = pj.plan(LitePlanner(PROBLEM, UNIT, tight), cases)
-        gap = np.abs(UNIT * plans.cost / published["cost_ref"] - 1.0)
-        # A few of the 120 throws have a second minimum nearby.
-        assert (gap <= 1e-6).mean() > 0.95 and gap.max() < 1e-4
+    gradient_alone = LiteRule(gradient=1e-9, decrease=0.0, max_steps=20000)
+    gaps = lite_gaps(num, gradient_alone, (1.0, 0.98, 1.02))
+    # A few of the 240 throws have a second minimum nearby. Rounding decides which one is reached.
+    assert (np.abs(gaps[0]) <= 1e-6).mean() > 0.95 and np.abs(gaps[0]).max() < 1e-3
+    # From the best of three guesses no throw ends above its published optimum; two end below.
+    assert gaps.min(axis=0).max() <= 1e-6
+
+
+@pytest.mark.slow
+def test_the_published_stopping_rule_of_lbfgs_lite_stops_shortly_above_the_optima():
+    (gap,) = lite_gaps(120, LiteRule())
+    assert 1e-6 < np.median(gap) < 1e-5 and np.abs(gap).max() < 1e-3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("factor", "least", "most"), [(1.0, 0.0, 0.5), (10.0, 1.0, 1.0)])
+def test_three_targets_are_caught_late_by_the_published_weight_of_time_alone(factor, least, most):
+    cases = pj.catch.draw(8, "triangle3", 0, dtype=jnp.float64)
+    weight = factor * PROBLEM.time_weight
+    plans = pj.plan(pj.catch.planner("catch", decide="greedy", time_weight=weight), cases)
+    rule = {"tolerance": 0.05, "net_test": "ball"}
+    unlimited = cases.replace(horizon=np.full_like(cases.horizon, np.inf))
+    assert pj.catch.judge(unlimited, plans, **rule).success.all()
+    assert least <= pj.catch.judge(cases, plans, **rule).success.mean() <= most
 
 
 def test_objective_gradient_agrees_with_finite_differences():

@@ -173,7 +173,7 @@ def test_a_file_that_is_no_checkpoint_is_named(tmp_path, fresh):
         ({"sizes": {"width": True}}, "be among size, width, .* got width True"),
         ({"sizes": {"width": 10**9}}, "be among size, width, whole numbers from 1 to 1024"),
         ({"sizes": {"width": 32}}, r"have \(228, 32\) finite numbers in the weight"),
-        ({"network": ["mlp"]}, r"be one of attention, mlp, got \['mlp'\]"),
+        ({"network": ["mlp"]}, r"be one of attention, mlp, published, got \['mlp'\]"),
         ({"network": "attention"}, "be among width, heads, layers, .* got size 6"),
         ({"network": "attention", "sizes": {}}, "hold the weight"),
         ({"network": "attention", "sizes": {"heads": 5}}, "be of a network that exists"),

@@ -222,6 +222,13 @@ def test_a_hit_planned_once_without_noise_lands_on_the_target(seen):
     assert flights.miss.max() < 0.05
 
 
+def test_some_serves_of_a_batch_keep_the_time_of_their_plan():
+    served = volleys(3, seen=0.4)
+    some = served[np.array([2, 0])]
+    assert some.seen == 0.4
+    np.testing.assert_array_equal(some.believed, served.believed[[2, 0]])
+
+
 def test_a_serve_without_time_for_observations_is_rejected():
     with pytest.raises(ValueError, match="seen must be > 0 and <= 1, got 0"):
         volleys(1, seen=0.0)

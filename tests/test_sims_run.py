@@ -3,6 +3,8 @@
 import dataclasses
 import re
 import shutil
+import subprocess
+import sys
 
 import jax
 import jax.numpy as jnp
@@ -252,6 +254,12 @@ class DropFlight(BallFlightTask):
     def launches(self, cases, flown):
         at = np.tile(np.float32([0.0, 0.0, 2.2]), (len(cases), 1, 1))
         return Launches(pj.BallState(at, 0.0 * at), np.full(at.shape[:2], 0.06), np.zeros(1), 0.1)
+
+
+def test_a_missing_package_of_mjx_is_named_with_its_extra():
+    code = "import sys; sys.modules['trimesh'] = None; import planner_jax.sims.model"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert "MissingExtra: a flight needs trimesh: pip install" in done.stderr
 
 
 def test_a_task_without_flights_is_refused_in_one_line(monkeypatch):

@@ -21,6 +21,8 @@ BY_DEFAULT = ("README", "overview")  # the others compile programs of their own:
 FENCE = re.compile(r"^( *)```(\w*)[^\n]*\n(.*?)^\1```", re.MULTILINE | re.DOTALL)
 NOT_RUN = re.compile(r"<!-- not run: .+ -->\s*$")
 SMALL = {"draw(1000": "draw(16", "draw(100,": "draw(16,", "draw(100)": "draw(16)"}
+# The README's own jit loop; docs/jit.md runs with the planners that it shows.
+SMALL["pj.solve(pj.hit.planner()"] = 'pj.solve(pj.hit.planner("juggle")'
 PLACEHOLDER = re.compile(r"[\[\]|{}*]|\.\.\.| [A-Z]\b")
 COMMAND = re.compile(r"`((?:planner-jax|(?:taskset -c \d+ )?python -m benchmarks\.)[^`\n]*)`")
 

@@ -15,11 +15,11 @@ from planner_jax.cli.main import main
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.missing_extra import install_line
 from planner_jax.planning.decided import first_choice
-from planner_jax.policies.checkpoint import save_checkpoint
+from planner_jax.policies.checkpoint import load_checkpoint, save_checkpoint
 from planner_jax.policies.curves import draw_curves
 from planner_jax.policies.networks import NETWORKS, Mlp
 from planner_jax.policies.observation import FEATURES
-from planner_jax.policies.policy import Policy
+from planner_jax.policies.policy import Policy, policy
 from planner_jax.policies.progress import FILE, read_rows, to_text
 from planner_jax.policies.settings import NETWORK_NAMES
 from planner_jax.runs.manifest import to_write
@@ -27,6 +27,7 @@ from planner_jax.task.catch.estimate import shortfall
 from planner_jax.task.catch.suites import draw_by_key
 
 training = pytest.importorskip("planner_jax.policies.training", exc_type=ImportError)
+published_env = pytest.importorskip("planner_jax.policies.published_env", exc_type=ImportError)
 SUITE, LANES, ROWS = "triangle3", 250, 50
 PART = training.Part(steps=ROWS * LANES, learning_rate=1e-3)
 
@@ -53,6 +54,62 @@ def asked(hasty, tmp_path_factory) -> Any:
 def trained(asked, tmp_path_factory) -> Any:
     out = tmp_path_factory.mktemp("trained")
     return training.train(asked, out, progress=False), out
+
+
+@pytest.fixture(scope="module")
+def published(tmp_path_factory) -> Any:
+    """Train the published policy in cases that weight the change of the decided times most."""
+    out = tmp_path_factory.mktemp("published")
+    how: dict[str, Any] = {"iterations": (5,), "learning_rate": 3e-4}
+    asked = training.published_training(
+        "parabola1", [6000], 50, starts="random", t_min=0.25, eval_cases=0, **how
+    )
+    weights = (("caught", 1.0), ("cost", 0.1), ("time", 5.0))
+    asked = dataclasses.replace(asked, weights=weights)
+    return training.train(asked, out, progress=False), out
+
+
+def test_training_of_the_published_policy_raises_its_reward(published):
+    rewards = [row["reward"] for row in read_rows(published[1])]
+    tenth = len(rewards) // 10
+    assert np.mean(rewards[-tenth:]) > np.mean(rewards[:tenth]) + 0.3
+
+
+def test_a_trained_published_policy_is_read_from_its_file(published):
+    found = load_checkpoint(published[1] / "policy.npz")
+    assert (found.about["starts"], found.about["t_min"]) == ("random", 0.25)
+    cases = draw_by_key(jax.random.key(1), 20, "parabola1", "random")
+    read = policy(published[1] / "policy.npz")
+    choices = [jax.vmap(each.propose)(cases) for each in (read, published[0])]
+    chex.assert_trees_all_equal(*choices)
+    assert np.ptp(np.asarray(choices[0].times)) > 0.1 and np.min(choices[0].times) >= 0.25
+
+
+def test_a_case_of_nan_gets_the_least_reward_and_spoils_no_other():
+    env = published_env.PublishedEnv("parabola1", published_env.paper_planner(5))
+    state = jax.jit(env.reset)(jax.random.split(jax.random.key(0), 50))
+    assert state.obs.shape == (50, env.observation_size) == (50, 16)
+    action = jnp.zeros((50, env.action_size))
+    step = jax.jit(env.step)
+    usual = step(state, action)
+    (cases,) = state.info["cases"]
+    broken = cases.replace(head_state=cases.head_state.at[3].set(jnp.nan))
+    spoiled = step(state.replace(info=state.info | {"cases": (broken,)}), action)
+    others = np.arange(50) != 3
+    assert spoiled.reward[3] == -30.0 and np.isfinite(usual.reward).all()
+    np.testing.assert_array_equal(spoiled.reward[others], usual.reward[others])
+    solved = np.asarray(usual.info["episode_metrics"]["solved"])
+    assert set(solved) == {0.0, 1.0} and usual.done.all()
+    assert usual.reward[solved == 1.0].mean() > usual.reward[solved == 0.0].mean()
+    assert not np.array_equal(usual.obs, state.obs)
+
+
+@pytest.mark.parametrize("starts", ["hover", "random"])
+def test_the_extended_policy_is_trained_from_the_requested_starts(starts):
+    asked = training.Training((SUITE,), (PART,), starts=starts)
+    env = training._environment(asked, PART)
+    (cases,) = jax.jit(env.reset)(jax.random.split(jax.random.key(0), 4)).info["cases"]
+    assert (np.ptp(np.asarray(cases.head_state)[:, 1]) > 0.1) == (starts == "random")
 
 
 def feasible(found: Policy) -> float:

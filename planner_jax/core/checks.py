@@ -14,7 +14,7 @@ from jax.core import Tracer
 from jaxtyping import PyTree
 
 from planner_jax.core.arithmetic import Numbers, numpy_of, to_host
-from planner_jax.core.errors import ArgumentError, ArgumentTypeError
+from planner_jax.core.errors import ArgumentError, ArgumentTypeError, NotOffered
 from planner_jax.core.rules import FINITE, Rule
 
 
@@ -49,9 +49,8 @@ def require_switch(name: str, value: object) -> None:
 
 def require_numbers(name: str, value: object) -> None:
     """Raise `ArgumentTypeError` unless an argument is a tuple of numbers."""
-    if not isinstance(value, tuple) or any(
-        (number := numeric(each)) is None or number.shape for each in value
-    ):
+    numbers = [numeric(each) for each in value] if isinstance(value, tuple) else [None]
+    if any(each is None or each.shape for each in numbers):
         raise ArgumentTypeError(name, "a tuple of numbers", value)
 
 
@@ -60,6 +59,12 @@ def require_kind(name: str, value: object, *kinds: type) -> None:
     if not isinstance(value, kinds):
         known = " or a ".join(kind.__name__ for kind in kinds)
         raise ArgumentTypeError(name, f"a {known}", shown=f"a {type(value).__name__}")
+
+
+def require_values(call: str, *trees: PyTree) -> None:
+    """Raise `TypeError` if trees, arguments of a function of the host, have traced arrays."""
+    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(trees)):
+        raise NotOffered(f"{call} works on the host: call it outside your compiled function")
 
 
 def require_path_name(name: str, value: object) -> None:
@@ -81,10 +86,8 @@ def numeric(value: object) -> Numbers | None:
     if isinstance(value, np.ma.MaskedArray) and np.ma.is_masked(value):
         return None
     try:
-        if not isinstance(value, _HOSTS) and isinstance(value, Tracer | jax.Array):
-            array: Numbers = value
-        else:
-            array = np.asarray(value)
+        is_jax = not isinstance(value, _HOSTS) and isinstance(value, Tracer | jax.Array)
+        array: Numbers = value if is_jax else np.asarray(value)  # type: ignore[assignment]
     except jax.errors.TracerArrayConversionError:  # a list or tuple with traced numbers
         try:
             array = jnp.asarray(value)

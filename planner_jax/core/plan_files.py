@@ -15,7 +15,7 @@ from typing import TypeVar
 import numpy as np
 from jaxtyping import PyTree
 
-from planner_jax.core.checks import require_path_name
+from planner_jax.core.checks import require_path_name, require_values
 from planner_jax.core.errors import ArgumentError, ArgumentTypeError
 from planner_jax.core.rules import nodes_of
 from planner_jax.host.files import open_plain, replacing
@@ -39,6 +39,7 @@ class PlanFileError(ArgumentError):
 def save_arrays(path: str | os.PathLike, tree: PyTree) -> None:
     """Write a (nested) dataclass of arrays to a .npz file, which is unchanged if writing fails."""
     require_path_name("path", path)
+    require_values("save", tree)
     header = json.dumps({"version": VERSION, "class": type(tree).__name__})
     arrays = {name: np.asarray(leaf) for name, leaf in leaves_by_name(tree).items()}
     for name, array in arrays.items():

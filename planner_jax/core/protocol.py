@@ -13,7 +13,7 @@ from flax import struct
 from jax import Array
 from jaxtyping import PyTree
 
-from planner_jax.core.arithmetic import Numbers, numpy_of
+from planner_jax.core.arithmetic import Numbers, numpy_of, to_host
 from planner_jax.core.checks import (
     require_kind,
     require_number,
@@ -261,14 +261,14 @@ def take(tree: Tree, k: int | np.integer | slice | Numbers) -> Tree:
     return jax.tree.map(lambda leaf: leaf[k], tree)
 
 
-def are_solved(plans: Plan) -> np.ndarray:
-    """Return whether each plan keeps every limit that its planner checks, bool.
+def are_solved(plans: Plan) -> Numbers:
+    """Return whether each plan keeps every limit that its planner checks, bool; traced if they are.
 
     Raises:
         ArgumentTypeError: the argument is not a plan or a batch of plans.
     """
     require_kind("plans", plans, Plan)
-    return np.asarray(is_solved(plans.status))
+    return to_host(is_solved(plans.status))
 
 
 def mark_bad_input(plans: PlanT, cases: PyTree) -> PlanT:

@@ -5,7 +5,7 @@ from jax import Array, lax
 
 from planner_jax.trajectory.bezier import energy_of_pieces
 
-_TIME_WEIGHT, _LENGTH_WEIGHT = 1.0, 0.1  # [1/s], [1/rad], for `spline_cost`
+WEIGHTS = 1.0, 0.1  # [1/s], [1/rad], of the duration and the length in `spline_cost`
 
 
 def obstacle_cost(
@@ -79,10 +79,10 @@ def polyline_length(samples: Array) -> Array:
     return jnp.sum(jnp.sqrt(jnp.maximum(steps, 1e-10)))
 
 
-def spline_cost(length: Array, duration: Array) -> Array:
-    """Return duration [s] + 0.1 length [rad] of an arm's motion, (...) [Natarajan2024, eq. 4a].
+def spline_cost(length: Array, duration: Array, weights: Array | tuple = WEIGHTS) -> Array:
+    """Return w_1 (duration) + w_2 (length) of an arm's motion, (...) [Natarajan2024, eq. 4a].
 
-    The length is the integral of the joint velocity's norm; `polyline_length` computes it from
-    samples of the joint angles.
+    The length [rad] is the integral of the joint velocity's norm; `polyline_length` computes it
+    from samples of the joint angles. The duration is in s, and w_1 and w_2 are the `weights` (2,).
     """
-    return _TIME_WEIGHT * duration + _LENGTH_WEIGHT * length
+    return weights[0] * duration + weights[1] * length

@@ -11,6 +11,7 @@ state is `retract(mean, error)`, with the error (15,) of position [m], attitude 
 """
 
 import dataclasses
+import functools
 import math
 
 import jax
@@ -173,6 +174,34 @@ def robot_filter_init(
     return RobotFilterState(mean, jnp.diag(stds**2), jnp.zeros((), mean.pos.dtype))
 
 
+def predict_mean(
+    mean: BodyState,
+    force: Float[Array, "3"],
+    rate: Float[Array, "3"],
+    duration: Array,
+    gravity: Array,
+) -> BodyState:
+    """Return the state after a measurement of the IMU that holds for `duration` () [s].
+
+    The arguments are explained in `robot_filter_predict`; `gravity` () [m/s^2] is a magnitude.
+    """
+    t = duration
+    pull, turn = force - mean.force_bias, (rate - mean.rate_bias) * t
+    # Series of the integrals of exp([turn] s) pull from s = 0 to 1, once and twice.
+    once, twice = pull / 24.0, pull / 120.0
+    for first, second in ((6.0, 24.0), (2.0, 6.0), (1.0, 2.0)):
+        once = pull / first + jnp.cross(turn, once)
+        twice = pull / second + jnp.cross(turn, twice)
+    fall = gravity_vector(gravity)
+    quat = multiply(mean.quat_wxyz, exponential(turn))
+    return dataclasses.replace(
+        mean,
+        pos=mean.pos + t * mean.vel + t**2 * (rotate(mean.quat_wxyz, twice) + 0.5 * fall),
+        quat_wxyz=quat / jnp.sqrt(jnp.sum(quat**2)),
+        vel=mean.vel + t * (rotate(mean.quat_wxyz, once) + fall),
+    )
+
+
 def robot_filter_predict(
     state: RobotFilterState,
     force: Float[Array, "3"],
@@ -191,22 +220,9 @@ def robot_filter_predict(
     """
     t = jnp.asarray(duration, state.covariance.dtype)
 
-    def transition(mean: BodyState) -> BodyState:
-        pull, turn = force - mean.force_bias, (rate - mean.rate_bias) * t
-        # Series of the integrals of exp([turn] s) pull from s = 0 to 1, once and twice.
-        once, twice = pull / 24.0, pull / 120.0
-        for first, second in ((6.0, 24.0), (2.0, 6.0), (1.0, 2.0)):
-            once = pull / first + jnp.cross(turn, once)
-            twice = pull / second + jnp.cross(turn, twice)
-        fall = gravity_vector(model.gravity)
-        quat = multiply(mean.quat_wxyz, exponential(turn))
-        return dataclasses.replace(
-            mean,
-            pos=mean.pos + t * mean.vel + t**2 * (rotate(mean.quat_wxyz, twice) + 0.5 * fall),
-            quat_wxyz=quat / jnp.sqrt(jnp.sum(quat**2)),
-            vel=mean.vel + t * (rotate(mean.quat_wxyz, once) + fall),
-        )
-
+    transition = functools.partial(
+        predict_mean, force=force, rate=rate, duration=t, gravity=model.gravity
+    )
     mean = transition(state.mean)
     zero = jnp.zeros(15, t.dtype)
     F = jax.jacfwd(lambda e: difference(mean, transition(retract(state.mean, e))))(zero)

@@ -31,7 +31,6 @@ from planner_jax.host.compile_cache import keep_compiled_programs
 from planner_jax.planning.programs import BUCKETS, GPU_LEAST_PADDED, Device, is_cpu, solve_one
 
 _ARRAYS = (jax.Array, np.ndarray, np.generic)
-
 _QUIET = 1.0  # [s] least time between two progress reports of one attempt
 
 
@@ -75,9 +74,8 @@ class Watch:
     def __init__(
         self, time_limit: float | None = None, progress: Callable[[Progress], object] | None = None
     ) -> None:
-        if time_limit is not None:
-            if not require_scalar("time_limit", time_limit) >= 0.0:
-                raise ArgumentError("time_limit", ">= 0 s", time_limit)
+        if time_limit is not None and not require_scalar("time_limit", time_limit) >= 0.0:
+            raise ArgumentError("time_limit", ">= 0 s", time_limit)
         if progress is not None and not callable(progress):
             raise ArgumentTypeError("progress", "callable, such as print", progress)
         self._start, self._limit, self._progress = time.monotonic(), time_limit, progress

@@ -11,6 +11,7 @@ from flax import struct
 from jax import Array
 from jaxtyping import PyTree
 
+from planner_jax.core.checks import require_values
 from planner_jax.core.errors import NotOffered
 from planner_jax.core.planner import PlanT
 from planner_jax.core.registry import Task
@@ -116,6 +117,7 @@ def sensitivity(
     Raises:
         TypeError: the planner does not minimise, the cases have a wrong type, or they are rallies.
     """
+    require_values("sensitivity", planner, cases)
     task = _task_of(cases)
     if task is not None and task.name in _REFUSED:
         raise NotOffered(

@@ -1,5 +1,6 @@
 """`warm_up`: it compiles all searches of a planner before they are needed."""
 
+from planner_jax.core.checks import require_values
 from planner_jax.core.choices import require
 from planner_jax.core.planner import CaseT, Kind, Planner, PlanT
 from planner_jax.planning.plan import Driver, plan
@@ -20,6 +21,7 @@ def warm_up(planner: Planner[CaseT, PlanT], case: CaseT) -> None:
         TypeError: the case belongs to another task than the planner.
     """
     require(case.batch_shape == (), "case", "one case", shown=f"batch shape {case.batch_shape}")
+    require_values("warm_up", planner, case)
     plan(planner, case)
     inner = planner.inner
     if inner.kind is Kind.COMPILED and isinstance(case, inner.case_type):

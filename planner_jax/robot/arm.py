@@ -13,6 +13,7 @@ from flax import struct
 from jax import Array, lax
 
 from planner_jax.core.arithmetic import host_leaf
+from planner_jax.core.checks import require_values
 from planner_jax.core.protocol import Plan
 from planner_jax.robot.setpoints import sample_at_rate
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
@@ -236,6 +237,7 @@ class ArmPlan(Plan):
         Raises:
             ValueError: the rate is not positive.
         """
+        require_values("sample", self)
         ends = np.sum(np.asarray(self.motion.durations), axis=-1)
         return ArmSetpoints(**sample_at_rate(rate, ends, self.motion, _setpoint_at))
 

@@ -13,6 +13,7 @@ import numpy as np
 from flax import struct
 from jax import Array
 
+from planner_jax.core.checks import require_values
 from planner_jax.core.protocol import Plan
 from planner_jax.robot.setpoints import sample_at_rate
 
@@ -103,6 +104,7 @@ class CarPlan(Plan):
         Raises:
             ValueError: the rate is not positive.
         """
+        require_values("sample", self)
         leaves = (self.start, self.time, self.speed, self.curvature)
         samples = sample_at_rate(rate, self.time, leaves, _setpoint_at)
         origin = np.asarray(self.origin, np.float64)[..., None, :]

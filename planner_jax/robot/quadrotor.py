@@ -24,6 +24,7 @@ from planner_jax.core.arithmetic import (
     numpy_of,
     reciprocal,
 )
+from planner_jax.core.checks import require_values
 from planner_jax.core.origin import Located, to_world
 from planner_jax.core.protocol import Plan
 from planner_jax.robot.quadrotor_model import MORE_TILT, RECOVERY_TILT
@@ -356,12 +357,11 @@ class QuadrotorPlan(Plan, Located):
         Raises:
             ValueError: the rate is not positive.
         """
-        # These modules are imported only if needed.
-        from planner_jax.robot.attitude import QuadrotorSetpoints, setpoint_at
+        from planner_jax.robot.attitude import QuadrotorSetpoints, setpoint_at  # rarely needed
         from planner_jax.robot.setpoints import sample_at_rate
 
+        require_values("sample", self)
         path = jax.tree.map(np.asarray, self).whole
-        ends = np.sum(path.durations, axis=-1)
         leaves = jax.tree.map(np.asarray, (path, self.gravity, self.air, self.heading))
-        found = sample_at_rate(rate, ends, leaves, setpoint_at)
+        found = sample_at_rate(rate, np.sum(path.durations, axis=-1), leaves, setpoint_at)
         return QuadrotorSetpoints(**{**found, "pos": to_world(found["pos"], self.origin)})

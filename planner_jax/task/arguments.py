@@ -99,17 +99,16 @@ def judge_by(
     checks.require_kind("cases", cases, kinds[0])
     checks.require_kind("plans", plans, kinds[1])
     require_settings(referee, settings)
+    checks.require_values("judge", cases, plans)
     for leaf in jax.tree.leaves((cases, plans)):
         if checks.numeric(leaf) is None:
             raise ArgumentTypeError("cases and plans", "numbers", leaf, verb="hold")
-    num = np.shape(plans.status)
-    if num != cases.batch_shape:
+    if (num := np.shape(plans.status)) != cases.batch_shape:
         rule = f"the batch shape of the cases, {cases.batch_shape}"
         raise ArgumentError("plans", rule, num, verb="have")
     if not has_origin(plans, cases):
         raise ArgumentError("plans", "the origin of the cases", verb="have", shown="")
-    alone = cases.batch_shape == ()
-    if alone:
+    if alone := cases.batch_shape == ():
         cases, plans = jax.tree.map(lambda leaf: np.asarray(leaf)[None], (cases, plans))
     verdict = referee(cases, plans, **settings)
     return take(verdict, 0) if alone else verdict

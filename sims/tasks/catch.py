@@ -25,6 +25,7 @@ from planner_jax.robot.quadrotor_model import PAPER_CATCHER, QuadrotorModel
 from planner_jax.runs.columns import BOOL, Column, list_of
 from planner_jax.sims.launch import (
     await_ball,
+    begin_filters,
     flight_keys,
     launch_ball,
     ready,
@@ -180,6 +181,7 @@ def fly_catches(
     balls, guess = jax.tree.map(jnp.asarray, (cases.balls, cases.believed))
     keys = flight_keys(seed, cases.index)
     flight = ready(loop, jnp.tile(jnp.array(START), (len(cases), 1)), keys)
+    flight = begin_filters(loop, flight)
     nothing = np.zeros(num_balls, bool), np.zeros(cases.horizon.shape, np.float32)
     compiled = begin_compiling(
         loop, pilot, flight, predict_case.eval_shape(loop, flight, *nothing), drag

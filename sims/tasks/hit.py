@@ -24,6 +24,7 @@ from planner_jax.robot.quadrotor_model import PAPER_HITTER, QuadrotorModel
 from planner_jax.runs.columns import BOOL, NUMBER, VECTOR, Column
 from planner_jax.runs.summary import percent
 from planner_jax.sims.launch import (
+    begin_filters,
     flight_keys,
     launch_ball,
     ready,
@@ -273,6 +274,7 @@ def fly_hits(
     keys = flight_keys(seed, cases.index)
     drag = truth.drag[:, None]
     flight = turn_robots(ready(loop, truth.head_state[:, 0], keys), truth.heading)
+    flight = begin_filters(loop, flight)
     compiled = begin_compiling(loop, pilot, flight, truth, drag)
     balls = jax.tree.map(lambda leaf: leaf[:, None], truth.ball)
     guess = jnp.asarray(cases.believed)[:, None]

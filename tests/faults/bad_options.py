@@ -80,6 +80,7 @@ serve hit --robot nobody                     | --robot must be
 library build new --home 1                   | --home must be six angles
 library build new --home nan nan nan nan nan nan | --home must be finite
 library build new --layout x                 | --layout must be one of
+library build new --planner rrt              | --planner must be one of
 library repair junk --pole 1 --out new       | --pole
 library check junk --num 0                   | --num must be >= 1
 bench throughput --planner mpp               | --planner must be one of exact, bat .. got 'mpp'
@@ -91,6 +92,11 @@ bench throughput --devices 1000              | --devices must
 bench throughput --batch 16 0                | --batch must be >= 1
 robots nobody                                | robot must be one of
 train --suite x                              | --suite must be one or more of
+train --starts moving                        | --starts must be one of hover, random
+train --policy x                             | --policy must be one of extended, published
+train --policy published                     | --suite must be one suite in which every target
+train --policy published --suite swarm8      | --suite must be one suite in which every target
+train --policy published --suite hexagon6 --network mlp | --network must be left out
 view folder --port x                         | --port must be a whole number, got 'x'
 report gone                                  | RUN must be
 nobody                                       | nobody

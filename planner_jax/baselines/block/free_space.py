@@ -19,7 +19,12 @@ from planner_jax.task.block.case import BlockCase
 # [rad], joint-space distance between samples of an edge, as in the code that the authors of
 # [Natarajan2024] published (github.com/sbpl/parallel_search).
 RESOLUTION = 0.05 / 3.0
-_BATCHES = (1, 64, 256, 1024)  # batch sizes for which programs are compiled
+
+
+@functools.cache
+def _sizes() -> tuple[int, ...]:
+    """Return the batch sizes for which programs are compiled; a GPU also has a large one."""
+    return (1, 64, 256, 1024, *(() if jax.default_backend() == "cpu" else (16384,)))
 
 
 @jax.jit
@@ -35,7 +40,7 @@ def _compile(tree: Hashable, layout: tuple, dtype: np.dtype) -> None:
     `tree` is the pytree structure of (arm, scene), `layout` the shape and type of each leaf.
     """
     arm, scene = jax.tree.unflatten(tree, [np.zeros(*leaf) for leaf in layout])
-    for size in _BATCHES:
+    for size in _sizes():
         _nearest(arm, scene, np.zeros((size, arm.num), dtype))
 
 
@@ -55,7 +60,7 @@ class FreeSpace:
         """Return which of N poses (N, n) [rad] are within limits and collision-free, (N,) bool."""
         num, begin, gaps = len(angles), 0, []
         while begin < num:
-            size = next((size for size in _BATCHES if size >= num - begin), _BATCHES[-1])
+            size = next((size for size in _sizes() if size >= num - begin), _sizes()[-1])
             some = angles[begin : begin + size]
             filled = np.empty((size, len(self.lower)), self._dtype)
             filled[: len(some)], filled[len(some) :] = some, some[-1]

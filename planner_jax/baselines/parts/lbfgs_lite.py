@@ -37,7 +37,7 @@ class LiteRule:
     """The rule that stops a search; the defaults of LBFGS-Lite, but for the iterations."""
 
     gradient: float = 1e-5  # least |gradient| / max(1, |x|), in greatest components
-    decrease: float = 1e-6  # least decrease in 3 iterations, divided by max(1, |cost|)
+    decrease: float = 1e-6  # least decrease in 3 iterations over max(1, |cost|); 0: none
     max_steps: int = 10000  # greatest number of iterations; LBFGS-Lite has no limit
 
 

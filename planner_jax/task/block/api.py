@@ -26,11 +26,12 @@ def planner(
       an outer and an inner cell through which a ball can fly.
     * `direct`: each joint moves as fast as its limits allow, to the end pose that is reached first
       without a collision.
-    * `rrt-connect`, `epase`: a path by OMPL's RRT-Connect, or by a weighted A* over steps of the
-      joints, to one end pose after another. TOPP-RA sets the speed along the path. Both run on the
-      host and need the extra `arm-peers`.
-    * `insat`: the A* of `epase` interleaved with the optimisation of B-splines [Natarajan2024,
-      Algorithm 2]; runs on the host.
+    * `rrt-connect`, `epase`: a path by OMPL's RRT-Connect, or by ePA*SE over steps of the joints,
+      to one end pose after another. TOPP-RA sets the speed along the path. Both run on the host and
+      need the extra `arm-peers`.
+    * `insat`, `pinsat`: a weighted A* or ePA*SE over steps of the joints, interleaved with the
+      optimisation of B-splines [Natarajan2024, Algorithm 2]. The search runs on the host. `pinsat`
+      optimises the splines of up to `width` states in one call, and is meant for GPUs.
 
     Planners of other packages are also found by name.
 
@@ -39,7 +40,7 @@ def planner(
         effort: "feasible" ends with the first plan that keeps every limit. "good" and "best"
             compare more motions of `online` or `brisk`, for plans of less cost.
         options: fields of the planner's class: `OnlineBlock`, `LibraryBlock`,
-            `DirectBlock`, `RrtConnectBlock`, `EpaseBlock` or `InsatBlock`.
+            `DirectBlock`, `RrtConnectBlock`, `EpaseBlock`, `InsatBlock` or `PinsatBlock`.
 
     Raises:
         ValueError: no planner has the requested name, or it does not support the effort.

@@ -32,6 +32,7 @@ TASK = Task(
         "rrt-connect": "planner_jax.baselines.block.rrt_connect:RrtConnectBlock",
         "epase": "planner_jax.baselines.block.epase:EpaseBlock",
         "insat": "planner_jax.baselines.block.insat:InsatBlock",
+        "pinsat": "planner_jax.baselines.block.insat:PinsatBlock",
         "library": "planner_jax.baselines.block.library.planner:library_planner",
     },
     from_file={"library": "planner-jax library build FILE"},

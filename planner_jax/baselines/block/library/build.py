@@ -19,6 +19,7 @@ from tqdm import tqdm
 
 from planner_jax.baselines.block.library.cells import Layout, Tunnels, tunnels
 from planner_jax.baselines.block.library.file import BUILD_VERSION, LARGEST, save_library
+from planner_jax.baselines.block.library.insat_pairs import plan_pairs_by_insat
 from planner_jax.baselines.block.library.pairs import (
     BentPair,
     PairCase,
@@ -57,6 +58,9 @@ STARTS, REPAIR_STARTS = (2, 0, 1, 3, 4, 5), (2,)
 # [s] A stored motion is planned again if, without obstacles, the arm could block a ball that comes
 # earlier by this time.
 _WORTH = 0.03
+# Names of the planners of motions -> number of pairs that are planned and written to disk as one
+# part; None for the number of `portions`.
+PLANNERS = {"least-squares": None, "insat": 16}
 _CHECKED_AT_ONCE = 1024  # number of stored motions whose distances are computed in one batch
 
 
@@ -93,6 +97,7 @@ def build(
     homes: ArrayLike,
     layout: Layout,
     *,
+    planner: str = "least-squares",
     progress: bool = True,
 ) -> Library:
     """Plan for all pairs of cells that a ball can pass through, and write the library.
@@ -106,6 +111,8 @@ def build(
         setting: arm, limits and scene, with NumPy leaves.
         homes: (H, 6) [rad], joint angles of one or more poses at which motions start.
         layout: the division of both boxes around the arm into cells.
+        planner: a key of `PLANNERS`: "least-squares" for `plan_pairs`, or "insat" for the motions
+            of [Natarajan2024, Algorithm 1].
         progress: show a progress bar on the standard error stream.
 
     Raises:
@@ -116,8 +123,10 @@ def build(
     _require_free(setting, homes)
     tunnel = tunnels(layout, setting.scene.inner, setting.scene.outer)
     feasible = np.flatnonzero(tunnel.is_feasible)
-    parts = _Parts(Path(f"{os.fspath(path)}.parts"), setting, homes, layout)
-    size = portions().pairs
+    parts = _Parts(Path(f"{os.fspath(path)}.parts"), setting, homes, layout, planner)
+    size, plan_rows = PLANNERS[planner] or portions().pairs, plan_pairs
+    if planner == "insat":
+        plan_rows = _plan_rows_by_insat
     work = [
         (k, feasible[begin : begin + size])
         for k in range(len(homes))
@@ -130,7 +139,7 @@ def build(
         for number, (k, pairs) in enumerate(work):
             found = parts.read(number)
             if found is None:
-                found = plan_pairs(setting, homes[k], tunnel, pairs)
+                found = plan_rows(setting, homes[k], tunnel, pairs)
                 parts.write(number, found)
             rows[k, pairs] = found
             bar.update(len(pairs))
@@ -263,6 +272,14 @@ def plan_pairs(
     return _rows_of(straight, found)
 
 
+def _plan_rows_by_insat(
+    setting: Setting, home: np.ndarray, tunnel: Tunnels, pairs: np.ndarray
+) -> np.ndarray:
+    point, entry = plan_pairs_by_insat(setting, home, tunnel, pairs)
+    found = _Motions(point=point, entry=entry, quickest=entry)
+    return _rows_of(StraightPair(setting, host_leaf(home)), found)
+
+
 def _groups(starts: Sequence[int]) -> list[Sequence[int]]:
     num = portions().starts
     return [starts[begin : begin + num] for begin in range(0, len(starts), num)]
@@ -351,10 +368,12 @@ def _bar(total: int, unit: str, progress: bool) -> tqdm:
 
 
 class _Parts:
-    def __init__(self, folder: Path, setting: Setting, homes: np.ndarray, layout: Layout):
+    def __init__(
+        self, folder: Path, setting: Setting, homes: np.ndarray, layout: Layout, planner: str
+    ):
         self._folder = folder
         header = {
-            "version": BUILD_VERSION,
+            "version": f"{BUILD_VERSION} {planner}",
             "fingerprint": fingerprint(setting),
             "homes": homes.tolist(),
             "layout": dataclasses.asdict(layout),

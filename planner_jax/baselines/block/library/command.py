@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from planner_jax.baselines.block.library.build import build, repair
+from planner_jax.baselines.block.library.build import PLANNERS, build, repair
 from planner_jax.baselines.block.library.cells import LAYOUTS, Face
 from planner_jax.baselines.block.library.coverage import Coverage, check, coverage
 from planner_jax.baselines.block.library.file import load_library, save_library
@@ -36,6 +36,7 @@ def build_library(
     *,
     layout: str = "full",
     regime: str = "R2",
+    planner: str = "least-squares",
     pole: bool = True,
     arm: str | None = None,
     home: Sequence[float] | None = None,
@@ -47,6 +48,7 @@ def build_library(
         layout: a key of `LAYOUTS`, the division of the two boxes around the arm into cells.
         regime: a key of `REGIMES`: whether motions end at standstill, and the joint limits of the
             IRB 1600. Another arm has the limits of its file.
+        planner: a key of `PLANNERS`, the planner of the stored motions.
         pole: whether the scene contains the pole.
         arm: path of an MJCF or URDF file; by default the IRB 1600.
         home: joint angles [rad] at which motions start, six for each start pose; by default one
@@ -57,6 +59,7 @@ def build_library(
     """
     require_one_of(LAYOUTS, "layout", layout)
     require_one_of(REGIMES, "regime", regime)
+    require_one_of(PLANNERS, "planner", planner)
     require(
         home is None or (len(home) > 0 and len(home) % 6 == 0),
         "home",
@@ -76,7 +79,7 @@ def build_library(
     )
     homes = np.reshape(body.home if home is None else home, (-1, 6))
     start = time.perf_counter()
-    library = build(path, setting, homes, LAYOUTS[layout])
+    library = build(path, setting, homes, LAYOUTS[layout], planner=planner)
     print(f"Built in {time.perf_counter() - start:.1f} s, compilation included.")
     _print(path, library, coverage(library))
 

@@ -15,6 +15,10 @@ def add_commands(command: Callable[[str, str], Callable[..., None]]) -> None:
     build = command("build", "plan for every pair of cells; continues an interrupted build")
     build("--layout", metavar="NAME", help="full, or A, B, C, D of fewer (default: full)")
     build("--regime", metavar="NAME", help="limits of the joints: R1, R2, R3 (default: R2)")
+    method = (
+        "planner of the motions: least-squares or insat, of [Natarajan2024] (default: the first)"
+    )
+    build("--planner", metavar="NAME", help=method)
     build("--no-pole", dest="pole", action="store_false", help="the scene without its pole")
     build("--arm", metavar="FILE", help="an MJCF or URDF file (default: the IRB 1600)")
     angles = "six angles [rad] of the arm's home, or six for each of several homes"
