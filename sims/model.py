@@ -28,7 +28,8 @@ import mujoco
 import numpy as np
 from jax import Array
 
-from planner_jax.core.errors import ArgumentError, ArgumentTypeError, MissingExtra
+from planner_jax.core.errors import ArgumentError, ArgumentTypeError
+from planner_jax.core.missing_extra import MissingExtra
 
 with contextlib.redirect_stdout(io.StringIO()):  # hides the message that Warp is not installed
     try:

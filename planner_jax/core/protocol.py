@@ -261,7 +261,7 @@ def take(tree: Tree, k: int | np.integer | slice | Numbers) -> Tree:
     return jax.tree.map(lambda leaf: leaf[k], tree)
 
 
-def are_solved(plans: Plan) -> Numbers:
+def are_solved(plans: Plan) -> PyTree:
     """Return whether each plan keeps every limit that its planner checks, bool; traced if they are.
 
     Raises:

@@ -84,9 +84,7 @@ class ChainProblem(Problem[CaseT, PlanT]):
     shipped_name: ClassVar[str] = "exact"  # first part of the scales' names in the package
     num_end_variables: ClassVar[int]  # K, for each segment
     guess_table: ClassVar[np.ndarray]  # one row for each starting point, best first
-    # Number of intervals of each piece, at whose ends a finished plan is checked: for a plan of one
-    # segment, and of several segments, between which the body rate can have narrow peaks.
-    decode_nodes: ClassVar[tuple[int, int]] = (32, 48)
+    decode_nodes: ClassVar[tuple[int, int]] = (32, 48)  # to check one, several segments
     stands: ClassVar[bool] = False  # whether the quadrotor stands still after the last segment
     weights: ClassVar[tuple[str, ...]] = ("energy_weight", "margin", "hinge_width")
     refinements: ClassVar[tuple[str, ...]] = ("nodes",)
@@ -231,9 +229,8 @@ class ChainProblem(Problem[CaseT, PlanT]):
         """Compute those parts of the objective that depend only on N segments' K end variables.
 
         Returns:
-            Boundary rows (N, 8, 3), scaled states at both ends of the segments; mean durations of a
-            piece (N,) [s]; the cost () of time, ends, and energy at waypoint offsets 0; and the
-            greatest relative excess over the limits at the ends ().
+            Scaled states at both ends of the segments (N, 8, 3); mean durations of a piece (N,) [s];
+            cost () of time, ends, and energy at offsets 0; greatest relative excess at the ends ().
         """
         ends = self.meet(natural, context)
         durations = ends.durations / self.num_pieces
@@ -249,10 +246,7 @@ class ChainProblem(Problem[CaseT, PlanT]):
         return jnp.sum(jnp.where(self.active(context), values, 0.0))
 
     def objective(self, point: Float[Array, " n"], context: PyTree) -> Evaluation:
-        """Return the cost, and the violation: the largest excess over a limit at sampled times.
-
-        For most quantities q the excess is q^2 / limit^2 - 1.
-        """
+        """Return the cost, and the largest excess at sampled times, mostly q^2 / limit^2 - 1."""
         case, moving = _split_moving(context.case)
         offsets, natural = self.split(point)
         rows, durations, core, at_ends = self.evaluate_ends(natural, context)
@@ -273,8 +267,7 @@ class ChainProblem(Problem[CaseT, PlanT]):
 
     def curvature_at(self, point: Float[Array, " n"], context: PyTree) -> Curvature:
         """Return evaluation, gradient, Hessian products and preconditioner at a point (n,)."""
-        # Imported here because only Newton's method needs this module.
-        from planner_jax.optimise.chain_curvature import chain_curvature
+        from planner_jax.optimise.chain_curvature import chain_curvature  # for Newton's method
 
         case, moving = _split_moving(context.case)
         if moving:

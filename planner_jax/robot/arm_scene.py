@@ -131,7 +131,7 @@ class Scene:
         return dataclasses.replace(self, meshes=None, **joined)
 
 
-def paper_scene(*, has_pole: bool = True, pole: Sequence[float] = POLE, size: float = 1.0) -> Scene:
+def paper_scene(*, has_pole: bool = True, pole: ArrayLike = POLE, size: float = 1.0) -> Scene:
     """Return the scene of the simulations in [Natarajan2024, Fig. 5], with NumPy float32 leaves.
 
     The sizes are from the model in the authors' repository. The model's box around the camera is

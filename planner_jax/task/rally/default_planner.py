@@ -104,10 +104,6 @@ class RallyProblem(ChainProblem[RallyCase, RallyPlan]):
     the last hit may end in a state from which no further hit keeps the limits.
 
     Attributes:
-        proportions: durations of a segment's polynomial pieces, relative to each other.
-        nodes: number of intervals of each piece, at whose ends penalties are evaluated.
-        time_weight: weight of the total time.
-        energy_weight: [s^8/m^2], weight of the integral of |snap|^2.
         contact_weight: [s], weight of the penalties at the contacts.
         place_weight: weight of the squares of the place variables.
         apex_weight: weight of the squares of the apexes off the middle.
