@@ -229,7 +229,7 @@ class ChainProblem(Problem[CaseT, PlanT]):
         """Compute those parts of the objective that depend only on N segments' K end variables.
 
         Returns:
-            Scaled states at both ends of the segments (N, 8, 3); mean durations of a piece (N,) [s];
+            Scaled states at both ends of the segments (N, 8, 3); mean duration of a piece (N,) [s];
             cost () of time, ends, and energy at offsets 0; greatest relative excess at the ends ().
         """
         ends = self.meet(natural, context)
