@@ -24,7 +24,7 @@ PAGES = {
     "benchmarks/GPU_LOG.md": "gpu_log.md",
 }
 LINK = re.compile(r"(!?)\[([^\]]*)\]\((?!\w+:|#)([^)#\s]+)(#[^)\s]*)?\)")
-FIELD = re.compile(r"^ {8}(\w+): (.+(?:\n {12}.+)*)", re.MULTILINE)  # a field and its text
+FIELD = re.compile(r"^ {4}(\w+): (.+(?:\n {8}.+)*)", re.MULTILINE)  # a field and its text
 CODE = re.compile(r"(^```.*?^```)", re.MULTILINE | re.DOTALL)
 
 
@@ -93,7 +93,8 @@ def inherited_fields(name: str) -> list[str]:
     """
     package, _, own = name.rpartition(".")
     bases = getattr(getattr(importlib.import_module(package), own), "__mro__", ())[1:]
-    sections = [(base.__doc__ or "").partition("Attributes:\n")[2] for base in bases]
+    texts = [inspect.cleandoc(base.__doc__ or "") for base in bases]
+    sections = [text.partition("Attributes:\n")[2] for text in texts]
     fields = [FIELD.findall(section) for section in sections]
     lines = [f"- `{field}`: {' '.join(text.split())}" for own in fields for field, text in own]
     return ["Inherited fields:\n", *lines, ""] if lines else []

@@ -1,6 +1,7 @@
 """The names a user imports from the top of the package, and from a task."""
 
 import dataclasses
+import inspect
 import re
 
 import numpy as np
@@ -57,8 +58,8 @@ def test_unknown_name_is_an_attribute_error():
 
 def _described(kind: type) -> dict[str, str]:
     """Return the texts of the fields in the section "Attributes" of a class's docstring."""
-    section = (kind.__doc__ or "").partition("Attributes:\n")[2]
-    return dict(re.findall(r"^ {8}(\w+): (.+)$", section, re.MULTILINE))
+    section = inspect.cleandoc(kind.__doc__ or "").partition("Attributes:\n")[2]
+    return dict(re.findall(r"^ {4}(\w+): (.+)$", section, re.MULTILINE))
 
 
 def _public_dataclasses() -> list[type]:
