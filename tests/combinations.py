@@ -108,7 +108,8 @@ def cross(command: str, task: Task) -> Iterator[Combination]:
             line = f"unrecognized arguments: {' '.join(words)}; `planner-jax {place} --help` lists"
             if name == "effort" and command == "bench":
                 line = f"--effort must be left out for the task {task.name}"
-            there = names.issuperset(word[2:] for word in words if word.startswith("--"))
+            fields = (word[2:].replace("-", "_") for word in words if word.startswith("--"))
+            there = names.issuperset(fields)
             if there or name in names or "--robot" not in words:
                 yield Combination((*start, *words), *(() if there else (REFUSED, line)))
 
