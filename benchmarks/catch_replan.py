@@ -28,6 +28,7 @@ from planner_jax.ball.flight import BallState
 from planner_jax.benchmarks.cost_gap import cost_gaps
 from planner_jax.benchmarks.run import Bench, argument_parser, begin
 from planner_jax.live.server import compute_in_place
+from planner_jax.policies.published import PAPER_RULE
 from planner_jax.task.catch.case import CatchCase
 from planner_jax.task.catch.plan import CatchPlan
 
@@ -130,7 +131,7 @@ def time_replans(bench: Bench, lanes: list[CatchCase], noise: float) -> None:
     report_times(bench, "re-plan alone", seconds)
     cases, plans = stack(replans)
     bench.say(f"solved {100.0 * pj.are_solved(plans).mean():.2f} %")
-    verdict = pj.catch.judge(cases.case, plans, tolerance=0.05, net_test="ball")
+    verdict = pj.catch.judge(cases.case, plans, **PAPER_RULE)
     bench.count(verdict.success, cost_gaps(AGAIN, cases, plans))
 
 

@@ -28,6 +28,7 @@ import planner_jax as pj
 from planner_jax.baselines.catch.published import find_number
 from planner_jax.benchmarks.cost_gap import cost_gaps, gap_figures
 from planner_jax.benchmarks.run import Bench, argument_parser, begin, parse_names
+from planner_jax.policies.published import PAPER_RULE
 from planner_jax.runs.summary import wilson_interval
 from planner_jax.task.catch.spec import DECISIONS, SUITES, TASK
 
@@ -42,7 +43,7 @@ def run_row(bench: Bench, suite: str, name: str, options: argparse.Namespace) ->
     plans = pj.plan(planner, cases)
     warm = time.perf_counter() - began
     verdict = pj.catch.judge(cases, plans)
-    protocol = functools.partial(pj.catch.judge, plans=plans, tolerance=0.05, net_test="ball")
+    protocol = functools.partial(pj.catch.judge, plans=plans, **PAPER_RULE)
     ever = dataclasses.replace(cases, horizon=np.full_like(cases.horizon, np.inf))
     success, gaps = verdict.success, cost_gaps(planner, cases, plans)
     bench.count(success, gaps)

@@ -36,6 +36,7 @@ from planner_jax.benchmarks.intercept_speed import PAPER, constant_speed, judge,
 from planner_jax.benchmarks.run import argument_parser, begin, parse_names
 from planner_jax.benchmarks.speed_problems import speed_problems
 from planner_jax.core.protocol import is_solved
+from planner_jax.policies.published import PAPER_RULE
 from planner_jax.runs import style
 from planner_jax.sims.prediction.polynomial_fit import fit_polynomial
 from planner_jax.task.catch.context import CatchContext
@@ -193,10 +194,7 @@ def plan_throws(num: int, seed: int) -> dict[str, tuple[Any, Any]]:
     cases = pj.catch.draw(num, "paper-throws", seed)
     plans = pj.plan(pj.catch.planner("catch"), cases)
     timed = pj.plan(TimedMpp(), dataclasses.replace(cases, times=plans.times))
-    good, other = (
-        pj.catch.judge(cases, each, tolerance=0.05, net_test="ball").success
-        for each in (plans, timed)
-    )
+    good, other = (pj.catch.judge(cases, each, **PAPER_RULE).success for each in (plans, timed))
     if not (good & ~other).any():
         raise LookupError(f"no throw of {num} has the required outcomes")
     lane = int(np.argmax(good & ~other))

@@ -129,7 +129,7 @@ def receive_pose(
         loop: settings of the closed loop.
         belief: belief at the end of an observation period.
         measured: (S, 6), measurements of the IMU in the S steps of this period.
-        state: true state, of which a pose is captured.
+        state: true state; its pose is captured.
         errors: (2, 3) standard normal errors of the pose.
     """
     imu = jnp.concatenate([belief.imu, measured])

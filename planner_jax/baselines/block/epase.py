@@ -193,8 +193,9 @@ def find_path(
 ) -> np.ndarray | None:
     """Return angles (N, n) [rad] of a path by ePA*SE from `start` to `end` (n,) [rad], or None.
 
-    The path is at most `weight` times as long as the shortest path over states of the search. The
-    other arguments are those of `EpaseBlock`.
+    The path is at most `weight` times as long as the shortest path over states of the search.
+    `free` checks collisions, `left` returns the remaining search time [s], and `width` is the
+    greatest number of states that are expanded at once.
     """
     states = OpenStates(start, end, weight)
 

@@ -229,8 +229,8 @@ class InsatBlock(PoseByPose):
     ) -> tuple[np.ndarray, Splines]:
         """Optimise N splines; return the indices of those that are free, and these splines.
 
-        The splines are fitted to two paths (N, 33, n) [rad], of which the second starts at the end
-        of the first.
+        The splines are fitted to the paths `before` and `after` (N, 33, n) [rad]. The path `after`
+        starts at the end of the path `before`.
         """
         dtype = np.asarray(case.angles).dtype
         curves = np.concatenate([before, after[:, 1:]], axis=1).astype(dtype)

@@ -3,9 +3,8 @@
 A pair is one cell of the outer and one cell of the inner box around the arm that a ball passes.
 `build` calls these planners for every pair. The paper plans to equidistant points of the line
 between the two cells' centres, and stores the motion of least duration, as `insat_pairs` does. Here
-a ball flies from
-centre to centre, and the planners store the motion with which this ball may enter the outer box
-earliest after the start of the motion.
+a ball flies from centre to centre, and the planners store the motion with which this ball may enter
+the outer box earliest after the start of the motion.
 """
 
 import dataclasses
